@@ -1,0 +1,52 @@
+"""Cloth that is fast enough to learn on: a batched mass-spring core under Gymnasium environments, on the CPU.
+
+``import clothgym`` registers the environments and loads nothing else; the core's names are loaded when first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from clothgym.registration import register
+
+if TYPE_CHECKING:
+    from clothgym.collisions import Box as Box
+    from clothgym.collisions import Capsule as Capsule
+    from clothgym.collisions import Plane as Plane
+    from clothgym.collisions import Sphere as Sphere
+    from clothgym.integrators import INTEGRATORS as INTEGRATORS
+    from clothgym.material import Material as Material
+    from clothgym.mesh import ClothMesh as ClothMesh
+    from clothgym.mesh import grid as grid
+    from clothgym.simulation import Simulation as Simulation
+    from clothgym.state import State as State
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Box": "clothgym.collisions",
+    "Capsule": "clothgym.collisions",
+    "ClothMesh": "clothgym.mesh",
+    "INTEGRATORS": "clothgym.integrators",
+    "Material": "clothgym.material",
+    "Plane": "clothgym.collisions",
+    "Simulation": "clothgym.simulation",
+    "Sphere": "clothgym.collisions",
+    "State": "clothgym.state",
+    "grid": "clothgym.mesh",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'clothgym' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*_HOMES, "__version__"])
+
+
+register()

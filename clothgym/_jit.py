@@ -1,0 +1,243 @@
+"""Floor 0: how every kernel is compiled, cached and run on several threads.
+
+One policy for the whole project, so that the promises made about bits and about start-up are kept in one place:
+
+* plain IEEE arithmetic (no fast-math): an environment's bits do not depend on who else is in its batch;
+* compiled code is kept on disk in a folder whose name is a digest of the core's sources.  numba's own cache does not
+  notice an edit in a callee that lives in another file; this key does;
+* a file lock around each compilation: processes that start together on a cold cache compile each kernel once;
+* threads are plain Python threads running kernels that do not hold the GIL.  Unlike numba's threading layers they may be
+  used from several threads at once, survive a fork, and cost no parallel compilation.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import numba
+from numba.core import caching
+
+OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "nogil": True, "boundscheck": False}
+
+
+def _source_digest() -> str:
+    """Digest of all core sources that hold kernels, of numba's version and of Python's."""
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        text = path.read_bytes()
+        if b"kernel" in text:
+            digest.update(path.name.encode() + text)
+    return digest.hexdigest()[:16]
+
+
+def _default_root() -> Path:
+    if os.environ.get("CLOTHGYM_CACHE_DIR"):
+        return Path(os.environ["CLOTHGYM_CACHE_DIR"])
+    if os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(os.environ["NUMBA_CACHE_DIR"]) / "clothgym"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "clothgym" / "kernels"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clothgym" / "kernels"
+
+
+class _CacheFolder:
+    """The folder of compiled kernels, found once, with the lock that guards it."""
+
+    def __init__(self) -> None:
+        self.depth = 0  # nested compilations that hold the lock; guarded by numba's own compiler lock
+        self._file: int | None = None  # a bare descriptor: held for the life of the process
+        self._announced = False
+        root = _default_root()
+        self.path = root / _source_digest()
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT)
+            self.writable = True
+        except OSError as error:
+            self.writable = False
+            warnings.warn(
+                f"clothgym cannot write its kernel cache {str(root)!r} ({error.strerror}): kernels will be compiled anew in "
+                "this process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder that can be written.",
+                stacklevel=2,
+            )
+
+    def acquire(self) -> None:
+        if self._file is not None and self.depth == 0:
+            _lock_file(self._file)
+            self.depth = 1
+
+    def release(self) -> None:
+        if self._file is not None and self.depth == 1:
+            self.depth = 0
+            _unlock_file(self._file)
+
+    def announce(self) -> None:
+        if not self._announced:
+            self._announced = True
+            where = f", kept in {self.path}" if self.writable else ""
+            print(f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True)
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _lock_file(file: int) -> None:
+        while True:
+            with contextlib.suppress(OSError):  # LK_LOCK gives up after ten seconds; a compilation may take longer
+                msvcrt.locking(file, msvcrt.LK_LOCK, 1)
+                return
+
+    def _unlock_file(file: int) -> None:
+        msvcrt.locking(file, msvcrt.LK_UNLCK, 1)
+else:
+    import fcntl
+
+    def _lock_file(file: int) -> None:
+        fcntl.flock(file, fcntl.LOCK_EX)
+
+    def _unlock_file(file: int) -> None:
+        fcntl.flock(file, fcntl.LOCK_UN)
+
+
+_folder: _CacheFolder | None = None
+
+
+def cache_folder() -> _CacheFolder:
+    global _folder
+    if _folder is None:
+        _folder = _CacheFolder()
+    return _folder
+
+
+class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  # type: ignore[misc]
+    """Tells numba's cache to use our folder; the stamp is the kernel's own file, the folder's name covers its callees."""
+
+    def __init__(self, py_func: FunctionType, py_file: str) -> None:
+        self._py_file = py_file
+        self._lineno = py_func.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder().path)
+
+    def ensure_cache_path(self) -> None:
+        pass
+
+
+class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = [_Locator]
+
+
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    """numba's disk cache with a lock: on a miss it waits for other processes, looks again, and keeps the lock."""
+
+    _impl_class = _Impl
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = super().load_overload(sig, target_context)
+        folder = cache_folder()
+        if found is None and folder.writable and folder.depth == 0:
+            folder.acquire()
+            found = super().load_overload(sig, target_context)
+        if found is None:
+            folder.announce()
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if cache_folder().writable:
+            super().save_overload(sig, data)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile ``function`` by the project's policy, at its first call, through the locked cache.
+
+    Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
+    """
+    dispatcher = numba.njit(**OPTIONS)(function)
+    dispatcher._cache = _Cache(function)
+    compile_or_load = dispatcher.compile
+
+    def compile_locked(signature: Any) -> Any:
+        held = cache_folder().depth > 0
+        try:
+            return compile_or_load(signature)
+        finally:
+            if not held:
+                cache_folder().release()
+
+    dispatcher.compile = compile_locked
+    return dispatcher
+
+
+def specialize(function: FunctionType, name: str, **callees: Any) -> Any:
+    """A kernel with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
+
+    This is how one substep loop serves every integrator: numba's disk cache misses in each new process when a dispatcher
+    is an argument or a closure variable, and hits when it is a global.  ``name`` keeps the cache entries apart.
+    """
+    code = function.__code__.replace(co_name=name, co_qualname=name)
+    bound = FunctionType(code, {**function.__globals__, **callees}, name)
+    bound.__qualname__ = name
+    bound.__module__ = function.__module__
+    return kernel(bound)
+
+
+_pool: ThreadPoolExecutor | None = None
+_pool_size = 0
+_pool_guard = threading.Lock()
+
+
+def _start_anew() -> None:
+    """After a fork the child has no worker threads, and would share its parent's hold on the lock: it makes its own."""
+    global _pool, _pool_size, _pool_guard, _folder
+    _pool, _pool_size, _pool_guard, _folder = None, 0, threading.Lock(), None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_start_anew)
+
+
+def default_threads() -> int:
+    """Threads to use when the caller does not say: the processors this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _spans(count: int, parts: int) -> Iterator[tuple[int, int]]:
+    for part in range(parts):
+        yield count * part // parts, count * (part + 1) // parts
+
+
+def run_spans(work: Callable[[int, int], None], count: int, threads: int) -> None:
+    """Call ``work(first, last)`` over ``range(count)`` cut into at most ``threads`` spans, one of them on this thread.
+
+    The spans share nothing, so the outcome does not depend on how many there are.
+    """
+    global _pool, _pool_size
+    parts = min(threads, count)
+    if parts <= 1:
+        work(0, count)
+        return
+    with _pool_guard:
+        if _pool is None or _pool_size < parts - 1:
+            # an outgrown pool ends by itself when its last caller is done with it
+            _pool, _pool_size = ThreadPoolExecutor(parts - 1, "clothgym"), parts - 1
+        pool = _pool
+    first, *rest = _spans(count, parts)
+    futures = [pool.submit(work, *span) for span in rest]
+    try:
+        work(*first)
+    finally:
+        wait(futures)
+    for future in futures:
+        future.result()

@@ -1,0 +1,101 @@
+"""Floor 1: what a fabric is, in SI units, and what it means to the springs of a sheet."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.mesh import BEND_X, BEND_Y, NUM_KINDS, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
+
+
+@dataclass(frozen=True)
+class Material:
+    """A fabric.
+
+    Attributes:
+        density: mass per area [kg/m^2].
+        stretch_stiffness: Young's modulus times thickness [N/m].
+        shear_stiffness: shear modulus times thickness [N/m].
+        bend_rigidity: plate rigidity B [N m].  Skip-one springs have no rigidity in the flat state; theirs is chosen to
+            store the energy B kappa^2 / 2 per area when the radius of curvature is two grid spacings.
+        damping_time: Kelvin-Voigt retardation time [s]: each spring's damper is this time its stiffness.
+        air_drag: force per area and velocity relative to the air [N s/m^3]; the default is the quadratic law's
+            ``rho C_D v / 2`` at 1 m/s, with 1.2 kg/m^3 and C_D = 1.2 of a plate.
+        source: where the figures come from.
+
+    Raises:
+        ValueError: a figure that is negative (or zero, where zero makes no fabric) or not finite.
+    """
+
+    density: float = 0.150
+    stretch_stiffness: float = 261.0
+    shear_stiffness: float = 105.0
+    bend_rigidity: float = 2.34e-6
+    damping_time: float = 1e-4
+    air_drag: float = 0.72
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "source":
+                continue
+            positive = field.name in ("density", "stretch_stiffness")
+            if not np.isfinite(value) or value < 0 or (positive and value == 0):
+                need = "positive" if positive else "zero or positive"
+                raise ValueError(f"{field.name}={value!r}: must be {need} and finite")
+
+    @staticmethod
+    def preset(name: str, **changes: float) -> Material:
+        """A measured fabric by name, with some figures changed if wanted: ``Material.preset("cotton", density=0.2)``."""
+        if name not in PRESETS:
+            near = difflib.get_close_matches(str(name), PRESETS, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"no material preset {name!r}{hint} (there are: {', '.join(PRESETS)})")
+        return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
+
+
+# Stretch: Young's modulus E times thickness t.  Shear: E t / (2 (1 + nu)).  Bending: E t^3 / (12 (1 - nu^2)).
+PRESETS: dict[str, Material] = {
+    "cotton": Material(
+        density=0.1503,
+        stretch_stiffness=261.1,
+        shear_stiffness=105.0,
+        bend_rigidity=2.34e-6,
+        source="100 % cotton of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457): 472.64 kg/m^3, 0.318 mm, 0.821 MPa, nu 0.243; "
+        "damping_time and air_drag are not measured there and are ours",
+    ),
+}
+
+
+def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: NDArray) -> NDArray[np.float64]:
+    """Spring constants by kind [N/m], (kinds, ...), that give a rectangular grid the fabric's moduli.
+
+    On cells a x b with diagonals d, springs k_x, k_y, k_d (both diagonals) and skip-one k_b make a sheet with
+    ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)``, ``C12 = C66 = 2 k_d a b/d^2`` and Young's modulus
+    ``C11 - C12^2/C11`` (small strains; checked against a stretched and a sheared sheet in the tests).  Poisson's ratio
+    ``C12/C11`` falls out.  All arguments have the same shape ``(...)`` [N/m, N/m, N m].
+
+    Raises:
+        ValueError: no spring network has these moduli (shear too stiff for the stretch, or cells too oblong).
+    """
+    a, b = mesh.spacing
+    stretch, shear, bend = (np.asarray(q, np.float64) for q in (stretch, shear, bend))
+    d2 = a * a + b * b
+    k = np.zeros((NUM_KINDS, *stretch.shape))
+    k[SHEAR] = shear * d2 / (2 * a * b)
+    c11 = (stretch + np.sqrt(stretch**2 + 4 * shear**2)) / 2
+    for structural, skip, along, across in ((STRUCTURAL_X, BEND_X, a, b), (STRUCTURAL_Y, BEND_Y, b, a)):
+        # energy of skip springs per area, k kappa^4 along^3 / (32 across), equals B kappa^2 / 2 at kappa = 1 / (2 along)
+        k[skip] = 64 * bend * across / along**3
+        k[structural] = (c11 - 2 * k[SHEAR] * along**3 / (across * d2)) * across / along - 4 * k[skip]
+    if np.any(k < 0):
+        raise ValueError(
+            f"no springs on cells of {a:.4g} x {b:.4g} m have stretch_stiffness={stretch.min():.4g} N/m with "
+            f"shear_stiffness={shear.max():.4g} N/m and bend_rigidity={bend.max():.4g} N m: lower the shear stiffness or the "
+            "rigidity, use a coarser grid, or make the cells nearer to square"
+        )
+    return k
