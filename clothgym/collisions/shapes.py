@@ -1,0 +1,158 @@
+"""Colliders as people describe them, and as rows of numbers for the kernel.
+
+Sphere, capsule and box are one shape: a box with half sides b, swept by a ball of radius r.  A sphere has b = 0, a capsule
+b = (0, 0, half its straight part), a box r = 0.  One distance function serves them all without a branch, and each lane of a
+batch may have another shape in the same slot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+# rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r, friction, velocity, and the
+# square of |b| + r, beyond which nothing can touch it
+POINT, AXES, HALF, RADIUS, FRICTION, VELOCITY, REACH2 = 0, 3, 12, 15, 16, 17, 20
+ROWS = 21
+
+PLANE, ROUNDED_BOX = 0, 1
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Collider:
+    """What all colliders share.
+
+    Attributes:
+        friction: Coulomb's coefficient between cloth and solid.
+        thickness: distance at which the cloth rests on the surface [m].
+        velocity: of the solid [m/s]; it moves, and drags the cloth.
+
+    Raises:
+        ValueError: a size that is not positive, a friction or thickness below zero, a vector that is not three finite
+            numbers, or a direction of length zero.
+    """
+
+    kind: ClassVar[int]
+    friction: float = 0.3
+    thickness: float = 0.001
+    velocity: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if isinstance(item.default, tuple) or item.name in ("center", "base", "half_sides", "yaw_axis"):
+                if np.shape(value) != (3,) or not np.all(np.isfinite(value)):
+                    raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be three finite numbers")
+            elif not np.isfinite(value):
+                raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be finite")
+            elif item.name in ("friction", "thickness") and value < 0:
+                raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be zero or positive")
+
+    def _positive(self, **sizes: float) -> None:
+        for name, size in sizes.items():
+            if not np.all(np.asarray(size) > 0):
+                raise ValueError(f"{type(self).__name__} {name}={size!r}: must be positive")
+
+    def rows(self) -> NDArray[np.float64]:
+        """The numbers the kernel reads, (ROWS,)."""
+        rows = np.zeros(ROWS)
+        rows[AXES : AXES + 9] = np.eye(3).ravel()
+        rows[FRICTION] = self.friction
+        rows[VELOCITY : VELOCITY + 3] = self.velocity
+        self._shape(rows)
+        rows[REACH2] = (np.linalg.norm(rows[HALF : HALF + 3]) + rows[RADIUS]) ** 2
+        return rows
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        """Write the rows that are the shape's own."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Plane(Collider):
+    """A half-space: the solid lies below ``point`` against ``normal``."""
+
+    kind: ClassVar[int] = PLANE
+    point: Vector = (0.0, 0.0, 0.0)
+    normal: Vector = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if np.linalg.norm(self.normal) == 0:
+            raise ValueError(f"Plane normal={self.normal!r}: must have a length")
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
+        rows[POINT : POINT + 3] = np.asarray(self.point) + normal * self.thickness
+        rows[AXES + 6 : AXES + 9] = normal
+
+
+@dataclass(frozen=True)
+class Sphere(Collider):
+    """A ball."""
+
+    kind: ClassVar[int] = ROUNDED_BOX
+    center: Vector = (0.0, 0.0, 0.0)
+    radius: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive(radius=self.radius)
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        rows[POINT : POINT + 3] = self.center
+        rows[RADIUS] = self.radius + self.thickness
+
+
+@dataclass(frozen=True)
+class Capsule(Collider):
+    """A cylinder with round ends, upright unless ``axis`` says otherwise; ``height`` is from end to end [m]."""
+
+    kind: ClassVar[int] = ROUNDED_BOX
+    center: Vector = (0.0, 0.0, 0.0)
+    radius: float = 0.1
+    height: float = 0.4
+    axis: Vector = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive(radius=self.radius, height=self.height)
+        if self.height < 2 * self.radius:
+            raise ValueError(f"Capsule height={self.height!r}: must be at least twice the radius {self.radius!r}")
+        if np.linalg.norm(self.axis) == 0:
+            raise ValueError(f"Capsule axis={self.axis!r}: must have a length")
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        rows[POINT : POINT + 3] = self.center
+        z = np.asarray(self.axis) / np.linalg.norm(self.axis)
+        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+        x /= np.linalg.norm(x)
+        rows[AXES : AXES + 9] = np.concatenate([x, np.cross(z, x), z])
+        rows[HALF + 2] = self.height / 2 - self.radius
+        rows[RADIUS] = self.radius + self.thickness
+
+
+@dataclass(frozen=True)
+class Box(Collider):
+    """A box, turned by ``yaw`` about z [rad] if wanted; its thickness rounds the edges."""
+
+    kind: ClassVar[int] = ROUNDED_BOX
+    center: Vector = (0.0, 0.0, 0.0)
+    half_sides: Vector = field(default=(0.1, 0.1, 0.1))
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive(half_sides=self.half_sides)  # type: ignore[arg-type]
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        rows[POINT : POINT + 3] = self.center
+        rows[AXES : AXES + 9] = (c, s, 0, -s, c, 0, 0, 0, 1)
+        rows[HALF : HALF + 3] = self.half_sides
+        rows[RADIUS] = self.thickness
