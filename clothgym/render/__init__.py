@@ -1,0 +1,11 @@
+"""Floor 6: what a sheet looks like: a small software rasteriser that draws the same picture on any machine.
+
+It sees triangles, positions and named solids; it knows nothing of simulations or environments.
+"""
+
+from clothgym.render.camera import Camera
+from clothgym.render.export import write_video
+from clothgym.render.renderer import Renderer
+from clothgym.render.solids import Solid
+
+__all__ = ["Camera", "Renderer", "Solid", "write_video"]

@@ -1,0 +1,272 @@
+"""The rasteriser as people use it: one cloth mesh, one camera, and as many frames as wanted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym._jit import default_threads, run_spans
+from clothgym.render.camera import Camera, View
+from clothgym.render.maps import draw_maps, studio_rig
+from clothgym.render.raster import clear_to_floor, depth_image, project_perspective, rasterise
+from clothgym.render.shading import CORAL, INDIGO, cloth_and_floor_palette, draw_studio, encode, shade_floor, shade_surfaces
+from clothgym.render.solids import Color, Solid, check_color, linear_color
+from clothgym.render.surface import place_vertices, plain_surface, push_out, smooth_surface, vertex_normals
+
+Marker = Solid | tuple[Sequence[float], Color]
+
+MARKER_RADIUS = 0.011  # [m]
+BIAS = 0.006  # the cloth is drawn this much nearer to the eye than it is [m]
+HIGHEST_LIFT, DEEPEST = 0.006, 0.03  # smooth cloth less than 3 cm deep in a solid is drawn on top of it, so far above [m]
+FINE_CELLS, COARSE_CELLS = 64, 32  # cells along the drawn cloth's longer side, for large and for small pictures
+LARGE_PICTURE = 400  # samples along its shorter side
+
+
+class _Things(NamedTuple):
+    """What stands beside the cloth of one frame: solids, which hold it up, and markers, which need not."""
+
+    solids: list[Solid]
+    markers: list[Solid]
+
+
+class _Scene(NamedTuple):
+    """Cloth and solids of one frame as one mesh: positions [m] and normals, (vertices, 3); surface: 0 for the cloth's
+    triangles, 1 + number of the solid for the others, (triangles,)."""
+
+    x: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    surface: NDArray[np.int32]
+
+
+class Renderer:
+    """Draws a cloth, solids beside it and the floor z = 0.
+
+    The same positions give the same pixels, alone or in a batch, on any number of threads.
+
+    Args:
+        triangles: of the cloth mesh, counter-clockwise seen from its front, (triangles, 3) int32.
+        uv: material coordinates for the pattern [m], (particles, 2).
+        camera: where the eye stands; above the floor.
+        width, height: of the image [pixels].
+        antialias: samples per pixel and direction.
+        threads: for batches; None takes the processors at hand.
+        grid_shape: (rows, columns) if the particles are a grid, row by row: the cloth is then drawn as a smooth surface
+            through them.
+        front, back: colors of the fabric's sides, sRGB from 0 to 255.
+        check: width of a stripe of the pattern [m]; None makes twelve of the longer side.
+
+    Raises:
+        ValueError: an argument that does not fit.
+    """
+
+    def __init__(
+        self,
+        triangles: ArrayLike,
+        uv: ArrayLike,
+        camera: Camera,
+        width: int = 480,
+        height: int = 480,
+        antialias: int = 2,
+        threads: int | None = None,
+        *,
+        grid_shape: tuple[int, int] | None = None,
+        front: Color = CORAL,
+        back: Color = INDIGO,
+        check: float | None = None,
+    ) -> None:
+        for name, value, most in (("width", width, 8192), ("height", height, 8192), ("antialias", antialias, 8)):
+            if not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
+                raise ValueError(f"{name}={value!r}: must be an integer from 1 to {most}")
+        if threads is not None and (not isinstance(threads, (int, np.integer)) or threads < 1):
+            raise ValueError(f"threads={threads!r}: must be a positive integer, or None for all processors")
+        if camera.eye[2] <= 0:
+            raise ValueError(f"camera eye={camera.eye!r}: must stand above the floor z = 0, or the floor hides everything")
+        check_color("front", front)
+        check_color("back", back)
+        uv, triangles = _checked_mesh(uv, triangles, grid_shape)
+        if check is not None and not (np.isfinite(check) and check > 0):
+            raise ValueError(f"check={check!r}: must be a positive, finite length in metres, or None")
+        self.camera, self.width, self.height, self.antialias = camera, int(width), int(height), int(antialias)
+        self.threads = default_threads() if threads is None else int(threads)
+        self._particles = len(uv)
+        self._check = float(np.ptp(uv, axis=0).max()) / 12 or 1.0 if check is None else float(check)
+        samples = min(width, height) * antialias
+        if grid_shape is None:
+            self._cloth = plain_surface(triangles, uv)
+        else:
+            cells = FINE_CELLS if samples >= LARGE_PICTURE else COARSE_CELLS
+            self._cloth = smooth_surface(triangles, uv, grid_shape, cells)
+        self._palette = cloth_and_floor_palette(front, back)
+        self._rig = studio_rig(camera, samples)
+        self._pixel_view = camera.view(self.width, self.height)
+        self._sample_view = camera.view(self.width * self.antialias, self.height * self.antialias)
+        self._studio = np.empty((self.height, self.width, 3), np.float32)
+        draw_studio(self._sample_view.rays, camera.reach, self._rig.center, self._palette, self.antialias, self._studio)
+
+    def rgb(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.uint8]:
+        """A picture, (height, width, 3) sRGB.
+
+        positions: of the particles [m], (particles, 3).  markers: small spheres, each a (position [m], color), or solids.
+        """
+        x = self._checked_positions(positions, 2)
+        out = np.empty((self.height, self.width, 3), np.uint8)
+        self._draw_rgb(x, self._checked_things(solids, markers), out)
+        return out
+
+    def depth(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.float32]:
+        """Depth along the view axis at the middle of each pixel [m], (height, width); +inf where nothing is seen.
+
+        The floor counts as seen, up to its horizon.  Arguments as for ``rgb``.
+        """
+        x = self._checked_positions(positions, 2)
+        out = np.empty((self.height, self.width), np.float32)
+        self._draw_depth(x, self._checked_things(solids, markers), out)
+        return out
+
+    def rgb_batch(
+        self,
+        positions: ArrayLike,
+        solids: Sequence[Sequence[Solid]] | None = None,
+        markers: Sequence[Sequence[Marker]] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Pictures of many environments, (environments, height, width, 3): the pixels that ``rgb`` gives for each.
+
+        positions [m], (environments, particles, 3).  solids, markers: a sequence for each environment, or None.
+        """
+        x, things = self._checked_batch(positions, solids, markers)
+        out = np.empty((len(x), self.height, self.width, 3), np.uint8)
+        self._spread(self._draw_rgb, x, things, out)
+        return out
+
+    def depth_batch(
+        self,
+        positions: ArrayLike,
+        solids: Sequence[Sequence[Solid]] | None = None,
+        markers: Sequence[Sequence[Marker]] | None = None,
+    ) -> NDArray[np.float32]:
+        """Depths of many environments [m], (environments, height, width): what ``depth`` gives for each."""
+        x, things = self._checked_batch(positions, solids, markers)
+        out = np.empty((len(x), self.height, self.width), np.float32)
+        self._spread(self._draw_depth, x, things, out)
+        return out
+
+    def _spread(self, draw: Callable[..., None], x: NDArray[np.float32], things: list[_Things], out: NDArray[Any]) -> None:
+        def work(first: int, last: int) -> None:
+            for environment in range(first, last):
+                draw(x[environment], things[environment], out[environment])
+
+        run_spans(work, len(x), self.threads)
+
+    def _draw_rgb(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.uint8]) -> None:
+        scene = self._scene(x, things)
+        cloth, rig, view = self._cloth, self._rig, self._sample_view
+        screen, inverse_depth, _, owner = self._rasterised(scene, view)
+        maps = draw_maps(rig, scene.x, scene.triangles, len(cloth.uv), BIAS)
+        palette = np.concatenate([self._palette, *(linear_color(solid.color)[None] for solid in [*things.solids, *things.markers])])
+        mesh = (screen, inverse_depth, scene.triangles, scene.normals, cloth.uv, scene.surface)
+        # a texel of the shadow map is flat: a slanted surface must not shade itself
+        slack = BIAS + 2.0 / rig.shadow_scale
+        places = (rig.axes, rig.center, rig.shadow_scale, rig.height_scale, slack)
+        light = np.empty((self.height, self.width, 3), np.float32)
+        shade_floor(view.rays, tuple(maps), places, self._studio, self.antialias, owner, light)
+        shade_surfaces(view.rays, palette, self._check, mesh, tuple(maps), places, self.antialias, owner, light)
+        encode(light, out)
+
+    def _draw_depth(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.float32]) -> None:
+        scene = self._scene(x, things)
+        screen, inverse_depth, buffer, owner = self._rasterised(scene, self._pixel_view)
+        depth_image(screen, inverse_depth, scene.triangles, buffer, owner, out)
+
+    def _scene(self, x: NDArray[np.float32], things: _Things) -> _Scene:
+        cloth = self._cloth
+        meshes = [solid.mesh() for solid in [*things.solids, *things.markers]]
+        first = np.cumsum([len(cloth.uv), *(len(mesh.positions) for mesh in meshes)])
+        vertices = np.empty((first[-1], 3), np.float32)
+        normals = np.empty((first[-1], 3), np.float32)
+        place_vertices(x, cloth.index, cloth.weight, vertices)
+        lift = min(0.6 * cloth.cell, HIGHEST_LIFT)  # a cell across a sharp edge then just spans it
+        for solid in things.solids if lift > 0 else ():
+            (half, radius), center = solid.rounded_box(), tuple(map(float, solid.center))
+            push_out(vertices, len(cloth.uv), center, math.cos(solid.yaw), math.sin(solid.yaw), half, radius, lift, DEEPEST)
+        vertex_normals(vertices[: first[0]], cloth.triangles, normals[: first[0]])
+        for mesh, start, end in zip(meshes, first, first[1:]):
+            vertices[start:end], normals[start:end] = mesh.positions, mesh.normals
+        triangles = np.concatenate([cloth.triangles, *(mesh.triangles + np.int32(start) for mesh, start in zip(meshes, first))])
+        counts = [len(cloth.triangles), *(len(mesh.triangles) for mesh in meshes)]
+        return _Scene(vertices, normals, triangles, np.repeat(np.arange(len(counts), dtype=np.int32), counts))
+
+    def _rasterised(self, scene: _Scene, view: View) -> tuple[NDArray[Any], ...]:
+        """screen and inverse depth of the vertices; nearness and triangle of the samples."""
+        cloth, count = self._cloth, len(scene.x)
+        screen, inverse_depth, nearness = np.empty((count, 2), np.int32), np.empty(count, np.float32), np.empty(count, np.float32)
+        project_perspective(
+            scene.x, view.axes, view.rays[0], view.scale, view.width, view.height, self.camera.near, len(cloth.uv), BIAS,
+            screen, inverse_depth, nearness,
+        )  # fmt: skip
+        buffer, owner = np.empty((view.height, view.width), np.float32), np.empty((view.height, view.width), np.int32)
+        clear_to_floor(view.rays, buffer, owner)
+        rasterise(screen, nearness, scene.triangles, len(cloth.triangles), buffer, owner)
+        return screen, inverse_depth, buffer, owner
+
+    def _checked_positions(self, positions: ArrayLike, dimensions: int) -> NDArray[np.float32]:
+        x = np.asarray(positions)
+        wanted = (self._particles, 3)
+        if x.ndim != dimensions or x.shape[-2:] != wanted:
+            shape = wanted if dimensions == 2 else ("environments", *wanted)
+            raise ValueError(f"positions have shape {x.shape}: this renderer's cloth needs {shape}")
+        with np.errstate(over="ignore"):
+            x = np.ascontiguousarray(x, np.float32)
+        if not np.all(np.isfinite(x)):
+            place = tuple(np.argwhere(~np.isfinite(x))[0, :-1].tolist())
+            raise ValueError(
+                f"positions[{', '.join(map(str, place))}]={x[place].tolist()}: a cloth that is not finite cannot be drawn; "
+                "draw the last finite state instead"
+            )
+        return x
+
+    def _checked_things(self, solids: Sequence[Solid], markers: Sequence[Marker]) -> _Things:
+        for solid in solids:
+            if not isinstance(solid, Solid):
+                raise ValueError(f"solid {solid!r}: must be a clothgym.render.Solid")
+        spheres = []
+        for marker in markers:
+            if not isinstance(marker, Solid):
+                if len(marker) != 2:
+                    raise ValueError(f"marker {marker!r}: must be (position in metres, color) or a clothgym.render.Solid")
+                center, color = marker
+                marker = Solid(kind="sphere", center=tuple(center), radius=MARKER_RADIUS, color=color)  # type: ignore[arg-type]
+            spheres.append(marker)
+        return _Things(list(solids), spheres)
+
+    def _checked_batch(
+        self, positions: ArrayLike, solids: Sequence[Sequence[Solid]] | None, markers: Sequence[Sequence[Marker]] | None
+    ) -> tuple[NDArray[np.float32], list[_Things]]:
+        x = self._checked_positions(positions, 3)
+        solids = [()] * len(x) if solids is None else solids
+        markers = [()] * len(x) if markers is None else markers
+        for name, lists in (("solids", solids), ("markers", markers)):
+            if len(lists) != len(x):
+                raise ValueError(f"{name} has {len(lists)} entries for {len(x)} environments: give one sequence for each")
+        return x, [self._checked_things(*pair) for pair in zip(solids, markers)]
+
+
+def _checked_mesh(
+    uv: ArrayLike, triangles: ArrayLike, grid_shape: tuple[int, int] | None
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    uv = np.ascontiguousarray(uv, np.float32)
+    if uv.ndim != 2 or uv.shape[1] != 2 or not np.all(np.isfinite(uv)):
+        raise ValueError(f"uv has shape {uv.shape}: must be (particles, 2), finite, in metres")
+    corners = np.asarray(triangles)
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0 or not np.issubdtype(corners.dtype, np.integer):
+        raise ValueError(f"triangles have shape {corners.shape} and dtype {corners.dtype}: must be (triangles, 3) integers")
+    if corners.min() < 0 or corners.max() >= len(uv):
+        raise ValueError(f"triangles name particles {corners.min()} to {corners.max()}: uv has particles 0 to {len(uv) - 1}")
+    fits = grid_shape is None or (np.shape(grid_shape) == (2,) and min(grid_shape) >= 2 and math.prod(grid_shape) == len(uv))
+    if not fits:
+        raise ValueError(f"grid_shape={grid_shape!r}: must be (rows, columns), at least 2 each, that make {len(uv)} particles")
+    return uv, np.ascontiguousarray(corners, np.int32)

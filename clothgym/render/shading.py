@@ -1,0 +1,281 @@
+"""From samples to colours: fabric, solids, floor and light.
+
+Arrays are float32, the arithmetic between them is numba's own choice (float64 for literals): one colour costs a few dozen
+nanoseconds either way.  Colours are linear light until the last line, where a table turns them to sRGB.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.render.raster import HALF_PIXEL, SUBPIXEL, sample_weights
+from clothgym.render.solids import linear_color
+
+# rows of the palette
+FRONT, FRONT_CHECK, BACK, BACK_CHECK, FLOOR, LINE, HORIZON, ZENITH, SOLIDS = range(9)
+CORAL, CREAM = (206, 64, 50), (247, 228, 206)
+INDIGO = (54, 68, 132)
+STUDIO = ((226, 222, 214), (205, 200, 191), (240, 238, 234), (222, 227, 232))  # floor, its lines, horizon, zenith
+
+KEY = (0.84, 0.80, 0.74)  # light from the lamp, before the cosine
+SKY = (0.47, 0.47, 0.49)  # from straight above
+BOUNCE = (0.40, 0.36, 0.32)  # from the floor
+TILES = 10.0  # on a metre of the floor
+LINE_WIDTH = 0.0016  # [m]
+ROOF_HEIGHT = 0.10  # a surface this far above takes the most of the sky's light [m]
+TEXELS_ASIDE = 1.5
+TRANSLUCENCE = 0.30  # of the fabric
+SHEEN, GLOSS = 0.35, 0.10  # light scattered along a silhouette; highlight of a solid
+CLOTH = 0  # surface number of the cloth; solids are 1, 2, ...
+SHADE = (0.50, 0.48, 0.43)  # what the lamp's shadow takes from the floor
+TONES = 8192
+
+_curve = np.linspace(0, 1, TONES)
+_srgb = np.where(_curve <= 0.0031308, 12.92 * _curve, 1.055 * _curve ** (1 / 2.4) - 0.055)
+SRGB: NDArray[np.uint8] = np.round(255 * _srgb).astype(np.uint8)
+
+
+def cloth_and_floor_palette(front: tuple[int, int, int], back: tuple[int, int, int]) -> NDArray[np.float32]:
+    """Linear colours of fabric and studio, (SOLIDS, 3); the solids' own follow them."""
+    cream = linear_color(CREAM)
+    rows = []
+    for color in map(linear_color, (front, back)):
+        rows += [color, color + np.float32(0.6) * (cream - color)]
+    return np.stack(rows + [linear_color(color) for color in STUDIO])
+
+
+@kernel
+def _stripes(q, width):
+    """Share of [q - width/2, q + width/2] in which floor(q) is odd, 0 to 1: stripes of width 1, seen through a box filter."""
+    a, b = 0.5 * (q - 0.5 * width), 0.5 * (q + 0.5 * width)
+    below, above = np.floor(a), np.floor(b)
+    return (above - below + max(2 * (b - above) - 1, 0) - max(2 * (a - below) - 1, 0)) / width
+
+
+@kernel
+def _line(q, line, width):
+    """Share of [q - width/2, q + width/2] that lies within line/2 of a whole number."""
+    a, b = q - 0.5 * width + 0.5 * line, q + 0.5 * width + 0.5 * line
+    below, above = np.floor(a), np.floor(b)
+    return ((above - below) * line + min(b - above, line) - min(a - below, line)) / width
+
+
+@kernel
+def _lit(shadow, box, axes, center, scale, slack, x, y, z):
+    """Share of the lamp that reaches a point [m], 0 to 1: 3 x 3 texels around it, the outer ones in part (Reeves 1987)."""
+    dx, dy, dz = x - center[0], y - center[1], z - center[2]
+    size = shadow.shape[0]
+    u = 0.5 * size + scale * (axes[0][0] * dx + axes[0][1] * dy + axes[0][2] * dz) - 0.5
+    v = 0.5 * size - scale * (axes[1][0] * dx + axes[1][1] * dy + axes[1][2] * dz) - 0.5
+    if not (box[0] <= u < box[1] and box[2] <= v < box[3]):
+        return 1.0
+    near = np.float32(axes[2][0] * dx + axes[2][1] * dy + axes[2][2] * dz + slack)
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    total = 0.0
+    for a in range(4):
+        r = row - 1 + a
+        share = 1 - fu if shadow[r, column - 1] <= near else 0.0
+        share += 1.0 if shadow[r, column] <= near else 0.0
+        share += 1.0 if shadow[r, column + 1] <= near else 0.0
+        share += fu if shadow[r, column + 2] <= near else 0.0
+        total += share * (1 - fv if a == 0 else (fv if a == 3 else 1.0))
+    return total / 9
+
+
+@kernel
+def _bilinear(field, row, column, channel, fu, fv):
+    upper = field[row, column, channel] * (1 - fu) + field[row, column + 1, channel] * fu
+    lower = field[row + 1, column, channel] * (1 - fu) + field[row + 1, column + 1, channel] * fu
+    return upper * (1 - fv) + lower * fv
+
+
+@kernel
+def _heights_at(heights, box, center, scale, x, y):
+    """The three height maps at (x, y) [m], bilinear; zeros outside."""
+    size = heights.shape[0]
+    u = 0.5 * size + scale * (x - center[0]) - 0.5
+    v = 0.5 * size - scale * (y - center[1]) - 0.5
+    if not (box[0] <= u < box[1] and box[2] <= v < box[3]):
+        return 0.0, 0.0, 0.0
+    column, row = int(u), int(v)
+    fu, fv = u - column, v - row
+    touching = _bilinear(heights, row, column, 0, fu, fv)
+    hanging = _bilinear(heights, row, column, 1, fu, fv)
+    return touching, hanging, _bilinear(heights, row, column, 2, fu, fv)
+
+
+@kernel
+def _background(up, palette):
+    """Linear colour above the horizon; up: the ray's slope."""
+    t = min(1.5 * up, 1)
+    low, high = palette[HORIZON], palette[ZENITH]
+    return low[0] + t * (high[0] - low[0]), low[1] + t * (high[1] - low[1]), low[2] + t * (high[2] - low[2])
+
+
+@kernel
+def _tile_ink(x, y, depth, dx, dy, dz, rays):
+    """Share of a sample's footprint on the floor at (x, y) [m] that is covered by the lines between tiles."""
+    # how far the point moves from one sample to the next, right and down
+    sx, sy, tiles = rays[2][2] / dz, rays[3][2] / dz, depth * TILES
+    wide_x = tiles * (abs(rays[2][0] - dx * sx) + abs(rays[3][0] - dx * sy))
+    wide_y = tiles * (abs(rays[2][1] - dy * sx) + abs(rays[3][1] - dy * sy))
+    ink_x, ink_y = _line(x * TILES, LINE_WIDTH * TILES, wide_x), _line(y * TILES, LINE_WIDTH * TILES, wide_y)
+    return ink_x + ink_y - ink_x * ink_y
+
+
+@kernel
+def draw_studio(rays, reach, center, palette, antialias, studio):
+    """Floor and background without anything on them, linear, (height, width, 3): the same in every frame of a camera."""
+    floor, line, horizon = palette[FLOOR], palette[LINE], palette[HORIZON]
+    for row in range(studio.shape[0]):
+        for column in range(studio.shape[1]):
+            px, py = (column + 0.5) * antialias, (row + 0.5) * antialias
+            dx = rays[1][0] + px * rays[2][0] + py * rays[3][0]
+            dy = rays[1][1] + px * rays[2][1] + py * rays[3][1]
+            dz = rays[1][2] + px * rays[2][2] + py * rays[3][2]
+            if dz >= 0:
+                color = _background(dz, palette)
+                for c in range(3):
+                    studio[row, column, c] = color[c]
+                continue
+            depth = -rays[0][2] / dz
+            x, y = rays[0][0] + depth * dx, rays[0][1] + depth * dy
+            away = np.sqrt((x - center[0]) ** 2 + (y - center[1]) ** 2) / reach
+            fade = min(max((away - 0.9) / 3.2, 0), 1)
+            fade = fade * (2 - fade)
+            ink = _tile_ink(x, y, depth, dx, dy, dz, rays)
+            for c in range(3):
+                tile = floor[c] + ink * (line[c] - floor[c])
+                studio[row, column, c] = tile + fade * (horizon[c] - tile)
+
+
+@kernel
+def shade_floor(rays, maps, rig, studio, antialias, owner, light):
+    """The studio, darkened by shadows, into ``light``, (height, width, 3); what surfaces cover of a pixel is left to them.
+
+    A shadow on the floor is smooth: one look in the middle of a pixel does for all its samples.
+    """
+    shadow, shadow_box, heights, heights_box, floor_box = maps
+    axes, center, shadow_scale, height_scale, slack = rig
+    share = 1 / (antialias * antialias)
+    for row in range(light.shape[0]):
+        for column in range(light.shape[1]):
+            empty = 0
+            for s in range(row * antialias, (row + 1) * antialias):
+                for q in range(column * antialias, (column + 1) * antialias):
+                    empty += owner[s, q] < 0
+            part = empty * share
+            r, g, b = part, part, part
+            px, py = (column + 0.5) * antialias, (row + 0.5) * antialias
+            dz = rays[1][2] + px * rays[2][2] + py * rays[3][2]
+            if empty > 0 and dz < 0:
+                depth = -rays[0][2] / dz
+                x = rays[0][0] + depth * (rays[1][0] + px * rays[2][0] + py * rays[3][0])
+                y = rays[0][1] + depth * (rays[1][1] + px * rays[2][1] + py * rays[3][1])
+                if floor_box[0] <= x <= floor_box[1] and floor_box[2] <= y <= floor_box[3]:
+                    dark = 1 - _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x, y, 0.0)
+                    touching, hanging, _ = _heights_at(heights, heights_box, center, height_scale, x, y)
+                    part *= (1 - 0.55 * touching) * (1 - 0.45 * hanging)
+                    r, g, b = part * (1 - SHADE[0] * dark), part * (1 - SHADE[1] * dark), part * (1 - SHADE[2] * dark)
+            light[row, column, 0] = r * studio[row, column, 0]
+            light[row, column, 1] = g * studio[row, column, 1]
+            light[row, column, 2] = b * studio[row, column, 2]
+
+
+@kernel
+def _fabric_tone(u, v, check, footprint):
+    """0 where the fabric has its own colour, 1 where two light stripes cross: gingham. u, v, check, footprint [m]."""
+    width = max(footprint / check, 1e-6)
+    return 0.5 * (_stripes(u / check, width) + _stripes(v / check, width))
+
+
+@kernel
+def _fabric(uv, triangles, t, w0, w1, w2, footprint, check, palette, front):
+    """Linear colour of the cloth at a sample of triangle t."""
+    i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+    u = w0 * uv[i, 0] + w1 * uv[j, 0] + w2 * uv[k, 0]
+    v = w0 * uv[i, 1] + w1 * uv[j, 1] + w2 * uv[k, 1]
+    # gingham: 0 where the fabric has its own colour, 1 where two light stripes cross
+    width = max(footprint / check, 1e-6)
+    tone = 0.5 * (_stripes(u / check, width) + _stripes(v / check, width))
+    dark, light = palette[FRONT if front else BACK], palette[FRONT_CHECK if front else BACK_CHECK]
+    return dark[0] + tone * (light[0] - dark[0]), dark[1] + tone * (light[1] - dark[1]), dark[2] + tone * (light[2] - dark[2])
+
+
+@kernel
+def shade_surfaces(rays, palette, check, mesh, maps, rig, antialias, owner, light):
+    """Add cloth and solids, linear, to ``light``, (height, width, 3): the mean over each pixel's antialias^2 samples.
+
+    owner: triangle seen by a sample or -1, (height antialias, width antialias).  rays: of the samples' image.
+    """
+    screen, inverse_depth, triangles, normals, uv, surface = mesh
+    shadow, shadow_box, heights, heights_box, _ = maps
+    axes, center, shadow_scale, height_scale, slack = rig
+    share = 1 / (antialias * antialias)
+    sample_slope = np.sqrt(rays[2][0] ** 2 + rays[2][1] ** 2 + rays[2][2] ** 2)
+    for s in range(owner.shape[0]):
+        for q in range(owner.shape[1]):
+            t = owner[s, q]
+            if t < 0:
+                continue
+            px, py = np.int64(q) * SUBPIXEL + HALF_PIXEL, np.int64(s) * SUBPIXEL + HALF_PIXEL
+            w0, w1, w2, inverse, clockwise = sample_weights(screen, triangles, inverse_depth, t, px, py)
+            i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+            depth = 1 / inverse
+            dx = rays[1][0] + (q + 0.5) * rays[2][0] + (s + 0.5) * rays[3][0]
+            dy = rays[1][1] + (q + 0.5) * rays[2][1] + (s + 0.5) * rays[3][1]
+            dz = rays[1][2] + (q + 0.5) * rays[2][2] + (s + 0.5) * rays[3][2]
+            x, y, z = rays[0][0] + depth * dx, rays[0][1] + depth * dy, rays[0][2] + depth * dz
+            nx = w0 * normals[i, 0] + w1 * normals[j, 0] + w2 * normals[k, 0]
+            ny = w0 * normals[i, 1] + w1 * normals[j, 1] + w2 * normals[k, 1]
+            nz = w0 * normals[i, 2] + w1 * normals[j, 2] + w2 * normals[k, 2]
+            # on the back of the fabric the normal points away from the eye
+            unit = (-1 if clockwise else 1) / np.sqrt(max(nx * nx + ny * ny + nz * nz, 1e-12))
+            nx, ny, nz = nx * unit, ny * unit, nz * unit
+            toward = 1 / np.sqrt(dx * dx + dy * dy + dz * dz)
+            facing = min(max(-(nx * dx + ny * dy + nz * dz) * toward, 0), 1)
+
+            lamp = nx * axes[2][0] + ny * axes[2][1] + nz * axes[2][2]
+            # looked up beside the surface, on its lit side: within a texel a slanted surface would shade itself
+            aside = TEXELS_ASIDE / shadow_scale if lamp > 0 else -TEXELS_ASIDE / shadow_scale
+            lit = _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x + aside * nx, y + aside * ny, z + aside * nz)
+            _, hanging, roof = _heights_at(heights, heights_box, center, height_scale, x, y)
+            open_sky = 1 - 0.55 * min(max((roof - z) / ROOF_HEIGHT, 0), 1)
+            direct = max(lamp, 0) * lit
+            rim = SHEEN * (1 - facing) * (1 - facing) * (1 - facing)
+            if surface[t] == CLOTH:
+                footprint = depth * sample_slope / max(facing, 0.15)
+                r, g, b = _fabric(uv, triangles, t, w0, w1, w2, footprint, check, palette, not clockwise)
+                # some of the lamp's light comes through the fabric
+                direct += TRANSLUCENCE * max(-lamp, 0) * lit
+                gloss = 0.0
+            else:
+                base = palette[SOLIDS - 1 + surface[t]]
+                r, g, b = base[0], base[1], base[2]
+                # Blinn 1977: the half vector between lamp and eye, to the 32nd power
+                hx, hy, hz = axes[2][0] - dx * toward, axes[2][1] - dy * toward, axes[2][2] - dz * toward
+                shine = max((nx * hx + ny * hy + nz * hz) / np.sqrt(hx * hx + hy * hy + hz * hz), 0)
+                for _ in range(5):
+                    shine *= shine
+                gloss = GLOSS * shine * lit
+            sky, bounce, edge = (0.5 + 0.5 * nz) * open_sky, (0.5 - 0.5 * nz) * (1 - 0.6 * hanging), rim * open_sky
+            r = r * (KEY[0] * direct + SKY[0] * sky + BOUNCE[0] * bounce) + SKY[0] * edge + gloss
+            g = g * (KEY[1] * direct + SKY[1] * sky + BOUNCE[1] * bounce) + SKY[1] * edge + gloss
+            b = b * (KEY[2] * direct + SKY[2] * sky + BOUNCE[2] * bounce) + SKY[2] * edge + gloss
+            row, column = s // antialias, q // antialias
+            light[row, column, 0] += share * r
+            light[row, column, 1] += share * g
+            light[row, column, 2] += share * b
+
+
+@kernel
+def encode(light, out):
+    """Linear light to sRGB bytes, (height, width, 3); what is not a number is black."""
+    for row in range(light.shape[0]):
+        for column in range(light.shape[1]):
+            for c in range(3):
+                value = light[row, column, c]
+                out[row, column, c] = SRGB[int(min(value, 1) * (TONES - 1) + 0.5)] if value > 0 else 0
