@@ -1,0 +1,12 @@
+"""The environments.  This folder is imported as ``clothgym.envs``."""
+
+if __name__ != "clothgym.envs":
+    # with the repository's root on sys.path a bare `import envs` would make a second copy of every class
+    raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
+
+from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.task import Task, TaskState
+from clothgym.envs.vector import ClothVectorEnv
+
+__all__ = ["ClothDrapeEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothVectorEnv", "Task", "TaskState"]

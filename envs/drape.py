@@ -1,0 +1,352 @@
+"""ClothDrape-v0: lay a hanging sheet over a target, let go, and be judged when it has settled."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym import _jit
+from clothgym._jit import kernel
+from clothgym.collisions import Plane
+from clothgym.envs.measures import CENTROID, SPEED2, covered_share, soft_coverage
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.targets import SHAPES, Target, reference_coverage
+from clothgym.envs.task import Physics, Task
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.material import Material
+from clothgym.mesh import grid
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera, Solid
+
+SIDE = 0.6  # L [m]
+ROWS = 17
+SHEET = grid(ROWS, ROWS, SIDE, SIDE)
+
+FRICTION = 0.5
+THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its flat triangles stay outside of a round one
+JUDGED_POINTS = 256
+GUIDE_POINTS = 32
+COVERED_WITHIN = 0.02 * SIDE
+GUIDE_REACH = 0.15 * SIDE
+CENTRING_SCALE = 0.2  # in sides: performance is halved at this distance
+ENOUGH_COVERAGE, ENOUGH_CENTRING, ENOUGH_REST = 0.9, 0.1, 0.05
+
+# the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
+EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.25, 0.55, 0.25
+EXPERT_SPEED = 0.8  # share of the anchors' speed limit
+
+POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # in sides, and in m/s
+
+
+def _key_points() -> NDArray:
+    """Corners, middles of the edges, centre: particles of a 3 x 3 subgrid."""
+    line = np.array([0, ROWS // 2, ROWS - 1])
+    return (line[:, None] * ROWS + line[None, :]).ravel()
+
+
+@kernel
+def _gather(first, last, x, v, particles, origin, out):
+    """Positions relative to ``origin`` [m] and velocities [m/s] of some particles: (blocks, 6 * count, lanes)."""
+    for b in range(first, last):
+        for k in range(len(particles)):
+            for c in range(3):
+                for l in range(x.shape[3]):
+                    out[b, 3 * k + c, l] = x[b, particles[k], c, l] - origin[b, c, l]
+                    out[b, 3 * (len(particles) + k) + c, l] = v[b, particles[k], c, l]
+
+
+class DrapeTask(Task):
+    """The task of ``ClothDrape-v0``, see ``ClothDrapeEnv``."""
+
+    physics = Physics(
+        mesh=SHEET,
+        material=Material.preset("cotton"),
+        anchors=(SHEET.corners[2], SHEET.corners[3]),
+        anchor_speed=1.0,
+        time_step=1 / 30,
+        integrator="semi_implicit_euler",
+        substeps=57,
+    )
+    acting_steps = 60
+    settling_steps = 40
+    obs_modes = ("keypoints", "particles")
+    reset_options = ("material", "target")
+
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
+        super().__init__(num_envs, **kwargs)
+        self.targets: list[Target] = [Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0))] * num_envs
+        layout = self.simulation.layout
+        self.episode |= {
+            "target": np.zeros((num_envs, 6)),  # shape, radius, height, center, yaw
+            "reference": np.ones(num_envs),
+        }
+        self._origin = np.zeros((layout.blocks, 3, layout.lanes), np.float32)
+        self._guide = np.zeros((layout.blocks, GUIDE_POINTS, 3, layout.lanes), np.float32)
+        self._guided = np.zeros((layout.blocks, layout.lanes), np.float32)
+        self._seen = np.zeros((layout.blocks, 6 * len(self._particles), layout.lanes), np.float32)
+
+    @property
+    def _particles(self) -> NDArray:
+        return _key_points() if self.obs_mode == "keypoints" else np.arange(SHEET.num_particles)
+
+    def _colliders(self) -> list:
+        floor = Plane(friction=FRICTION, thickness=THICKNESS)
+        return [floor, Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
+
+    def _arena(self) -> tuple[NDArray, NDArray]:
+        return np.array([-1.2, -1.2, 0.01]), np.array([1.2, 1.2, 1.2])
+
+    # --- reset ----------------------------------------------------------------------------------------------------------
+
+    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        target = self._draw_target(rng, options.get("target", {}))
+        distance = SIDE * float(rng.uniform(0.75, 0.9))
+        sideways = SIDE * float(rng.uniform(-0.1, 0.1))
+        clearance = SIDE * float(rng.uniform(0.1, 0.25))
+        ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
+        self._place_target(env, target)
+        # the sheet hangs in a plane across the way to the target, its held edge up
+        rest = SHEET.rest_positions
+        x = target.center[0] + sideways + rest[:, 0]
+        y = target.center[1] - distance + ripple
+        z = clearance + SIDE / 2 + rest[:, 1]
+        return np.stack([x, y, z], axis=1)
+
+    @staticmethod
+    def _draw_target(rng: np.random.Generator, wanted: Mapping[str, Any]) -> Target:
+        known = ("shape", "radius", "height", "center", "yaw")
+        unknown = set(wanted) - set(known)
+        if unknown:
+            raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
+        drawn = Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape"))
+        figures = drawn.describe() | dict(wanted)
+        if "height" not in wanted and drawn.shape != "post":
+            figures["height"] = 2 * figures["radius"]
+        return Target(**figures)  # type: ignore[arg-type]
+
+    def _place_target(self, env: int, target: Target) -> None:
+        self.targets[env] = target
+        self.episode["target"][env] = (SHAPES.index(target.shape), target.radius, target.height, *target.center, target.yaw)
+        self.episode["reference"][env] = reference_coverage(target, SIDE)
+        self.simulation.set_collider(1, [target.collider(FRICTION, THICKNESS)], np.array([env]))
+        block, lane = divmod(env, self.simulation.layout.lanes)
+        self._origin[block, :, lane] = target.top
+        points = target.upper_surface(GUIDE_POINTS)
+        self._guide[block, :, :, lane] = points[np.arange(GUIDE_POINTS) % len(points)]
+
+    def set_state(self, state: Any) -> None:
+        super().set_state(state)
+        for env, (shape, radius, height, x, y, yaw) in enumerate(self.episode["target"].tolist()):
+            self._place_target(env, Target(SHAPES[int(shape)], radius, height, (x, y), yaw))
+
+    # --- what the agent sees --------------------------------------------------------------------------------------------
+
+    def _observation_bound(self) -> NDArray:
+        points = 3 * len(self._particles)
+        rest = [POSITION_BOUND] * 3 + [1.0] * (self.num_anchors + len(SHAPES) + 6)
+        return np.array([POSITION_BOUND] * points + [VELOCITY_BOUND] * points + rest, np.float32)
+
+    def _observe(self) -> NDArray:
+        view = self.simulation.view
+
+        def work(first: int, last: int) -> None:
+            _gather(first, last, view.x, view.v, self._particles, self._origin, self._seen)
+
+        _jit.run_spans(work, len(self._seen), self.threads)
+        points = self.simulation.layout.to_public(self._seen)
+        half = points.shape[1] // 2
+        points[:, :half] *= np.float32(1 / SIDE)
+        episode = self.episode
+        shape, radius, height, *_, yaw = episode["target"].T
+        settling = episode["settling_since"] >= 0
+        center = (self.simulation.layout.to_public(self._summary)[:, :3] - self._tops()) / SIDE
+        return np.concatenate(
+            [
+                points,
+                center,
+                self.simulation.attached,
+                shape[:, None] == np.arange(len(SHAPES)),
+                (radius / SIDE)[:, None],
+                (height / SIDE)[:, None],
+                (yaw * (4 / np.pi))[:, None],
+                settling[:, None],
+                (1 - episode["step"] / (self.acting_steps + self.settling_steps))[:, None],
+                (np.maximum(self.acting_steps - episode["step"], 0) / self.acting_steps)[:, None],
+            ],
+            axis=1,
+        )
+
+    def _tops(self) -> NDArray:
+        return self.episode["target"][:, [3, 4, 2]]
+
+    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
+
+    def _off_center(self, summary: NDArray) -> NDArray:
+        """Horizontal distance of the sheet's centre of area from the target's axis, in sides, (num_envs,)."""
+        off = summary[CENTROID : CENTROID + 2].T - self.episode["target"][:, 3:5]
+        return np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2) / SIDE
+
+    def _potential(self, summary: NDArray) -> NDArray:
+        view = self.simulation.view
+
+        def work(first: int, last: int) -> None:
+            soft_coverage(first, last, view.x, self._guide, np.float32(GUIDE_REACH), self._guided)
+
+        _jit.run_spans(work, len(self._guided), self.threads)
+        near = self.simulation.layout.to_public(self._guided)
+        return (near + _centring(self._off_center(summary))) / 2
+
+    def _judgement(self) -> dict[str, NDArray]:
+        names = ("normalized_performance", "coverage", "off_center", "rms_speed")
+        return {name: np.zeros(self.num_envs) for name in names} | {
+            "is_success": np.zeros(self.num_envs, bool),
+            "coverage_reference": self.episode["reference"].copy(),
+        }
+
+    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
+        reference = self.episode["reference"][envs]
+        coverage = np.array([self._coverage(env) for env in envs])
+        off_center = self._off_center(summary)[envs]
+        rms_speed = np.sqrt(summary[SPEED2][envs]).astype(np.float64)
+        share = coverage / reference
+        return {
+            "normalized_performance": np.minimum(share, 1.0) * _centring(off_center),
+            "coverage": coverage,
+            "off_center": off_center,
+            "rms_speed": rms_speed,
+            "is_success": (share >= ENOUGH_COVERAGE) & (off_center <= ENOUGH_CENTRING) & (rms_speed < ENOUGH_REST),
+        }
+
+    def _coverage(self, env: int) -> float:
+        block, lane = divmod(int(env), self.simulation.layout.lanes)
+        sheet = self.simulation.view.x[block, :, :, lane].astype(np.float64)
+        return covered_share(sheet, SHEET.triangles, self.targets[env].upper_surface(JUDGED_POINTS), COVERED_WITHIN)
+
+    # --- expert and picture ---------------------------------------------------------------------------------------------
+
+    def expert_actions(self) -> NDArray:
+        """Over the target in one straight line, beyond it by a quarter of a side, down, and let go.
+
+        Without memory: where the anchors are says which of the two ways they are on.
+        """
+        tops = self._tops()
+        middle = self.episode["targets"].mean(axis=1)
+        beyond = tops[:, 1] + EXPERT_BEYOND * SIDE
+        arrived = np.abs(middle[:, 1] - beyond) < 0.02
+        low = np.maximum(tops[:, 2] - EXPERT_DROP * SIDE, 0.02)
+        goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * SIDE)], axis=1)
+        # half of the way in each step, as far as the speed goes
+        move = (goal - middle) / (2 * self.physics.time_step * self.physics.anchor_speed)
+        length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[:, None]
+        release = arrived & (np.abs(middle[:, 2] - low) < 0.02)
+        actions = np.empty((self.num_envs, self.num_anchors, 4))
+        actions[:, :, :3] = move[:, None]
+        actions[:, :, 3] = np.where(release, 1.0, -1.0)[:, None]
+        return actions.reshape(self.num_envs, -1)
+
+    def solids(self, env: int) -> list[Solid]:
+        return [self.targets[env].solid()]
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera  # imported here: training draws nothing
+
+        return Camera(eye=(1.35, -1.15, 0.95), target=(0.0, -0.05, 0.22), vertical_fov=34.0)
+
+
+def _centring(off_center: NDArray) -> NDArray:
+    """1 in the centre, 1/2 at CENTRING_SCALE sides: smooth, and with a gradient from afar."""
+    return 1 / (1 + (off_center / CENTRING_SCALE) ** 2)
+
+
+class ClothDrapeEnv(ClothEnv):
+    """Lay a hanging sheet over a target and let go of it.
+
+    ## Description
+    A square cotton sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.75 to 0.9 L in front of a target
+    that stands on the floor: a sphere (radius 0.2 to 0.3 L), a box (side 0.3 to 0.5 L) or a round-topped post (radius 0.1 to
+    0.15 L, height 0.4 to 0.6 L).  The agent moves both corners and may let go of each.  When it holds none, or after 60
+    steps, the sheet settles for 40 steps, in which actions are ignored; then it is judged.
+
+    The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 57 substeps, friction 0.5, linear air drag.
+    (Settling takes 40 steps, not fewer, because the corners that hang from a thin post swing for more than a second.)
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each corner:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | let go for good, if above 0.5 | [-1, 1] | |
+
+    ## Observation Space
+    ``Box`` of 68 numbers for ``obs_mode="keypoints"`` (and 6 x 289 + 14 for ``"particles"``, all particles row by row):
+
+    | Num | Observation | Bound |
+    | --- | --- | --- |
+    | 0-26 | 3 x 3 points of the sheet (corners, edge middles, centre) relative to the target's top, in L | 4 |
+    | 27-53 | their velocities [m/s] | 5 |
+    | 54-56 | centre of area relative to the target's top, in L | 4 |
+    | 57-58 | whether each corner is held | 1 |
+    | 59-61 | sphere, box, post | 1 |
+    | 62-64 | target's radius or half side and height, in L; its yaw over 45 degrees | 1 |
+    | 65-67 | settling; share of the episode left; share of the acting time left | 1 |
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure.
+    While the episode runs the potential is the mean of how near the sheet is to 32 points of the target's upper surface,
+    ``1/(1 + (d/0.15 L)^2)``, and of how central its centre of area is, ``1/(1 + (e/0.2 L)^2)``.  At the end it is the
+    normalised performance, at a failure 0: the return is the score, less the start's potential and the small terms.
+    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+
+    ## Judgement
+    Coverage C is the share of 256 points, spread evenly over that part of the target's surface which slopes by at most 60 degrees, that
+    lie within 0.02 L of a triangle of the sheet; C_ref is that of a fine (49 x 49) sheet let down flat and centred on the same
+    target (``benchmarks/drape_reference.py``); e is the horizontal distance of the sheet's centre of area from the target's axis.
+
+    ``info["normalized_performance"]`` = min(C / C_ref, 1) / (1 + (e / 0.2 L)^2): 0 for a sheet that does not touch the target's
+    top, 1 for the fine sheet's coverage dead centre.  ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and rms speed under
+    0.05 m/s.  ``info`` also has ``coverage``, ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``,
+    ``settling``, ``failure`` and ``reward_terms``.  What belongs to the judgement is 0 until then.
+
+    ## Starting State
+    The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
+    millimetre; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
+
+    ## Episode End
+    Terminated when judged, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's centre 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
+    goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    | Argument | Default | Meaning |
+    | --- | --- | --- |
+    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``substeps`` | 57 | or ``"auto"`` |
+    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
+    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
+    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
+    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
+    | ``render_mode`` | ``None`` | ``"rgb_array"`` or ``"depth_array"`` |
+
+    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the rest is drawn),
+    and ``"material"``, a dict of figures for one episode.
+
+    ## Vectorized environment
+    ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded ``s + i``, bit for bit.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = DrapeTask
+
+
+class ClothDrapeVectorEnv(ClothVectorEnv):
+    """``ClothDrape-v0`` as a batch, see ``ClothDrapeEnv``."""
+
+    task_class = DrapeTask

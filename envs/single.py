@@ -1,0 +1,72 @@
+"""The Gymnasium environment: a task as a batch of one."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.task import Task, TaskState
+
+RENDER_MODES = ["rgb_array", "depth_array"]
+FRAMES_PER_SECOND = 30
+IMAGE_SIZE = 480
+
+
+class ClothEnv(gym.Env[NDArray, NDArray]):
+    """Base of the single environments; a subclass names its ``Task``."""
+
+    task_class: ClassVar[type[Task]]
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - Gymnasium's own
+
+    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        kwargs.setdefault("threads", 1)
+        self.task = self.task_class(1, **kwargs)
+        self.observation_space = self.task.single_observation_space
+        self.action_space = self.task.single_action_space
+        self._renderer: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.task.reset(np.array([0]), [seed], options)
+        self._np_random = self.task.generators[0]
+        return self.task.episode["observation"][0].copy(), {"failure": ""}
+
+    def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
+        outcome = self.task.step(np.asarray(action)[None])
+        observation = self.task.episode["observation"][0].copy()
+        return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), bool(outcome.truncated[0]), pick(outcome.info, 0)
+
+    def expert_action(self) -> NDArray:
+        """What the task's scripted expert does now; it sees the whole state."""
+        return self.task.expert_actions()[0].astype(np.float32)
+
+    def render(self) -> NDArray | None:  # type: ignore[override]
+        if self.render_mode is None:
+            gym.logger.warn("render() without a render_mode does nothing; use gym.make(..., render_mode='rgb_array')")
+            return None
+        if self._renderer is None:
+            self._renderer = self.task.renderer(IMAGE_SIZE, IMAGE_SIZE)
+        return self.task.draw(self._renderer, self.render_mode, [0])[0]
+
+    def get_state(self) -> TaskState:
+        """All that is needed to continue the episode bit for bit."""
+        return self.task.get_state()
+
+    def set_state(self, state: TaskState) -> None:
+        self.task.set_state(state)
+        self._np_random = self.task.generators[0]
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    if render_mode is not None and render_mode not in RENDER_MODES:
+        raise ValueError(f"render_mode={render_mode!r}: must be None or one of {', '.join(RENDER_MODES)}")
+
+
+def pick(info: dict[str, Any], env: int) -> dict[str, Any]:
+    """One environment's part of a batch's info, as plain Python values."""
+    return {key: pick(value, env) if isinstance(value, dict) else value[env].item() for key, value in info.items()}

@@ -1,0 +1,149 @@
+"""The solids that a sheet is draped over: drawn at reset, standing on the floor, with points on their upper surface."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.collisions import Box, Capsule, Collider, Sphere
+
+if TYPE_CHECKING:
+    from clothgym.render import Solid
+
+SHAPES = ("sphere", "box", "post")
+# ranges of (width, height) by shape, in sides of the sheet: sphere radius, box half side, post radius; post height
+SIZES = {"sphere": ((0.2, 0.3), None), "box": ((0.15, 0.25), None), "post": ((0.1, 0.15), (0.4, 0.6))}
+# a surface is "upper" where it slopes by at most this: below, cloth hangs free of it in folds
+UPPER_SLOPE = math.radians(60)
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+@dataclass(frozen=True)
+class Target:
+    """A sphere, an upright box or a round-topped post on the floor.
+
+    Attributes:
+        shape: one of SHAPES.
+        radius: of sphere and post, half side of the box [m].
+        height: of its highest point [m]; a sphere's is twice its radius, a box's twice its half side.
+        center: of its axis on the floor [m].
+        yaw: of the box [rad].
+    """
+
+    shape: str
+    radius: float
+    height: float
+    center: tuple[float, float]
+    yaw: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.shape not in SHAPES:
+            raise ValueError(f"target shape={self.shape!r}: must be one of {', '.join(SHAPES)}")
+        for name in ("radius", "height"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"target {name}={getattr(self, name)!r}: must be a positive, finite length in metres")
+        if self.shape in ("sphere", "box") and not math.isclose(self.height, 2 * self.radius, rel_tol=1e-6):
+            raise ValueError(f"target height={self.height!r}: that of a {self.shape} is twice its radius {self.radius!r}")
+        if self.shape == "post" and self.height < self.radius:
+            raise ValueError(f"target height={self.height!r}: that of a post is at least its radius {self.radius!r}")
+        if len(self.center) != 2 or not all(map(math.isfinite, (*self.center, self.yaw))):
+            raise ValueError(f"target center={self.center!r}, yaw={self.yaw!r}: must be two finite numbers and one")
+
+    @staticmethod
+    def draw(rng: np.random.Generator, side: float, spread: float, shape: str | None = None) -> Target:
+        """A target for a sheet of that side [m], its axis within ``spread`` [m] of the origin."""
+        shape = shape if shape is not None else SHAPES[int(rng.integers(len(SHAPES)))]
+        if shape not in SHAPES:
+            raise ValueError(f"target shape={shape!r}: must be one of {', '.join(SHAPES)}")
+        widths, heights = SIZES[shape]
+        radius = side * float(rng.uniform(*widths))
+        height = side * float(rng.uniform(*heights)) if heights else 2 * radius
+        distance, angle = spread * math.sqrt(float(rng.uniform())), 2 * math.pi * float(rng.uniform())
+        yaw = float(rng.uniform(-math.pi / 4, math.pi / 4)) if shape == "box" else 0.0
+        return Target(shape, radius, height, (distance * math.cos(angle), distance * math.sin(angle)), yaw)
+
+    @property
+    def top(self) -> tuple[float, float, float]:
+        """Highest point of its axis [m]."""
+        return (*self.center, self.height)
+
+    def collider(self, friction: float, thickness: float) -> Collider:
+        x, y = self.center
+        if self.shape == "sphere":
+            return Sphere(center=(x, y, self.radius), radius=self.radius, friction=friction, thickness=thickness)
+        if self.shape == "box":
+            half = (self.radius, self.radius, self.radius)
+            return Box(center=(x, y, self.radius), half_sides=half, yaw=self.yaw, friction=friction, thickness=thickness)
+        # the lower round end is sunk, so that the post stands on the floor as a cylinder
+        length = self.height + self.radius
+        center = (x, y, self.height - length / 2)
+        return Capsule(center=center, radius=self.radius, height=max(length, 2 * self.radius), friction=friction, thickness=thickness)
+
+    def solid(self) -> Solid:
+        """The same for the renderer."""
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        x, y = self.center
+        if self.shape == "sphere":
+            return Solid(kind="sphere", center=(x, y, self.radius), radius=self.radius)
+        if self.shape == "box":
+            return Solid(kind="box", center=(x, y, self.radius), half_sides=(self.radius,) * 3, yaw=self.yaw)
+        length = self.height + self.radius
+        return Solid(kind="capsule", center=(x, y, self.height - length / 2), radius=self.radius, height=length)
+
+    def upper_surface(self, count: int) -> NDArray[np.float64]:
+        """About ``count`` points, evenly by area, where the surface slopes by at most UPPER_SLOPE [m], (points, 3)."""
+        if self.shape == "box":
+            points = _square(count) * self.radius
+            c, s = math.cos(self.yaw), math.sin(self.yaw)
+            turned = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+            return turned + (*self.center, self.height)
+        return _cap(count) * self.radius + (*self.center, self.height - self.radius)
+
+    def describe(self) -> dict[str, object]:
+        return asdict(self)
+
+
+@lru_cache
+def _cap(count: int) -> NDArray[np.float64]:
+    """Fibonacci points on the unit sphere's cap up to UPPER_SLOPE: equal steps in z are equal areas (Archimedes)."""
+    k = np.arange(count)
+    z = 1 - (1 - math.cos(UPPER_SLOPE)) * (k + 0.5) / count
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE), z], axis=1)
+
+
+@lru_cache
+def _square(count: int) -> NDArray[np.float64]:
+    """Cell centres of the square [-1, 1]^2 at z = 0: ``count`` rounded to a square number."""
+    n = max(1, round(math.sqrt(count)))
+    line = (np.arange(n) + 0.5) / n * 2 - 1
+    return np.stack([*(g.ravel() for g in np.meshgrid(line, line)), np.zeros(n * n)], axis=1)
+
+
+@lru_cache
+def _reference_table() -> dict[str, tuple[NDArray, NDArray, NDArray]]:
+    text = resources.files("clothgym.envs").joinpath("drape_reference.json").read_text()
+    return {
+        shape: tuple(np.array(rows[name], dtype=float) for name in ("widths", "heights", "coverage"))  # type: ignore[misc]
+        for shape, rows in json.loads(text)["shapes"].items()
+    }
+
+
+def reference_coverage(target: Target, side: float) -> float:
+    """Coverage that a fine sheet, laid flat and centred, reaches on this target: the ideal of the task.
+
+    Bilinear in the committed table over width and height (in sheet sides); beyond the table its edge holds.
+    """
+    widths, heights, coverage = _reference_table()[target.shape]
+    if len(heights) == 1:
+        return float(np.interp(target.radius / side, widths, coverage[:, 0]))
+    by_width = [float(np.interp(target.radius / side, widths, column)) for column in coverage.T]
+    return float(np.interp(target.height / side, heights, by_width))

@@ -1,0 +1,434 @@
+"""A task, written once for a batch: what ``ClothEnv`` (a batch of one) and ``ClothVectorEnv`` (a batch of many) both run.
+
+An episode: the agent moves the anchors until it has let go of all of them, or until its time is up and they are released for
+it; then the sheet settles for a fixed number of steps, in which actions are ignored; then it is judged, which terminates.
+"""
+
+from __future__ import annotations
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+
+from clothgym import _jit
+from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, SUMMARY, summarize
+from clothgym.material import Material
+from clothgym.mesh import SHEAR, ClothMesh
+from clothgym.simulation import FIGURES, Simulation
+from clothgym.state import State
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera, Renderer, Solid
+
+REWARD_MODES = ("delta", "sparse")
+FAILURE_PENALTY = 0.5
+EFFORT_PRICE = 0.001
+TORN = 2.0  # a structural spring at twice its rest length
+FAILURES = ("", "diverged", "torn", "out_of_bounds")
+HELD, OPEN = (250, 200, 60), (150, 150, 150)  # colours of the anchors' markers
+LETS_GO = 0.5  # an action above this opens the anchor
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What an id fixes: control step [s], sheet, fabric, integrator, substeps, anchors."""
+
+    mesh: ClothMesh
+    material: Material
+    anchors: tuple[int, ...]
+    anchor_speed: float
+    time_step: float
+    integrator: str
+    substeps: int
+
+
+@dataclass
+class TaskState:
+    """All that is needed to continue a batch of episodes bit for bit: physics, episode, random generators."""
+
+    simulation: State
+    episode: dict[str, NDArray]
+    generators: list[str]
+
+
+@dataclass
+class Outcome:
+    """What a step brought, arrays over the batch; ``info`` may nest one level."""
+
+    reward: NDArray
+    terminated: NDArray
+    truncated: NDArray
+    info: dict[str, Any]
+
+
+class Task(ABC):
+    """Base of all tasks.
+
+    Args:
+        num_envs: environments in the batch.
+        integrator: another integrator than the task's own; its substeps are then chosen automatically.
+        substeps: substeps of a control step, or "auto"; the task's own number by default.
+        obs_mode: one of ``obs_modes``.
+        reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the judgement alone).
+        randomize: ranges of material figures drawn at each reset, ``{"density": [0.1, 0.2]}``.
+        threads: threads to use; all processors by default for a batch.
+
+    Raises:
+        ValueError: an unknown mode, figure or integrator, or a range that is none; the message says what would do.
+    """
+
+    physics: ClassVar[Physics]
+    acting_steps: ClassVar[int]
+    settling_steps: ClassVar[int]
+    obs_modes: ClassVar[tuple[str, ...]]
+    reset_options: ClassVar[tuple[str, ...]] = ("material",)
+
+    def __init__(
+        self,
+        num_envs: int,
+        integrator: str | None = None,
+        substeps: int | str | None = None,
+        obs_mode: str = "keypoints",
+        reward_mode: str = "delta",
+        randomize: Mapping[str, Sequence[float]] | None = None,
+        threads: int | None = None,
+    ) -> None:
+        for name, value, known in (("obs_mode", obs_mode, self.obs_modes), ("reward_mode", reward_mode, REWARD_MODES)):
+            if value not in known:
+                raise ValueError(f"{name}={value!r}: must be one of {', '.join(known)}")
+        self.obs_mode, self.reward_mode = obs_mode, reward_mode
+        self.randomize = _checked_ranges(randomize or {})
+        physics = self.physics
+        if substeps is None:
+            substeps = physics.substeps if integrator in (None, physics.integrator) and not self.randomize else "auto"
+        self.simulation = Simulation(
+            physics.mesh,
+            # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
+            material=_extreme(physics.material, self.randomize),
+            num_envs=num_envs,
+            integrator=integrator if integrator is not None else physics.integrator,
+            time_step=physics.time_step,
+            substeps=substeps,  # type: ignore[arg-type]
+            colliders=self._colliders(),
+            anchors=physics.anchors,
+            anchor_speed=2 * physics.anchor_speed,
+            threads=threads,
+        )
+        self.num_envs = num_envs
+        self.threads = self.simulation.threads
+        self.num_anchors = len(physics.anchors)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (4 * self.num_anchors,), np.float32)
+        bound = self._observation_bound()
+        self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
+        self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
+        self._seeded = np.zeros(num_envs, bool)
+
+        mesh = physics.mesh
+        self._share = (mesh.area / mesh.area.sum()).astype(np.float32)
+        self._structural = np.flatnonzero(mesh.springs.kind < SHEAR)
+        layout = self.simulation.layout
+        self._summary = np.zeros((layout.blocks, SUMMARY, layout.lanes), np.float32)
+        # the episode: arrays over the batch, all of them part of the state
+        self.episode: dict[str, NDArray] = {
+            "step": np.zeros(num_envs, np.int64),
+            "settling_since": np.full(num_envs, -1, np.int64),
+            "over": np.ones(num_envs, bool),
+            "targets": np.zeros((num_envs, self.num_anchors, 3)),
+            "potential": np.zeros(num_envs),
+            "observation": np.zeros((num_envs, len(bound)), np.float32),
+            "material": np.zeros((num_envs, len(FIGURES))),
+        }
+
+    # --- what each task says --------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _colliders(self) -> list:
+        """The scene's solids; those that change at reset are replaced by ``_begin``."""
+
+    @abstractmethod
+    def _observation_bound(self) -> NDArray:
+        """Largest magnitude of each component of the observation, (size,)."""
+
+    @abstractmethod
+    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        """Draw one environment's scene; the sheet's particles at the start [m], (particles, 3)."""
+
+    @abstractmethod
+    def _observe(self) -> NDArray:
+        """Observations of the whole batch, (num_envs, size), not yet clipped to the bounds."""
+
+    @abstractmethod
+    def _potential(self, summary: NDArray) -> NDArray:
+        """How far along each environment is, in [0, 1], (num_envs,); its change is the reward on the way."""
+
+    @abstractmethod
+    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
+        """Judge environments at the end of their episodes: at least "normalized_performance" and "is_success", (len(envs),)."""
+
+    @abstractmethod
+    def _judgement(self) -> dict[str, NDArray]:
+        """The keys of ``_judge`` for an environment that has not been judged."""
+
+    @abstractmethod
+    def _arena(self) -> tuple[NDArray, NDArray]:
+        """Lowest and highest corner of the room in which anchors move [m]; the sheet is out of bounds 0.5 m beyond it."""
+
+    @abstractmethod
+    def expert_actions(self) -> NDArray:
+        """What a scripted expert does now, (num_envs, actions); it sees the whole state."""
+
+    @abstractmethod
+    def solids(self, env: int) -> list[Solid]:
+        """What the renderer draws beside the sheet and the floor."""
+
+    @abstractmethod
+    def camera(self) -> Camera:
+        """Where the scene is seen from."""
+
+    # --- episode --------------------------------------------------------------------------------------------------------
+
+    def reset(self, envs: NDArray, seeds: Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> None:
+        """Begin new episodes; a seed of None goes on with the environment's generator."""
+        options = options or {}
+        unknown = set(options) - set(self.reset_options)
+        if unknown:
+            raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
+        if not len(envs):
+            return
+        starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
+        for k, env in enumerate(envs):
+            seed = seeds[k] if seeds is not None else None
+            if seed is not None or not self._seeded[env]:
+                self.generators[env] = seeding.np_random(seed)[0]
+                self._seeded[env] = True
+            self._draw_material(env, options.get("material", {}))
+            starts[k] = self._begin(env, self.generators[env], options)
+        if self.randomize or "material" in options or not np.array_equal(
+            self.episode["material"][envs], np.broadcast_to(self._own_figures(), (len(envs), len(FIGURES)))
+        ):
+            figures = {name: self.episode["material"][envs, i] for i, name in enumerate(FIGURES)}
+            self.simulation.set_parameters(envs, **figures)
+        self.simulation.reset(envs, positions=starts)
+        episode = self.episode
+        episode["step"][envs] = 0
+        episode["settling_since"][envs] = -1
+        episode["over"][envs] = False
+        episode["targets"][envs] = starts[:, self.physics.anchors]
+        summary = self._summarize()
+        episode["potential"][envs] = self._potential(summary)[envs]
+        episode["observation"][envs] = self._clipped_observation()[envs]
+
+    def _own_figures(self) -> NDArray:
+        return np.array([getattr(self.physics.material, name) for name in FIGURES])
+
+    def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
+        figures = dict(zip(FIGURES, self._own_figures().tolist()))
+        for name, (low, high) in self.randomize.items():
+            figures[name] = float(self.generators[env].uniform(low, high))
+        for name, value in fixed.items():
+            if name not in FIGURES:
+                raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
+            figures[name] = float(value)
+        Material(**figures)
+        self.episode["material"][env] = list(figures.values())
+
+    def check_actions(self, actions: Any) -> NDArray:
+        """Actions as float64, clipped to [-1, 1], (num_envs, actions).
+
+        Raises:
+            ValueError: a wrong shape or a value that is not finite; nothing has moved then.
+        """
+        array = np.asarray(actions, dtype=np.float64)
+        shape = (self.num_envs, *self.single_action_space.shape)
+        if array.shape != shape:
+            raise ValueError(f"action has shape {array.shape}: must be {shape}")
+        if not np.isfinite(array).all():
+            env, component = np.argwhere(~np.isfinite(array))[0]
+            raise ValueError(f"action[{component}] of environment {env} is {array[env, component]}: actions must be finite")
+        return np.clip(array, -1.0, 1.0)
+
+    def step(self, actions: NDArray) -> Outcome:
+        """One control step of all environments that are not over; the others keep still and get no reward."""
+        actions = self.check_actions(actions)
+        episode, simulation = self.episode, self.simulation
+        running = ~episode["over"]
+        acting = running & (episode["settling_since"] < 0)
+        moves = actions.reshape(self.num_envs, self.num_anchors, 4)
+        self._move_anchors(moves, acting)
+        simulation.step()
+        episode["step"][running] += 1
+        self._let_go(moves, acting)
+
+        summary = self._summarize()
+        failure = self._failures(summary)
+        settled = (episode["settling_since"] >= 0) & (episode["step"] - episode["settling_since"] >= self.settling_steps)
+        failure[~running] = 0
+        judged = running & settled & (failure == 0)
+        terminated = judged | (failure > 0)
+        info = self._judgement()
+        for key, value in self._judge(np.flatnonzero(judged), summary).items():
+            info[key][judged] = value
+        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info["normalized_performance"])
+        reward = terms["progress"] + terms["effort"] + terms["failure"]
+
+        fresh = self._clipped_observation()
+        keep = ~running | (failure == 1)
+        episode["observation"] = np.where(keep[:, None], episode["observation"], fresh)
+        episode["over"] |= terminated
+        info |= {
+            "reward_terms": terms,
+            "strain_max": np.sqrt(summary[STRETCH2]) - 1,
+            "settling": episode["settling_since"] >= 0,
+            "failure": np.array(FAILURES)[failure],
+        }
+        return Outcome(reward, terminated, np.zeros(self.num_envs, bool), info)
+
+    def _move_anchors(self, moves: NDArray, acting: NDArray) -> None:
+        low, high = self._arena()
+        reach = self.physics.anchor_speed * self.physics.time_step
+        targets = self.episode["targets"]
+        wanted = np.clip(targets + reach * _within_ball(moves[:, :, :3]), low, high)
+        self.episode["targets"] = np.where(acting[:, None, None], wanted, targets)
+        self.simulation.move_anchors(self.episode["targets"])
+
+    def _let_go(self, moves: NDArray, acting: NDArray) -> None:
+        """Open the anchors that the action opens, or all when time is up; who holds nothing any more begins to settle."""
+        episode, simulation = self.episode, self.simulation
+        held = simulation.attached
+        late = episode["step"] >= self.acting_steps
+        opens = held & acting[:, None] & ((moves[:, :, 3] > LETS_GO) | late[:, None])
+        if opens.any():
+            simulation.release(*np.nonzero(opens))
+        done = acting & ~(held & ~opens).any(axis=1)
+        episode["settling_since"][done] = episode["step"][done]
+
+    def _summarize(self) -> NDArray:
+        """Summary of the batch, (SUMMARY, num_envs) (see ``measures.summarize``)."""
+        view = self.simulation.view
+
+        def work(first: int, last: int) -> None:
+            summarize(first, last, view.x, view.v, self._share, view.springs, self._structural, self._summary)
+
+        _jit.run_spans(work, len(self._summary), self.threads)
+        return self.simulation.layout.to_public(self._summary).T
+
+    def _failures(self, summary: NDArray) -> NDArray:
+        """Index into FAILURES, (num_envs,)."""
+        low, high = self._arena()
+        center = summary[:3].T
+        outside = np.any((center < low - 0.5) | (center > high + 0.5), axis=1)
+        torn = summary[STRETCH2] > TORN**2
+        diverged = summary[FINITE] == 0
+        return np.where(diverged, 1, np.where(torn, 2, np.where(outside, 3, 0)))
+
+    def _reward_terms(
+        self,
+        moves: NDArray,
+        acting: NDArray,
+        running: NDArray,
+        judged: NDArray,
+        failure: NDArray,
+        summary: NDArray,
+        performance: NDArray,
+    ) -> dict[str, NDArray]:
+        """Reward terms, (num_envs,) each: the change of the potential, which ends at the judged performance, less small prices."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            potential = np.where(judged, performance, np.where(failure > 0, 0.0, self._potential(summary)))
+        previous = self.episode["potential"]
+        self.episode["potential"] = np.where(running, potential, previous)
+        if self.reward_mode == "sparse":
+            return {"progress": performance * judged, "effort": np.zeros(self.num_envs), "failure": np.zeros(self.num_envs)}
+        squares = moves[:, :, 0] ** 2 + moves[:, :, 1] ** 2 + moves[:, :, 2] ** 2
+        effort = squares[:, 0].copy()
+        for a in range(1, self.num_anchors):
+            effort += squares[:, a]
+        return {
+            "progress": np.where(running, potential - previous, 0.0),
+            "effort": -EFFORT_PRICE * effort * acting,
+            "failure": -FAILURE_PENALTY * (failure > 0),
+        }
+
+    def _clipped_observation(self) -> NDArray:
+        space = self.single_observation_space
+        with np.errstate(invalid="ignore"):
+            return np.clip(self._observe(), space.low, space.high).astype(np.float32)
+
+    # --- pictures -------------------------------------------------------------------------------------------------------
+
+    def renderer(self, width: int, height: int, antialias: int = 2) -> Renderer:
+        """A renderer for this task's sheet and camera."""
+        from clothgym.render import Renderer  # imported here: training draws nothing
+
+        mesh = self.physics.mesh
+        return Renderer(
+            mesh.triangles, mesh.rest_positions[:, :2], self.camera(), width, height, antialias, self.threads, grid_shape=mesh.shape
+        )
+
+    def draw(self, renderer: Renderer, mode: str, envs: Sequence[int]) -> NDArray:
+        """Frames of some environments: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array"."""
+        positions = self.simulation.positions[list(envs)]
+        targets, attached = self.episode["targets"], self.simulation.attached
+        solids = [self.solids(env) for env in envs]
+        markers = [[(x, HELD if held else OPEN) for x, held in zip(targets[env], attached[env])] for env in envs]
+        if mode == "depth_array":
+            return renderer.depth_batch(positions, solids, markers)
+        return renderer.rgb_batch(positions, solids, markers)
+
+    # --- state ----------------------------------------------------------------------------------------------------------
+
+    def get_state(self) -> TaskState:
+        return TaskState(
+            simulation=self.simulation.get_state(),
+            episode={name: value.copy() for name, value in self.episode.items()},
+            generators=[json.dumps(g.bit_generator.state) for g in self.generators],
+        )
+
+    def set_state(self, state: TaskState) -> None:
+        """Continue from a state of the same task with as many environments.
+
+        Raises:
+            ValueError: the state is another task's or of another size; nothing is changed then.
+        """
+        missing = set(self.episode) ^ set(state.episode)
+        if missing or len(state.generators) != self.num_envs:
+            raise ValueError(f"the state is of {len(state.generators)} environments of another task or size: it differs in {sorted(missing)}")
+        self.simulation.set_state(state.simulation)
+        self.episode = {name: value.copy() for name, value in state.episode.items()}
+        for env, text in enumerate(state.generators):
+            self.generators[env] = np.random.default_rng()
+            self.generators[env].bit_generator.state = json.loads(text)
+        self._seeded[:] = True
+
+
+def _within_ball(vectors: NDArray) -> NDArray:
+    """Vectors in the cube [-1, 1]^3 shortened to length 1 where they are longer: the speed limit holds in every direction."""
+    squares = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
+    return vectors / np.sqrt(np.maximum(squares, 1.0))[..., None]
+
+
+def _checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    checked = {}
+    for name, bounds in ranges.items():
+        if name not in FIGURES:
+            raise ValueError(f"randomize: no material figure {name!r} (there are: {', '.join(FIGURES)})")
+        if np.shape(bounds) != (2,) or not np.all(np.isfinite(bounds)) or bounds[0] > bounds[1]:
+            raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
+        for bound in bounds:
+            Material(**{name: float(bound)})
+        checked[name] = (float(bounds[0]), float(bounds[1]))
+    return checked
+
+
+def _extreme(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:
+    """The fabric of the ranges that needs the smallest substeps: as light, stiff and damped as can be drawn."""
+    figures = {name: getattr(material, name) for name in FIGURES}
+    for name, (low, high) in ranges.items():
+        figures[name] = low if name == "density" else high
+    return Material(**figures, source=material.source)

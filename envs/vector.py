@@ -1,0 +1,146 @@
+"""The native vector environment: a task as a batch of many, stepped in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from clothgym.envs.single import FRAMES_PER_SECOND, RENDER_MODES, check_render_mode
+from clothgym.envs.task import Task, TaskState
+
+IMAGE_SIZE = 240
+
+
+class ClothVectorEnv(VectorEnv):
+    """Base of the vector environments; a subclass names its ``Task``.
+
+    Args:
+        num_envs: environments in the batch; environment ``i`` of a batch seeded ``s`` equals a single one seeded ``s + i``.
+        autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
+        render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
+        kwargs: those of the task.
+    """
+
+    task_class: ClassVar[type[Task]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r}: a batch needs at least 1 environment, as an integer")
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            known = ", ".join(repr(mode.value) for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": RENDER_MODES, "render_fps": FRAMES_PER_SECOND, "autoreset_mode": self.autoreset_mode}
+        self.task = self.task_class(int(num_envs), **kwargs)
+        self.num_envs = int(num_envs)
+        self.single_observation_space = self.task.single_observation_space
+        self.single_action_space = self.task.single_action_space
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._renderer: Any = None
+
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
+        """Begin new episodes in all environments, or in those of ``options["reset_mask"]``, (num_envs,) of bool."""
+        options = dict(options or {})
+        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+            raise ValueError(f"options['reset_mask'] must be {self.num_envs} booleans with at least one True, not {mask!r}")
+        if seed is None:
+            seeds: list[int | None] = [None] * self.num_envs
+        elif isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments: give one each, or one integer")
+        envs = np.flatnonzero(mask)
+        self.task.reset(envs, [seeds[env] for env in envs], options)
+        return self._observation(), {"failure": np.full(self.num_envs, ""), "_failure": mask}
+
+    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
+        over = self.task.episode["over"].copy()
+        outcome = self.task.step(actions)
+        info = _with_masks(outcome.info, ~over)
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
+            # those that ended in the last step begin anew in this one: their actions were ignored
+            self.task.reset(np.flatnonzero(over))
+        elif self.autoreset_mode == AutoresetMode.SAME_STEP:
+            ended = outcome.terminated | outcome.truncated
+            if ended.any():
+                self._reset_ended(ended, info)
+        return self._observation(), outcome.reward, outcome.terminated, outcome.truncated, info
+
+    def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> None:
+        """Same-step mode: keep the last observations and infos in ``info``, then begin anew."""
+        final = np.full(self.num_envs, None, dtype=object)
+        for env in np.flatnonzero(ended):
+            final[env] = self.task.episode["observation"][env].copy()
+        info["final_info"] = _with_masks({key: value for key, value in info.items() if not key.startswith("_")}, ended)
+        info["_final_info"] = ended.copy()
+        info["final_obs"], info["_final_obs"] = final, ended.copy()
+        self.task.reset(np.flatnonzero(ended))
+
+    def _observation(self) -> NDArray:
+        return self.task.episode["observation"].copy()
+
+    def render(self) -> tuple[NDArray, ...] | None:
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = self.task.renderer(IMAGE_SIZE, IMAGE_SIZE, antialias=1)
+        return tuple(self.task.draw(self._renderer, self.render_mode, list(range(self.num_envs))))
+
+    # --- what users of Gymnasium's own vector environments rely on ------------------------------------------------------
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Call a method, or read an attribute, of the batch on behalf of each environment."""
+        value = getattr(self, name)
+        result = value(*args, **kwargs) if callable(value) else value
+        each = name in ("render", "expert_actions") and result is not None
+        return tuple(result) if each else (result,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of the batch; a list must hold one value, the same for all environments."""
+        if isinstance(values, (list, tuple)):
+            if any(value != values[0] for value in values):
+                raise ValueError(f"{name} belongs to the whole batch: {values!r} must be one value")
+            values = values[0]
+        setattr(self, name, values)
+
+    def expert_actions(self) -> NDArray:
+        """What the task's scripted expert does now, (num_envs, actions)."""
+        return self.task.expert_actions().astype(np.float32)
+
+    def get_state(self) -> TaskState:
+        """All that is needed to continue the batch bit for bit."""
+        return self.task.get_state()
+
+    def set_state(self, state: TaskState) -> None:
+        self.task.set_state(state)
+
+
+def _with_masks(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
+    """Gymnasium's vector info: each array beside a mask ``_key`` of the environments that it speaks of."""
+    masked: dict[str, Any] = {}
+    for key, value in info.items():
+        masked[key] = _with_masks(value, mask) if isinstance(value, dict) else value
+        masked[f"_{key}"] = mask.copy()
+    return masked
