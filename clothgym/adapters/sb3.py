@@ -1,0 +1,112 @@
+"""Stable-Baselines3's VecEnv over the native batch.
+
+SB3 takes no Gymnasium ``VectorEnv``; this is the thin coat it needs.  Infos are built for the environments that ended and for
+no others: filling a dictionary an environment and step would cost more than the physics of a small sheet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from clothgym.envs.single import ClothEnv, pick
+from clothgym.envs.vector import ClothVectorEnv
+
+
+class ClothSB3VecEnv(VecEnv):
+    """A ``ClothVectorEnv`` in same-step mode as an SB3 ``VecEnv``."""
+
+    def __init__(self, env: ClothVectorEnv) -> None:
+        if env.autoreset_mode.value != "SameStep":
+            raise ValueError(f"autoreset_mode={env.autoreset_mode.value!r}: SB3 needs 'SameStep'")
+        self.env = env
+        self._actions: NDArray | None = None
+        self._seed: int | None = None
+        self._reset_options: dict[str, Any] = {}
+        self.render_mode = env.render_mode
+        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+
+    def reset(self) -> NDArray:
+        observation, _ = self.env.reset(seed=self._seed, options=self._reset_options)
+        self._seed, self._reset_options = None, {}
+        self.reset_infos = [{} for _ in range(self.num_envs)]
+        return observation
+
+    def step_async(self, actions: NDArray) -> None:
+        self._actions = actions
+
+    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
+        observation, reward, terminated, truncated, info = self.env.step(self._actions)  # type: ignore[arg-type]
+        done = terminated | truncated
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        if done.any():
+            final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
+            final["reward_terms"] = {k: v for k, v in final["reward_terms"].items() if not k.startswith("_")}
+            for env in np.flatnonzero(done):
+                infos[env] = pick(final, env)
+                infos[env]["terminal_observation"] = info["final_obs"][env]
+                infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
+        return observation, reward.astype(np.float32), done, infos
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seed the next reset: environment ``i`` gets ``seed + i``."""
+        self._seed = seed
+        return [None if seed is None else seed + i for i in range(self.num_envs)]
+
+    def set_options(self, options: Any = None) -> None:
+        """Options of the next reset, the same for all environments."""
+        if isinstance(options, list):
+            if any(option != options[0] for option in options):
+                raise ValueError("the environments of a batch are reset with the same options")
+            options = options[0]
+        self._reset_options = dict(options or {})
+
+    def close(self) -> None:
+        self.env.close()
+
+    def get_images(self) -> Sequence[NDArray | None]:
+        return list(self.env.render() or [])
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        value = self.env.get_attr(attr_name) if hasattr(self.env, attr_name) else (getattr(self, attr_name),) * self.num_envs
+        return [value[i] for i in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError(f"{attr_name} belongs to the whole batch: it cannot be set for some environments only")
+        setattr(self.env, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        results = self.env.call(method_name, *method_args, **method_kwargs)
+        return [results[i] for i in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: Any = None) -> list[bool]:
+        return [False for _ in self._get_indices(indices)]
+
+
+def make_sb3_vec_env(env_id: str, num_envs: int = 64, seed: int | None = None, **kwargs: Any) -> ClothSB3VecEnv:
+    """A batch of a clothgym environment for SB3: ``PPO("MlpPolicy", make_sb3_vec_env("ClothDrape-v0", 64, seed=0))``.
+
+    Put SB3's ``VecMonitor`` on it to have episodes logged.  ``kwargs`` go to the environment.
+
+    Raises:
+        ValueError: an id that is not ours, or a keyword that the environment does not know.
+    """
+    name = env_id.split(":")[-1]
+    if name not in gym.registry or gym.registry[name].vector_entry_point is None:
+        from clothgym.registration import ENVIRONMENTS
+
+        raise ValueError(f"no clothgym environment {env_id!r} (there are: {', '.join(ENVIRONMENTS)})")
+    env = gym.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **kwargs)
+    assert isinstance(env, ClothVectorEnv)
+    vec_env = ClothSB3VecEnv(env)
+    vec_env.seed(seed)
+    return vec_env
+
+
+__all__ = ["ClothEnv", "ClothSB3VecEnv", "make_sb3_vec_env"]

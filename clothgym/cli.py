@@ -1,0 +1,72 @@
+"""The command line: what there is, how fast it is here, and compiling ahead of time."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m clothgym", description="Cloth that is fast enough to learn on.")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="environments, integrators and fabrics")
+    commands.add_parser("warmup", help="compile all kernels now, so that nothing has to later")
+    bench = commands.add_parser("bench", help="measure speed on this machine")
+    bench.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
+    bench.add_argument("--quick", action="store_true", help="fewer cases, in a few seconds")
+    options = parser.parse_args(arguments)
+    if options.command == "list":
+        _list()
+    elif options.command == "warmup":
+        _warm_up()
+    else:
+        _bench(options.json, options.quick)
+    return 0
+
+
+def _list() -> None:
+    from clothgym.integrators import INTEGRATORS
+    from clothgym.material import PRESETS
+    from clothgym.registration import ENVIRONMENTS
+
+    print("environments")
+    for env_id in ENVIRONMENTS:
+        print(f"  clothgym:{env_id}")
+    print("integrators")
+    for name, integrator in INTEGRATORS.items():
+        print(f"  {name:<22} order {integrator.order}")
+    print("fabrics")
+    for name, material in PRESETS.items():
+        print(f"  {name:<22} {material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m")
+
+
+def _warm_up() -> None:
+    import gymnasium as gym
+
+    from clothgym.integrators import INTEGRATORS
+    from clothgym.registration import ENVIRONMENTS
+
+    begun = time.perf_counter()
+    for env_id in ENVIRONMENTS:
+        for integrator in INTEGRATORS:
+            env = gym.make(env_id, integrator=integrator, render_mode="rgb_array")
+            env.reset(seed=0)
+            # to the judgement: it has kernels of its own
+            while not env.step(env.action_space.high)[2]:
+                pass
+            env.render()
+            env.close()
+    print(f"all kernels are ready ({time.perf_counter() - begun:.1f} s)")
+
+
+def _bench(path: Path | None, quick: bool) -> None:
+    from clothgym import bench
+
+    results = bench.run(quick)
+    print(bench.table(results))
+    if path is not None:
+        path.write_text(json.dumps(results, indent=1) + "\n")
+        print(f"written to {path}")

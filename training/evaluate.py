@@ -1,0 +1,136 @@
+"""Score policies on held-out episodes: one table for doing nothing, chance, the scripted expert and what was learnt.
+
+    python training/evaluate.py --env ClothDrape-v0 --policy noop random expert runs/ClothDrape-v0_0 --episodes 500
+
+Episode ``i`` is the one that seed ``seed + i`` gives, for every policy.  Training never uses seeds of a million or more.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import policies
+import tyro
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+HELD_OUT = 1_000_000
+BATCH = 250
+
+
+@dataclass
+class Args:
+    """What to score, and on what."""
+
+    env: str = "ClothDrape-v0"
+    """Id of the environment."""
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,PATH} ...")] = ("noop", "random", "expert")
+    """Policies: noop, random, expert, or the path of a run's folder."""
+    episodes: int = 500
+    """Episodes for each policy."""
+    seed: int = HELD_OUT
+    """Seed of the first episode."""
+    json: Path | None = None
+    """Where to write the scores, if anywhere."""
+
+
+def run_episodes(env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any) -> dict[str, NDArray]:
+    """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
+    env = gym.make_vec(f"clothgym:{env_id}", num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
+    batches = []
+    with tqdm(total=len(seeds), unit="episode", disable=not progress, leave=False) as bar:
+        for first in range(0, len(seeds), env.num_envs):
+            wanted = seeds[first : first + env.num_envs]
+            # the last batch may be short: its spare environments run too, and are not counted
+            padded = wanted + wanted[-1:] * (env.num_envs - len(wanted))
+            episodes = _run_batch(env, policy, padded, bar, len(wanted))
+            batches.append({key: value[: len(wanted)] for key, value in episodes.items()})
+    env.close()
+    return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
+
+
+def _run_batch(env: Any, policy: policies.Policy, seeds: list[int], bar: Any, count: int) -> dict[str, NDArray]:
+    observations, _ = env.reset(seed=seeds)
+    running = np.ones(env.num_envs, bool)
+    total, length = np.zeros(env.num_envs), np.zeros(env.num_envs, int)
+    last: dict[str, NDArray] = {}
+    while running.any():
+        observations, reward, terminated, truncated, info = env.step(policy(env, observations))
+        total += reward * running
+        length += running
+        done = running & (terminated | truncated)
+        for key, value in info.items():
+            if not key.startswith("_") and isinstance(value, np.ndarray):
+                last[key] = np.where(done, value, last.get(key, value))
+        running &= ~done
+        bar.update(int(done[:count].sum()))
+    return last | {"return": total, "length": length}
+
+
+def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
+    """95 % confidence interval of a proportion (Wilson 1927)."""
+    p = successes / trials
+    middle = (p + z * z / (2 * trials)) / (1 + z * z / trials)
+    half = z / (1 + z * z / trials) * math.sqrt(p * (1 - p) / trials + z * z / (4 * trials * trials))
+    return middle - half, middle + half
+
+
+def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
+    """The row of the table: rates and means with their 95 % intervals, and the cumulated failures."""
+    count = len(episodes["return"])
+    successes = int(episodes["is_success"].sum())
+    row: dict[str, Any] = {"episodes": count, "success_rate": successes / count, "success_rate_ci95": wilson(successes, count)}
+    for key in ("normalized_performance", "return"):
+        values = episodes[key].astype(float)
+        half = 1.96 * values.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
+        row[key], row[f"{key}_ci95"] = values.mean(), (values.mean() - half, values.mean() + half)
+    for failure in ("diverged", "torn", "out_of_bounds"):
+        row[failure] = int((episodes["failure"] == failure).sum())
+    row["mean_length"] = float(episodes["length"].mean())
+    return row
+
+
+def table(scores: dict[str, dict[str, Any]]) -> str:
+    """The scores as text, one policy a line."""
+    lines = [f"{'policy':<28} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}"]
+    for name, row in scores.items():
+        low, high = row["success_rate_ci95"]
+        spread = [(row[f"{key}_ci95"][1] - row[f"{key}_ci95"][0]) / 2 for key in ("normalized_performance", "return")]
+        lines.append(
+            f"{name:<28} {row['success_rate']:6.3f} [{low:.3f}, {high:.3f}] {row['normalized_performance']:8.3f} ± {spread[0]:.3f} "
+            f"{row['return']:8.3f} ± {spread[1]:.3f} {row['torn']:6d} {row['diverged']:9d} {row['mean_length']:6.1f}"
+        )
+    return "\n".join(lines)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write through a scratch file, so that a crash leaves no half of one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_suffix(".json.new")
+    scratch.write_text(json.dumps(content, indent=1, default=float) + "\n")
+    os.replace(scratch, path)
+
+
+def main(args: Args) -> None:
+    if args.episodes < 1:
+        raise ValueError(f"--episodes {args.episodes}: must be at least 1")
+    scores = {}
+    for name in args.policy:
+        policy = policies.named(name, args.env, args.seed)
+        episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)))
+        scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
+    print(f"{args.env}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
+    if args.json is not None:
+        write_json(args.json, scores[args.policy[0]] if len(scores) == 1 else scores)
+        print(f"written to {args.json}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,112 @@
+"""Policies to evaluate, and checkpoints that can be loaded without unpickling anything.
+
+A checkpoint is a run's folder: ``config.json`` says how to build the learner, ``checkpoint.pt`` holds tensors and numbers only
+and is read with ``weights_only=True``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+import clothgym
+
+CHECKPOINT, CONFIG = "checkpoint.pt", "config.json"
+Policy = Callable[[Any, NDArray], NDArray]  # (vector env, observations) -> actions
+
+
+def noop(env: Any, observations: NDArray) -> NDArray:
+    return np.zeros(env.action_space.shape, np.float32)
+
+
+def expert(env: Any, observations: NDArray) -> NDArray:
+    return env.expert_actions()
+
+
+def random(seed: int) -> Policy:
+    rng = np.random.default_rng(seed)
+    return lambda env, observations: rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+
+
+def named(name: str, env_id: str, seed: int) -> Policy:
+    """The policy called noop, random or expert, or the learnt one in the run's folder of that path.
+
+    Raises:
+        FileNotFoundError, ValueError: no such policy, or a checkpoint of another environment or version.
+    """
+    if name in ("noop", "expert"):
+        return {"noop": noop, "expert": expert}[name]
+    if name == "random":
+        return random(seed)
+    return learnt(Path(name), env_id)
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    folder = folder.parent if folder.name == CHECKPOINT else folder
+    if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():
+        raise FileNotFoundError(
+            f"{str(folder)!r} is neither noop, random, expert nor a run's folder: it lacks {CONFIG} or {CHECKPOINT}. "
+            "Train one with: python training/train.py --env ClothDrape-v0"
+        )
+    config = json.loads((folder / CONFIG).read_text())
+    if config.get("clothgym") != clothgym.__version__:
+        raise ValueError(
+            f"{str(folder)!r} was trained with clothgym {config.get('clothgym')}, this is {clothgym.__version__}: "
+            "its scores would not be comparable; train anew, or install that version"
+        )
+    return config
+
+
+def learnt(folder: Path, env_id: str) -> Policy:
+    """The deterministic policy of a run."""
+    config = read_config(folder)
+    if config["env"] != env_id:
+        raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
+    env = gym.make_vec(f"clothgym:{env_id}", num_envs=1, **config["env_kwargs"])
+    policy = ActorCriticPolicy(
+        env.single_observation_space, env.single_action_space, lambda _: 0.0, **config["hyperparameters"].get("policy_kwargs", {})
+    )
+    env.close()
+    policy.load_state_dict(_load(folder)["policy"])
+    policy.set_training_mode(False)
+    return lambda env, observations: policy.predict(observations, deterministic=True)[0]
+
+
+def save_checkpoint(folder: Path, model: PPO) -> None:
+    """Write the learner's tensors; a crash in the middle leaves the previous checkpoint whole."""
+    state = {
+        "policy": model.policy.state_dict(),
+        "optimizer": model.policy.optimizer.state_dict(),
+        "num_timesteps": model.num_timesteps,
+        "num_updates": model._n_updates,
+    }
+    scratch = folder / f"{CHECKPOINT}.new"
+    torch.save(state, scratch)
+    os.replace(scratch, folder / CHECKPOINT)
+
+
+def load_checkpoint(folder: Path, model: PPO) -> None:
+    """Put a run's tensors and counters into a learner built from its configuration."""
+    state = _load(folder)
+    model.policy.load_state_dict(state["policy"])
+    model.policy.optimizer.load_state_dict(state["optimizer"])
+    model.num_timesteps = int(state["num_timesteps"])
+    model._n_updates = int(state["num_updates"])
+
+
+def _load(folder: Path) -> dict[str, Any]:
+    folder = folder.parent if folder.name == CHECKPOINT else folder
+    try:
+        return torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True)
+    except Exception as error:
+        raise ValueError(f"{str(folder / CHECKPOINT)!r} cannot be read as a checkpoint ({error}): train anew") from error

@@ -1,0 +1,54 @@
+"""The pictures that a run leaves: a learning curve, and a film of what was learnt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import evaluate
+import gymnasium as gym
+import matplotlib
+import numpy as np
+import policies
+
+from clothgym.render import write_video
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
+
+
+def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references: dict[str, float]) -> None:
+    """Held-out success and performance over training time, with the references as level lines."""
+    minutes = [line["training_seconds"] / 60 for line in lines]
+    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    axes.plot(minutes, [line["success_rate"] for line in lines], color=ACCENT, marker="o", ms=3, label="success rate")
+    axes.plot(minutes, [line["normalized_performance"] for line in lines], color=INK, lw=1, label="normalized performance")
+    for name, level in references.items():
+        axes.axhline(level, color=QUIET, lw=0.8, ls="--")
+        axes.annotate(name, (1.0, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=QUIET, fontsize=8)
+    axes.set(xlabel="training time [minutes]", ylabel="held-out episodes", ylim=(-0.02, 1.02), title=folder.name)
+    axes.legend(frameon=False, loc="center right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(folder / "learning_curve.png", dpi=150)
+    plt.close(figure)
+
+
+def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, size: int = 240) -> None:
+    """Some held-out episodes side by side, one after the other's end standing still."""
+    env = gym.make_vec(
+        f"clothgym:{env_id}", num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs
+    )
+    observations, _ = env.reset(seed=evaluate.HELD_OUT)
+    frames, running = [], np.ones(episodes, bool)
+    still = [np.asarray(frame) for frame in env.render()]
+    while running.any():
+        frames.append(np.concatenate(still, axis=1))
+        observations, _, terminated, truncated, _ = env.step(policy(env, observations))
+        fresh = env.render()
+        still = [new if on else old for new, old, on in zip(fresh, still, running)]
+        running &= ~(terminated | truncated)
+    frames += [np.concatenate(still, axis=1)] * 15
+    env.close()
+    write_video(path, frames, fps=env.metadata["render_fps"])

@@ -1,0 +1,213 @@
+"""Train PPO on a clothgym environment, evaluate it on held-out seeds, and leave a folder that tells the story.
+
+    python training/train.py --env ClothDrape-v0                    # runs/ClothDrape-v0_0
+    python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
+    python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
+
+The folder holds: config.json, checkpoint.pt (tensors only), model.zip (Stable-Baselines3's own format, for ``PPO.load``),
+progress.jsonl (one held-out evaluation a line), evaluation.json (the final score), learning_curve.png, policy.gif, and the
+TensorBoard log.  Hyperparameters are read from hyperparams/ppo.yml, in the format of rl_zoo3.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import evaluate
+import numpy as np
+import policies
+import torch
+import tyro
+import yaml
+from report import draw_learning_curve, film
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecMonitor
+
+import clothgym
+from clothgym.adapters.sb3 import make_sb3_vec_env
+
+HERE = Path(__file__).parent
+
+
+@dataclass
+class Args:
+    """What to train, for how long, and where to keep it."""
+
+    env: str = "ClothDrape-v0"
+    """Id of the environment."""
+    seed: int = 0
+    """Seed of the learner and of its environments."""
+    timesteps: int | None = None
+    """Environment steps; the hyperparameter file's number by default."""
+    run: Path | None = None
+    """Folder of the run; runs/ENV_SEED by default."""
+    resume: Path | None = None
+    """Folder of a run to go on with; its configuration is used."""
+    hyperparams: Path = HERE / "hyperparams" / "ppo.yml"
+    """Hyperparameters by environment id, in rl_zoo3's format."""
+    eval_episodes: int = 100
+    """Held-out episodes of each evaluation on the way."""
+    final_episodes: int = 500
+    """Held-out episodes of the final evaluation."""
+    threads: int = 2
+    """Threads of torch; the environments use all processors between its calls."""
+
+
+class HeldOutEvaluation(BaseCallback):
+    """Every so many rollouts: score the policy on held-out seeds, append a line to progress.jsonl, save a checkpoint."""
+
+    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int) -> None:
+        super().__init__()
+        self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
+        self.rollouts = 0
+        self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
+        self.evaluating = 0.0
+        self.started = time.perf_counter()
+
+    @property
+    def training_seconds(self) -> float:
+        """Time spent on training, evaluations left out."""
+        return self.trained_before + time.perf_counter() - self.started - self.evaluating
+
+    def _on_training_start(self) -> None:
+        self.started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.rollouts and self.rollouts % self.every == 0:
+            self.evaluate()
+        self.rollouts += 1
+
+    def evaluate(self) -> None:
+        begun = time.perf_counter()
+        policies.save_checkpoint(self.folder, self.model)
+
+        def policy(env: Any, observations: Any) -> Any:
+            return self.model.predict(observations, deterministic=True)[0]
+
+        # the tail of the held-out seeds: the final score's are others
+        first = evaluate.HELD_OUT + 1_000_000
+        seeds = list(range(first, first + self.episodes))
+        episodes = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
+        line = {
+            "timesteps": self.num_timesteps,
+            "training_seconds": self.training_seconds - (time.perf_counter() - begun),
+            "success_rate": float(episodes["is_success"].mean()),
+            "normalized_performance": float(episodes["normalized_performance"].mean()),
+            "return": float(episodes["return"].mean()),
+        }
+        with open(self.folder / "progress.jsonl", "a") as file:
+            file.write(json.dumps(line) + "\n")
+        for key in ("success_rate", "normalized_performance", "return"):
+            self.logger.record(f"held_out/{key}", line[key])
+        self.evaluating += time.perf_counter() - begun
+
+
+def configure(args: Args) -> tuple[Path, dict[str, Any]]:
+    """The run's folder and configuration: a new one, or that of the run to go on with."""
+    if args.resume is not None:
+        config = policies.read_config(args.resume)
+        if args.timesteps is not None:
+            config["timesteps"] = args.timesteps
+        return args.resume, config
+    table = yaml.safe_load(args.hyperparams.read_text())
+    if args.env not in table:
+        raise ValueError(f"{args.hyperparams} has no hyperparameters for {args.env!r} (there are: {', '.join(table)})")
+    hyperparameters = dict(table[args.env])
+    config = {
+        "clothgym": clothgym.__version__,
+        "env": args.env,
+        "env_kwargs": hyperparameters.pop("env_kwargs", {}),
+        "num_envs": hyperparameters.pop("n_envs"),
+        "timesteps": args.timesteps or int(hyperparameters.pop("n_timesteps")),
+        "seed": args.seed,
+        "threads": args.threads,
+        "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
+        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+    }
+    folder = args.run or Path("runs") / f"{args.env}_{args.seed}"
+    if (folder / policies.CHECKPOINT).exists():
+        raise FileExistsError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
+    folder.mkdir(parents=True, exist_ok=True)
+    evaluate.write_json(folder / policies.CONFIG, config)
+    return folder, config
+
+
+def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
+    """The learner of a configuration, on its own batch of environments."""
+    options = dict(config["hyperparameters"])
+    policy = options.pop("policy")
+    for key in ("learning_rate", "clip_range"):
+        if isinstance(options.get(key), str):
+            options[key] = _linear(options[key])
+    env = VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **config["env_kwargs"]))
+    return PPO(policy, env, seed=seed % 2**32, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
+
+
+def _linear(text: str) -> Any:
+    """rl_zoo3's "lin_0.001": from there to zero over the run."""
+    kind, _, value = text.partition("_")
+    if kind != "lin":
+        raise ValueError(f"hyperparameter {text!r}: a schedule is written lin_VALUE")
+    start = float(value)
+    return lambda remaining: start * remaining
+
+
+def _lines(folder: Path) -> list[dict[str, float]]:
+    path = folder / "progress.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def train(args: Args) -> Path:
+    folder, config = configure(args)
+    torch.set_num_threads(config["threads"])
+    done = 0
+    if args.resume is not None:
+        done = int(torch.load(folder / policies.CHECKPOINT, weights_only=True)["num_timesteps"])
+    # a resumed run meets new episodes, not those of its beginning again
+    model = build(folder, config, config["seed"] * 10_000 + done)
+    if args.resume is not None:
+        policies.load_checkpoint(folder, model)
+        print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
+    per_rollout = config["num_envs"] * model.n_steps
+    watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), args.eval_episodes)
+    try:
+        if config["timesteps"] > done:
+            # learn() counts its steps on top of those done when the counter is not reset
+            model.learn(config["timesteps"] - done, callback=watch, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo")
+    except KeyboardInterrupt:
+        policies.save_checkpoint(folder, model)
+        raise SystemExit(f"interrupted: go on with  python training/train.py --resume {folder}") from None
+    seconds = watch.training_seconds
+    watch.evaluate()
+    model.save(folder / "model.zip")
+    finish(folder, config, seconds, args.final_episodes)
+    return folder
+
+
+def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:
+    """Final score beside the references, learning curve and film."""
+    scores = {}
+    for name in ("noop", "random", "expert", str(folder)):
+        policy = policies.named(name, config["env"], evaluate.HELD_OUT)
+        seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + episodes))
+        scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))
+    print(f"{config['env']}, {episodes} held-out episodes\n{evaluate.table(scores)}")
+    learnt = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
+    evaluate.write_json(folder / "evaluation.json", learnt | {"timesteps": config["timesteps"], "references": scores})
+    draw_learning_curve(folder, _lines(folder), {name: scores[name]["success_rate"] for name in ("noop", "expert")})
+    film(folder / "policy.gif", config["env"], policies.learnt(folder, config["env"]), config["env_kwargs"])
+    print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
+
+
+if __name__ == "__main__":
+    np.seterr(all="ignore")
+    train(tyro.cli(Args))
