@@ -1,0 +1,38 @@
+"""What several tests share: chains of particles whose behaviour is known in closed form."""
+
+import numpy as np
+import pytest
+
+from clothgym import Material, Simulation
+from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs
+
+
+def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
+    """Particles along x, joined by structural springs in red-black order."""
+    positions = np.stack([np.arange(particles) * spacing, np.zeros(particles), np.zeros(particles)], axis=1)
+    ends = np.stack([np.arange(particles - 1), np.arange(1, particles)], axis=1).astype(np.int32)
+    ends = np.concatenate([ends[::2], ends[1::2]])
+    springs = Springs(ends, np.full(len(ends), spacing), np.full(len(ends), STRUCTURAL_X, np.int32), np.ones(len(ends)))
+    return ClothMesh((2, particles), (1.0, 1.0), positions, springs, np.zeros((0, 3), np.int32), np.ones(particles))
+
+
+@pytest.fixture
+def chain():
+    """Make a float64 simulation of a line of masses [kg] and springs [N/m], its stiffness set directly."""
+
+    def make(particles, integrator, h, stiffness, mass=1.0, gravity=(0, 0, 0), damping_time=0.0, drag_rate=0.0, anchors=(0,), time_step=None):
+        time_step = time_step or h
+        simulation = Simulation(
+            line_mesh(particles), Material(shear_stiffness=0, bend_rigidity=0), integrator=integrator, time_step=time_step, substeps="auto", gravity=gravity, anchors=anchors, dtype="float64"
+        )
+        simulation.substeps = round(time_step / h)
+        state = simulation.get_state()
+        state.stiffness[:] = 0
+        state.stiffness[:, STRUCTURAL_X] = stiffness
+        state.free_inverse_mass[:] = 1 / mass
+        state.damping_time[:] = damping_time
+        state.drag_rate[:] = drag_rate
+        simulation.set_state(state)
+        return simulation
+
+    return make

@@ -1,0 +1,74 @@
+"""Cold and warm starts: each kernel compiled once between processes, a folder that cannot be written, light imports."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+SIMULATE = """
+import numpy as np
+from clothgym import Simulation, grid
+import clothgym.simulation as simulation
+s = Simulation(grid(3, 3, 0.1, 0.1), anchors=[0])
+s.step(3)
+compiled = s._advance.stats.cache_misses
+print(sum(compiled.values()), s.positions.sum())
+"""
+
+
+def start(code, **environment):
+    env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
+    return subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_ten_processes_on_a_cold_cache_compile_each_kernel_once_between_them(tmp_path):
+    processes = [start(SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path)) for _ in range(10)]
+    outputs = [process.communicate(timeout=300) for process in processes]
+    assert all(process.returncode == 0 for process in processes), outputs
+    compiled = [int(out.split()[0]) for out, _ in outputs]
+    assert sum(compiled) == 1
+    assert len({out.split()[1] for out, _ in outputs}) == 1
+    announced = [err for _, err in outputs if err]
+    assert len(announced) == 1 and announced[0].count("\n") == 1 and "compiling kernels" in announced[0]
+
+
+def test_a_folder_that_cannot_be_written_costs_a_sentence(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    out, err = start(SIMULATE, CLOTHGYM_CACHE_DIR=str(blocked)).communicate(timeout=300)
+    assert out.startswith("1 ")
+    assert "cannot write its kernel cache" in err and "CLOTHGYM_CACHE_DIR" in err
+
+
+def test_an_edit_in_a_callee_is_noticed(tmp_path):
+    """The cache folder's name is a digest of the sources: numba alone would run the old code."""
+    from clothgym import _jit
+
+    before = _jit._source_digest()
+    copy = tmp_path / "clothgym"
+    copy.mkdir()
+    for path in (os.path.dirname(_jit.__file__),):
+        for name in ("_jit.py", "forces.py"):
+            (copy / name).write_text(open(os.path.join(path, name)).read())
+    original = _jit.__file__
+    try:
+        _jit.__file__ = str(copy / "_jit.py")
+        first = _jit._source_digest()
+        (copy / "forces.py").write_text((copy / "forces.py").read_text().replace("one / np.sqrt", "one / np.sqrt "))
+        assert _jit._source_digest() != first != before
+    finally:
+        _jit.__file__ = original
+
+
+@pytest.mark.parametrize("module", ["torch", "stable_baselines3", "matplotlib", "imageio", "numba", "scipy.sparse"])
+def test_importing_the_package_loads_nothing_heavy(module):
+    out, err = start(f"import sys, clothgym; print({module!r} in sys.modules)").communicate(timeout=60)
+    assert out.strip() == "False", err
+
+
+def test_the_folder_envs_refuses_its_bare_name():
+    root = os.path.dirname(os.path.dirname(__file__))
+    out, err = start(f"import sys; sys.path.insert(0, {root!r}); import envs").communicate(timeout=60)
+    assert "clothgym.envs" in err and "ImportError" in err
