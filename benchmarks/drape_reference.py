@@ -44,9 +44,7 @@ def coverage(solids: list[Target]) -> list[float]:
     speed = np.sqrt(np.mean(np.sum(simulation.velocities**2, axis=2), axis=1))
     print(f"  largest rms speed at the end: {speed.max() * 1000:.1f} mm/s")
     points = [solid.upper_surface(JUDGED_POINTS) for solid in solids]
-    return [
-        covered_share(sheet, mesh.triangles, p, COVERED_WITHIN) for sheet, p in zip(simulation.positions.astype(float), points)
-    ]
+    return [covered_share(sheet, mesh.triangles, p, COVERED_WITHIN) for sheet, p in zip(simulation.positions.astype(float), points)]
 
 
 def main() -> None:
@@ -57,7 +55,9 @@ def main() -> None:
         values = np.array(coverage(solids)).reshape(len(widths), len(tall))
         print(values.round(3))
         table[shape] = {"widths": widths, "heights": tall, "coverage": values.round(4).tolist()}
-    about = f"made by benchmarks/drape_reference.py of clothgym {__version__}: {ROWS} x {ROWS} sheet; widths and heights in sheet sides"
+    about = (
+        f"made by benchmarks/drape_reference.py of clothgym {__version__}: {ROWS} x {ROWS} sheet; widths and heights in sheet sides"
+    )
     TABLE.write_text(json.dumps({"about": about, "shapes": table}, indent=1) + "\n")
 
 

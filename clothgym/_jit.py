@@ -85,7 +85,9 @@ class _CacheFolder:
         if not self._announced:
             self._announced = True
             where = f", kept in {self.path}" if self.writable else ""
-            print(f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True)
+            print(
+                f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True
+            )
 
 
 if sys.platform == "win32":
@@ -134,7 +136,7 @@ class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  #
 
 
 class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = [_Locator]
+    _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
 
 
 class _Cache(caching.FunctionCache):  # type: ignore[misc]
@@ -143,8 +145,11 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
     _impl_class = _Impl
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        found = super().load_overload(sig, target_context)
         folder = cache_folder()
+        if not folder.path.is_dir():
+            folder.announce()
+            return None
+        found = super().load_overload(sig, target_context)
         if found is None and folder.writable and folder.depth == 0:
             folder.acquire()
             found = super().load_overload(sig, target_context)
@@ -178,7 +183,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-def specialize(function: FunctionType, name: str, **callees: Any) -> Any:
+def specialize(function: Any, name: str, **callees: Any) -> Any:
     """A kernel with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
 
     This is how one substep loop serves every integrator: numba's disk cache misses in each new process when a dispatcher

@@ -55,8 +55,9 @@ def _warm_up() -> None:
             env = gym.make(env_id, integrator=integrator, render_mode="rgb_array")
             env.reset(seed=0)
             # to the judgement: it has kernels of its own
-            while not env.step(env.action_space.high)[2]:
-                pass
+            terminated = False
+            while not terminated:
+                _, _, terminated, _, _ = env.step(env.unwrapped.expert_action())  # type: ignore[attr-defined]
             env.render()
             env.close()
     print(f"all kernels are ready ({time.perf_counter() - begun:.1f} s)")

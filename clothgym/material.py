@@ -65,8 +65,8 @@ PRESETS: dict[str, Material] = {
         stretch_stiffness=261.1,
         shear_stiffness=105.0,
         bend_rigidity=2.34e-6,
-        source="100 % cotton of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457): 472.64 kg/m^3, 0.318 mm, 0.821 MPa, nu 0.243; "
-        "damping_time and air_drag are not measured there and are ours",
+        source="100 % cotton of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457): 472.64 kg/m^3, 0.318 mm, 0.821 MPa, "
+        "nu 0.243; damping_time and air_drag are not measured there and are ours",
     ),
 }
 

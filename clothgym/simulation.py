@@ -8,7 +8,8 @@ from __future__ import annotations
 import difflib
 import warnings
 from collections.abc import Sequence
-from functools import lru_cache
+from dataclasses import replace
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -41,7 +42,7 @@ def advance(first, last, x, v, w, springs, fabric, kinds, colliders, h, substeps
             resolve(x[b], v[b], w[b], kinds, colliders[b], h, contact)
 
 
-@lru_cache(maxsize=None)
+@cache
 def _compiled(integrator: Integrator) -> Any:
     return specialize(advance, f"advance_{integrator.name}", substep=integrator.substep)
 
@@ -193,8 +194,9 @@ class Simulation:
             if self.time_step / self.substeps > largest:
                 need = self.integrator.automatic_substeps(self.time_step, largest)
                 warnings.warn(
-                    f"{self.substeps} substeps of {self.time_step / self.substeps:.3g} s are too few for {self.integrator.name}: its "
-                    f"bound here is {largest:.3g} s, {why}. Use substeps={need} or substeps='auto'.",
+                    f"{self.substeps} substeps of {self.time_step / self.substeps:.3g} s are too few for "
+                    f"{self.integrator.name}: its bound here is {largest:.3g} s, {why}. "
+                    f"Use substeps={need} or substeps='auto'.",
                     stacklevel=4,
                 )
                 return
@@ -302,8 +304,10 @@ class Simulation:
         self._steps[env] = 0
         self._apply_masses()
 
-    def set_parameters(self, envs: ArrayLike | None = None, **figures: ArrayLike) -> None:
+    def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **figures: ArrayLike) -> None:
         """Change material figures (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
+
+        With ``warn``, figures that need more substeps than there are warn with the number that would do.
 
         Raises:
             ValueError: an unknown name, or a value that ``Material`` would not take; nothing is changed then.
@@ -316,7 +320,7 @@ class Simulation:
             if name in FIGURES:
                 values = np.broadcast_to(finite(name, value), env.shape)
                 for one in np.unique(values):
-                    Material(**{name: float(one)})
+                    replace(self.material, **{name: float(one)})  # type: ignore[arg-type]
                 parameters[:, FIGURES.index(name)] = values
             elif name in ("gravity", "wind"):
                 fields[name] = np.broadcast_to(finite(name, value), (len(env), 3))
@@ -331,6 +335,7 @@ class Simulation:
             getattr(self._fabric, name)[block, :, lane] = value
         if any(name in FIGURES for name in figures):
             self._apply_parameters(env)
+        if warn and any(name in FIGURES for name in figures):
             _, first = np.unique(parameters, axis=0, return_index=True)
             self._warn_if_beyond_bound(env[first])
 
@@ -343,7 +348,8 @@ class Simulation:
             raise ValueError(f"{len(colliders)} colliders for {len(env)} environments: give one each")
         for collider in colliders:
             if collider.kind != self._kinds[index]:
-                raise ValueError(f"collider {index} is a {type(self.colliders[index]).__name__}: a {type(collider).__name__} cannot take its place")
+                here, there = type(self.colliders[index]).__name__, type(collider).__name__
+                raise ValueError(f"collider {index} is a {here}: a {there} cannot take its place")
         block, lane = self.layout.place(env)
         self._colliders[block, index, :, lane] = np.array([c.rows() for c in colliders])
 

@@ -69,7 +69,7 @@ class DrapeTask(Task):
         anchor_speed=1.0,
         time_step=1 / 30,
         integrator="semi_implicit_euler",
-        substeps=57,
+        substeps=50,
     )
     acting_steps = 60
     settling_steps = 40
@@ -123,10 +123,10 @@ class DrapeTask(Task):
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
         drawn = Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape"))
-        figures = drawn.describe() | dict(wanted)
+        figures: dict[str, Any] = drawn.describe() | dict(wanted)
         if "height" not in wanted and drawn.shape != "post":
             figures["height"] = 2 * figures["radius"]
-        return Target(**figures)  # type: ignore[arg-type]
+        return Target(**figures)
 
     def _place_target(self, env: int, target: Target) -> None:
         self.targets[env] = target
@@ -255,7 +255,7 @@ class DrapeTask(Task):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(1.35, -1.15, 0.95), target=(0.0, -0.05, 0.22), vertical_fov=34.0)
+        return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.2, 0.27), vertical_fov=36.0)
 
 
 def _centring(off_center: NDArray) -> NDArray:
@@ -272,7 +272,7 @@ class ClothDrapeEnv(ClothEnv):
     0.15 L, height 0.4 to 0.6 L).  The agent moves both corners and may let go of each.  When it holds none, or after 60
     steps, the sheet settles for 40 steps, in which actions are ignored; then it is judged.
 
-    The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 57 substeps, friction 0.5, linear air drag.
+    The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 50 substeps, friction 0.5, linear air drag.
     (Settling takes 40 steps, not fewer, because the corners that hang from a thin post swing for more than a second.)
 
     ## Action Space
@@ -304,9 +304,10 @@ class ClothDrapeEnv(ClothEnv):
     ``reward_mode="sparse"``: the normalised performance, at the judgement.
 
     ## Judgement
-    Coverage C is the share of 256 points, spread evenly over that part of the target's surface which slopes by at most 60 degrees, that
-    lie within 0.02 L of a triangle of the sheet; C_ref is that of a fine (49 x 49) sheet let down flat and centred on the same
-    target (``benchmarks/drape_reference.py``); e is the horizontal distance of the sheet's centre of area from the target's axis.
+    Coverage C is the share of 256 points, spread evenly over that part of the target's surface which slopes by at most 60
+    degrees, that lie within 0.02 L of a triangle of the sheet; C_ref is that of a fine (49 x 49) sheet let down flat and
+    centred on the same target (``benchmarks/drape_reference.py``); e is the horizontal distance of the sheet's centre of area
+    from the target's axis.
 
     ``info["normalized_performance"]`` = min(C / C_ref, 1) / (1 + (e / 0.2 L)^2): 0 for a sheet that does not touch the target's
     top, 1 for the fine sheet's coverage dead centre.  ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and rms speed under
@@ -326,18 +327,19 @@ class ClothDrapeEnv(ClothEnv):
     | Argument | Default | Meaning |
     | --- | --- | --- |
     | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
-    | ``substeps`` | 57 | or ``"auto"`` |
+    | ``substeps`` | 50 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
     | ``render_mode`` | ``None`` | ``"rgb_array"`` or ``"depth_array"`` |
 
-    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the rest is drawn),
-    and ``"material"``, a dict of figures for one episode.
+    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
+    rest is drawn), and ``"material"``, a dict of figures for one episode.
 
     ## Vectorized environment
-    ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded ``s + i``, bit for bit.
+    ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded
+    ``s + i``, bit for bit.
 
     ## Version History
     * v0: initial version

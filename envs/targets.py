@@ -84,7 +84,9 @@ class Target:
         # the lower round end is sunk, so that the post stands on the floor as a cylinder
         length = self.height + self.radius
         center = (x, y, self.height - length / 2)
-        return Capsule(center=center, radius=self.radius, height=max(length, 2 * self.radius), friction=friction, thickness=thickness)
+        return Capsule(
+            center=center, radius=self.radius, height=max(length, 2 * self.radius), friction=friction, thickness=thickness
+        )
 
     def solid(self) -> Solid:
         """The same for the renderer."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit
-from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, SUMMARY, summarize
+from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, summarize
 from clothgym.material import Material
 from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.simulation import FIGURES, Simulation
@@ -132,7 +132,7 @@ class Task(ABC):
 
         mesh = physics.mesh
         self._share = (mesh.area / mesh.area.sum()).astype(np.float32)
-        self._structural = np.flatnonzero(mesh.springs.kind < SHEAR)
+        self._structural = np.flatnonzero(self.simulation.view.springs.kind < SHEAR)
         layout = self.simulation.layout
         self._summary = np.zeros((layout.blocks, SUMMARY, layout.lanes), np.float32)
         # the episode: arrays over the batch, all of them part of the state
@@ -143,7 +143,7 @@ class Task(ABC):
             "targets": np.zeros((num_envs, self.num_anchors, 3)),
             "potential": np.zeros(num_envs),
             "observation": np.zeros((num_envs, len(bound)), np.float32),
-            "material": np.zeros((num_envs, len(FIGURES))),
+            "material": np.tile([getattr(self.simulation.material, name) for name in FIGURES], (num_envs, 1)),
         }
 
     # --- what each task says --------------------------------------------------------------------------------------------
@@ -203,6 +203,7 @@ class Task(ABC):
         if not len(envs):
             return
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
+        before = self.episode["material"][envs]
         for k, env in enumerate(envs):
             seed = seeds[k] if seeds is not None else None
             if seed is not None or not self._seeded[env]:
@@ -210,11 +211,11 @@ class Task(ABC):
                 self._seeded[env] = True
             self._draw_material(env, options.get("material", {}))
             starts[k] = self._begin(env, self.generators[env], options)
-        if self.randomize or "material" in options or not np.array_equal(
-            self.episode["material"][envs], np.broadcast_to(self._own_figures(), (len(envs), len(FIGURES)))
-        ):
-            figures = {name: self.episode["material"][envs, i] for i, name in enumerate(FIGURES)}
-            self.simulation.set_parameters(envs, **figures)
+        material = self.episode["material"][envs]
+        if not np.array_equal(material, before):
+            # the declared ranges were held against the integrator's bound at construction; one episode's figures are now
+            figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
+            self.simulation.set_parameters(envs, warn="material" in options, **figures)
         self.simulation.reset(envs, positions=starts)
         episode = self.episode
         episode["step"][envs] = 0
@@ -272,7 +273,7 @@ class Task(ABC):
         failure[~running] = 0
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
-        info = self._judgement()
+        info: dict[str, Any] = dict(self._judgement())
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
         terms = self._reward_terms(moves, acting, running, judged, failure, summary, info["normalized_performance"])
@@ -372,7 +373,7 @@ class Task(ABC):
         )
 
     def draw(self, renderer: Renderer, mode: str, envs: Sequence[int]) -> NDArray:
-        """Frames of some environments: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array"."""
+        """Frames: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array"."""
         positions = self.simulation.positions[list(envs)]
         targets, attached = self.episode["targets"], self.simulation.attached
         solids = [self.solids(env) for env in envs]
@@ -398,7 +399,9 @@ class Task(ABC):
         """
         missing = set(self.episode) ^ set(state.episode)
         if missing or len(state.generators) != self.num_envs:
-            raise ValueError(f"the state is of {len(state.generators)} environments of another task or size: it differs in {sorted(missing)}")
+            raise ValueError(
+                f"the state is of {len(state.generators)} environments of another task or size: it differs in {sorted(missing)}"
+            )
         self.simulation.set_state(state.simulation)
         self.episode = {name: value.copy() for name, value in state.episode.items()}
         for env, text in enumerate(state.generators):
@@ -421,7 +424,7 @@ def _checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[fl
         if np.shape(bounds) != (2,) or not np.all(np.isfinite(bounds)) or bounds[0] > bounds[1]:
             raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
         for bound in bounds:
-            Material(**{name: float(bound)})
+            Material(**{name: float(bound)})  # type: ignore[arg-type]
         checked[name] = (float(bounds[0]), float(bounds[1]))
     return checked
 
@@ -431,4 +434,4 @@ def _extreme(material: Material, ranges: Mapping[str, tuple[float, float]]) -> M
     figures = {name: getattr(material, name) for name in FIGURES}
     for name, (low, high) in ranges.items():
         figures[name] = low if name == "density" else high
-    return Material(**figures, source=material.source)
+    return replace(material, **figures)  # type: ignore[arg-type]

@@ -20,10 +20,28 @@ def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
 def chain():
     """Make a float64 simulation of a line of masses [kg] and springs [N/m], its stiffness set directly."""
 
-    def make(particles, integrator, h, stiffness, mass=1.0, gravity=(0, 0, 0), damping_time=0.0, drag_rate=0.0, anchors=(0,), time_step=None):
+    def make(
+        particles,
+        integrator,
+        h,
+        stiffness,
+        mass=1.0,
+        gravity=(0, 0, 0),
+        damping_time=0.0,
+        drag_rate=0.0,
+        anchors=(0,),
+        time_step=None,
+    ):
         time_step = time_step or h
         simulation = Simulation(
-            line_mesh(particles), Material(shear_stiffness=0, bend_rigidity=0), integrator=integrator, time_step=time_step, substeps="auto", gravity=gravity, anchors=anchors, dtype="float64"
+            line_mesh(particles),
+            Material(shear_stiffness=0, bend_rigidity=0),
+            integrator=integrator,
+            time_step=time_step,
+            substeps="auto",
+            gravity=gravity,
+            anchors=anchors,
+            dtype="float64",
         )
         simulation.substeps = round(time_step / h)
         state = simulation.get_state()

@@ -29,7 +29,9 @@ def rollout(env, sequence, first=0):
     records = []
     for action in sequence:
         observation, reward, terminated, truncated, info = env.step(action)
-        record = {"observation": observation, "reward": reward, "terminated": terminated, "truncated": truncated} | dict(flatten(info))
+        record = {"observation": observation, "reward": reward, "terminated": terminated, "truncated": truncated} | dict(
+            flatten(info)
+        )
         records.append({key: np.asarray(value)[first:] for key, value in record.items()})
     return records
 
@@ -39,7 +41,11 @@ def assert_same(a, b, count):
     for one, other in zip(a, b):
         for key in one.keys() & other.keys():
             left, right = one[key][:count], other[key][:count]
-            same = all(np.array_equal(p, q) for p, q in zip(left, right)) if left.dtype == object else np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
+            same = (
+                all(np.array_equal(p, q) for p, q in zip(left, right))
+                if left.dtype == object
+                else np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
+            )
             assert same, key
 
 
@@ -132,7 +138,7 @@ def test_core_lanes_of_different_fabrics(name, dtype):
     solids = [Plane(point=(0, 0, -0.05)), Sphere(center=(0, 0, -0.1), radius=0.08)]
     positions = mesh.rest_positions + np.random.default_rng(0).normal(scale=1e-3, size=(36, 3))
     densities = np.linspace(0.12, 0.3, 17)
-    batch = Simulation(mesh, num_envs=17, integrator=name, colliders=solids, anchors=[0], dtype=dtype, threads=1)
+    batch = Simulation(mesh, num_envs=17, integrator=name, colliders=solids, anchors=[0], dtype=dtype, threads=1, substeps=150)
     batch.set_parameters(density=densities)
     batch.reset(positions=positions)
     batch.step(20)

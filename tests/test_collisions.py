@@ -26,7 +26,9 @@ def points_around(seed=0, count=400, scale=0.5):
 def test_plane_distance():
     normal = np.array([1.0, 2.0, 2.0]) / 3
     x = points_around()
-    assert distances(Plane(point=(0.1, 0, 0), normal=(1, 2, 2), thickness=0.01), x) == pytest.approx((x - (0.1, 0, 0)) @ normal - 0.01)
+    assert distances(Plane(point=(0.1, 0, 0), normal=(1, 2, 2), thickness=0.01), x) == pytest.approx(
+        (x - (0.1, 0, 0)) @ normal - 0.01
+    )
 
 
 def test_sphere_distance():
@@ -57,7 +59,15 @@ def test_box_distance_to_its_nearest_point():
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("collider", [Plane(), Sphere(center=(0, 0, -1), radius=1), Box(center=(0, 0, -1), half_sides=(1, 1, 1)), Capsule(center=(0, 0, -1), radius=1, height=2.0)])
+@pytest.mark.parametrize(
+    "collider",
+    [
+        Plane(),
+        Sphere(center=(0, 0, -1), radius=1),
+        Box(center=(0, 0, -1), half_sides=(1, 1, 1)),
+        Capsule(center=(0, 0, -1), radius=1, height=2.0),
+    ],
+)
 def test_inward_velocity_is_killed_and_nothing_is_inside(name, collider):
     """A small sheet thrown at a solid: after the step of contact no particle moves into it or lies in it."""
     mesh = grid(3, 3, 0.02, 0.02)
@@ -67,7 +77,11 @@ def test_inward_velocity_is_killed_and_nothing_is_inside(name, collider):
     x, v = simulation.positions[0], simulation.velocities[0]
     assert simulation.contacts().distance.min() > -1e-9
     outward = np.array([0, 0, 1.0]) if isinstance(collider, (Plane, Box)) else None
-    normals = np.broadcast_to(outward, x.shape) if outward is not None else (x - (0, 0, -1)) / np.linalg.norm(x - (0, 0, -1), axis=1)[:, None]
+    normals = (
+        np.broadcast_to(outward, x.shape)
+        if outward is not None
+        else (x - (0, 0, -1)) / np.linalg.norm(x - (0, 0, -1), axis=1)[:, None]
+    )
     touching = simulation.contacts().distance[0] < 1e-9
     assert touching.any()
     assert np.min(np.sum(v * normals, axis=1)[touching]) > -1e-9

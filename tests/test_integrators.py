@@ -108,7 +108,9 @@ def test_xpbd_is_as_soft_as_its_formula_says(chain, q2):
 
 def sheet_and_bound():
     mesh = grid(9, 9, 0.3, 0.3)
-    simulation = Simulation(mesh, Material(damping_time=0.0, air_drag=0.0), integrator="semi_implicit_euler", gravity=(0, 0, 0), dtype="float64")
+    simulation = Simulation(
+        mesh, Material(damping_time=0.0, air_drag=0.0), integrator="semi_implicit_euler", gravity=(0, 0, 0), dtype="float64"
+    )
     state = simulation.get_state()
     return mesh, state.stiffness[0], state.free_inverse_mass[0], simulation.largest_substep()[0]
 
@@ -117,7 +119,9 @@ def growth(mesh, h):
     """Growth of a small random in-plane disturbance over 400 substeps."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        simulation = Simulation(mesh, Material(damping_time=0.0, air_drag=0.0), gravity=(0, 0, 0), dtype="float64", time_step=h, substeps=1)
+        simulation = Simulation(
+            mesh, Material(damping_time=0.0, air_drag=0.0), gravity=(0, 0, 0), dtype="float64", time_step=h, substeps=1
+        )
     noise = np.random.default_rng(0).normal(size=(mesh.num_particles, 3)) * (1e-9, 1e-9, 0)
     simulation.reset(positions=mesh.rest_positions + noise)
     simulation.step(800)
@@ -153,14 +157,18 @@ def test_a_free_sheet_keeps_its_momentum(name):
     mass = 1 / simulation.get_state().free_inverse_mass[0]
     before = mass @ simulation.velocities[0]
     simulation.step(30)
-    assert np.max(np.abs(mass @ simulation.velocities[0] - before)) < 1e-12 * np.sum(mass[:, None] * np.abs(simulation.velocities[0]))
+    assert np.max(np.abs(mass @ simulation.velocities[0] - before)) < 1e-12 * np.sum(
+        mass[:, None] * np.abs(simulation.velocities[0])
+    )
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_sheet_falls_as_linear_drag_says(name):
     """v = -(g / b) (1 - exp(-b t)) with b = drag / density, on a sheet that stays flat."""
     drag, density, g, t = 0.5, 0.2, 9.81, 0.8
-    simulation = Simulation(grid(4, 4, 0.3, 0.3), Material(air_drag=drag, density=density), integrator=name, time_step=0.01, dtype="float64")
+    simulation = Simulation(
+        grid(4, 4, 0.3, 0.3), Material(air_drag=drag, density=density), integrator=name, time_step=0.01, dtype="float64"
+    )
     simulation.step(80)
     b = drag / density
     assert simulation.velocities[0, :, 2] == pytest.approx(-g / b * (1 - np.exp(-b * t)), rel=3e-3)
@@ -168,7 +176,9 @@ def test_a_sheet_falls_as_linear_drag_says(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_undamped_energy_stays_within_a_hundredth(name):
-    simulation = Simulation(grid(9, 9, 0.3, 0.3), Material(air_drag=0.0, damping_time=0.0), integrator=name, anchors=[0, 8], dtype="float64")
+    simulation = Simulation(
+        grid(9, 9, 0.3, 0.3), Material(air_drag=0.0, damping_time=0.0), integrator=name, anchors=[0, 8], dtype="float64"
+    )
     highest = simulation.energy().total[0]
     scale = abs(0.15 * 0.09 * 9.81 * 0.3)  # weight times side
     for _ in range(60):
@@ -197,7 +207,12 @@ def test_automatic_substeps_follow_stiffness(name):
     """A hundredfold stiffness needs tenfold substeps."""
     mesh = grid(5, 5, 0.3, 0.3)
     soft, stiff = (
-        Simulation(mesh, Material(stretch_stiffness=k, shear_stiffness=0.4 * k, bend_rigidity=0, damping_time=0.0), integrator=name, time_step=1.0).substeps
+        Simulation(
+            mesh,
+            Material(stretch_stiffness=k, shear_stiffness=0.4 * k, bend_rigidity=0, damping_time=0.0),
+            integrator=name,
+            time_step=1.0,
+        ).substeps
         for k in (200.0, 20000.0)
     )
     assert stiff == pytest.approx(10 * soft, rel=0.01)

@@ -50,7 +50,14 @@ def test_the_mesh_cannot_be_changed():
 
 @pytest.mark.parametrize(
     ("arguments", "name"),
-    [((1, 5, 1, 1), "rows"), ((5, 1, 1, 1), "cols"), ((5, 5, 0, 1), "width"), ((5, 5, 1, -2), "height"), ((5, 5, np.nan, 1), "width"), ((2.5, 5, 1, 1), "rows")],
+    [
+        ((1, 5, 1, 1), "rows"),
+        ((5, 1, 1, 1), "cols"),
+        ((5, 5, 0, 1), "width"),
+        ((5, 5, 1, -2), "height"),
+        ((5, 5, np.nan, 1), "width"),
+        ((2.5, 5, 1, 1), "rows"),
+    ],
 )
 def test_bad_sheets_are_named(arguments, name):
     with pytest.raises(ValueError, match=name):

@@ -20,7 +20,18 @@ def test_wheel_ships_clothgym_only(tmp_path):
             if path.is_file() and "__pycache__" not in path.parts and inside.parts[:2] != ("clothgym", "envs"):
                 (source / inside).parent.mkdir(parents=True, exist_ok=True)
                 (source / inside).write_bytes(path.read_bytes())
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", str(tmp_path), str(source)]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        str(tmp_path),
+        str(source),
+    ]
     subprocess.run(command, check=True, timeout=120)
     names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
     assert {name.split("/")[0].split("-")[0] for name in names} == {"clothgym"}

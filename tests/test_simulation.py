@@ -76,7 +76,11 @@ def test_a_restored_state_goes_on_bit_for_bit(name, tmp_path):
 
 def test_a_state_that_does_not_fit_is_refused(tmp_path):
     s = simulation(num_envs=2)
-    for other, name in ((simulation(num_envs=3), "positions"), (simulation(num_envs=2, anchors=[1, 4]), "anchors"), (simulation(num_envs=2, colliders=[Plane()]), "colliders")):
+    for other, name in (
+        (simulation(num_envs=3), "positions"),
+        (simulation(num_envs=2, anchors=[1, 4]), "anchors"),
+        (simulation(num_envs=2, colliders=[Plane()]), "colliders"),
+    ):
         with pytest.raises(ValueError, match=name):
             s.set_state(other.get_state())
     np.savez(tmp_path / "old.npz", positions=np.zeros(3))

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -20,7 +21,9 @@ print(sum(compiled.values()), s.positions.sum())
 
 def start(code, **environment):
     env = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"} | environment
-    return subprocess.Popen([sys.executable, "-c", textwrap.dedent(code)], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(code)], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def test_ten_processes_on_a_cold_cache_compile_each_kernel_once_between_them(tmp_path):
@@ -49,9 +52,8 @@ def test_an_edit_in_a_callee_is_noticed(tmp_path):
     before = _jit._source_digest()
     copy = tmp_path / "clothgym"
     copy.mkdir()
-    for path in (os.path.dirname(_jit.__file__),):
-        for name in ("_jit.py", "forces.py"):
-            (copy / name).write_text(open(os.path.join(path, name)).read())
+    for name in ("_jit.py", "forces.py"):
+        (copy / name).write_text((Path(_jit.__file__).parent / name).read_text())
     original = _jit.__file__
     try:
         _jit.__file__ = str(copy / "_jit.py")

@@ -41,7 +41,9 @@ class Args:
     """Where to write the scores, if anywhere."""
 
 
-def run_episodes(env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any) -> dict[str, NDArray]:
+def run_episodes(
+    env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any
+) -> dict[str, NDArray]:
     """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
     env = gym.make_vec(f"clothgym:{env_id}", num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
     batches = []

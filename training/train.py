@@ -56,7 +56,7 @@ class Args:
     final_episodes: int = 500
     """Held-out episodes of the final evaluation."""
     threads: int = 2
-    """Threads of torch; the environments use all processors between its calls."""
+    """Threads of torch while it learns; while the environments run it has one, and they have all processors."""
 
 
 class HeldOutEvaluation(BaseCallback):
@@ -82,9 +82,14 @@ class HeldOutEvaluation(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        # OpenMP's idle workers spin: while the environments run, torch must not have any
+        torch.set_num_threads(1)
         if self.rollouts and self.rollouts % self.every == 0:
             self.evaluate()
         self.rollouts += 1
+
+    def _on_rollout_end(self) -> None:
+        torch.set_num_threads(self.config["threads"])
 
     def evaluate(self) -> None:
         begun = time.perf_counter()
@@ -168,7 +173,6 @@ def _lines(folder: Path) -> list[dict[str, float]]:
 
 def train(args: Args) -> Path:
     folder, config = configure(args)
-    torch.set_num_threads(config["threads"])
     done = 0
     if args.resume is not None:
         done = int(torch.load(folder / policies.CHECKPOINT, weights_only=True)["num_timesteps"])

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from clothgym.envs.single import ClothEnv, pick
+from clothgym.envs.single import pick
 from clothgym.envs.vector import ClothVectorEnv
+from clothgym.registration import ENVIRONMENTS
 
 
 class ClothSB3VecEnv(VecEnv):
@@ -27,13 +28,13 @@ class ClothSB3VecEnv(VecEnv):
         self.env = env
         self._actions: NDArray | None = None
         self._seed: int | None = None
-        self._reset_options: dict[str, Any] = {}
+        self._next_options: dict[str, Any] = {}
         self.render_mode = env.render_mode
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> NDArray:
-        observation, _ = self.env.reset(seed=self._seed, options=self._reset_options)
-        self._seed, self._reset_options = None, {}
+        observation, _ = self.env.reset(seed=self._seed, options=self._next_options)
+        self._seed, self._next_options = None, {}
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return observation
 
@@ -48,7 +49,7 @@ class ClothSB3VecEnv(VecEnv):
             final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
             final["reward_terms"] = {k: v for k, v in final["reward_terms"].items() if not k.startswith("_")}
             for env in np.flatnonzero(done):
-                infos[env] = pick(final, env)
+                infos[env] = pick(final, int(env))
                 infos[env]["terminal_observation"] = info["final_obs"][env]
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
         return observation, reward.astype(np.float32), done, infos
@@ -64,7 +65,7 @@ class ClothSB3VecEnv(VecEnv):
             if any(option != options[0] for option in options):
                 raise ValueError("the environments of a batch are reset with the same options")
             options = options[0]
-        self._reset_options = dict(options or {})
+        self._next_options = dict(options or {})
 
     def close(self) -> None:
         self.env.close()
@@ -98,15 +99,10 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 64, seed: int | None = None, *
         ValueError: an id that is not ours, or a keyword that the environment does not know.
     """
     name = env_id.split(":")[-1]
-    if name not in gym.registry or gym.registry[name].vector_entry_point is None:
-        from clothgym.registration import ENVIRONMENTS
-
+    if name not in ENVIRONMENTS:
         raise ValueError(f"no clothgym environment {env_id!r} (there are: {', '.join(ENVIRONMENTS)})")
     env = gym.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **kwargs)
     assert isinstance(env, ClothVectorEnv)
     vec_env = ClothSB3VecEnv(env)
     vec_env.seed(seed)
     return vec_env
-
-
-__all__ = ["ClothEnv", "ClothSB3VecEnv", "make_sb3_vec_env"]

@@ -2,8 +2,8 @@
 
 Applied once after each substep, to the positions and velocities that the integrator left.  The normal impulse is the inward
 velocity that is taken away; friction takes at most ``mu`` times as much from the tangential velocity (Bridson, Fedkiw and
-Anderson 2002, section 7.1, eq. 13: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction takes from the velocity is taken from the
-substep's displacement too, or a sheet at rest on a slope would creep by ``h^2 g sin`` a substep.
+Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction takes from the velocity is taken from the substep's
+displacement too, or a sheet at rest on a slope would creep by ``h^2 g sin`` a substep.
 """
 
 from __future__ import annotations
@@ -56,9 +56,7 @@ def distance_and_normal(x, collider, kind, out):
     for c in range(3):
         for l in range(x.shape[1]):
             dx, dy, dz = x[0, l] - collider[POINT, l], x[1, l] - collider[POINT + 1, l], x[2, l] - collider[POINT + 2, l]
-            out[c, l] = (
-                dx * collider[AXES + 3 * c, l] + dy * collider[AXES + 3 * c + 1, l] + dz * collider[AXES + 3 * c + 2, l]
-            )
+            out[c, l] = dx * collider[AXES + 3 * c, l] + dy * collider[AXES + 3 * c + 1, l] + dz * collider[AXES + 3 * c + 2, l]
     # distance, and the normal in those axes
     for l in range(x.shape[1]):
         qx, qy, qz = out[0, l], out[1, l], out[2, l]

@@ -7,9 +7,7 @@ import difflib
 from clothgym.integrators import semi_implicit_euler, xpbd
 from clothgym.integrators.base import Integrator
 
-INTEGRATORS: dict[str, Integrator] = {
-    method.name: method for method in (semi_implicit_euler.SEMI_IMPLICIT_EULER, xpbd.XPBD)
-}
+INTEGRATORS: dict[str, Integrator] = {method.name: method for method in (semi_implicit_euler.SEMI_IMPLICIT_EULER, xpbd.XPBD)}
 
 
 def get(integrator: str | Integrator) -> Integrator:

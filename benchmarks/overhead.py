@@ -1,0 +1,84 @@
+"""What everything that is not physics costs: observation, reward, judgement, resets and the Stable-Baselines3 adapter.
+
+    python benchmarks/overhead.py            # prints, and writes benchmarks/results/overhead.json
+
+One thread; random actions over whole episodes, resets included.  The time inside ``Simulation.step`` is taken off.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+from clothgym.adapters.sb3 import make_sb3_vec_env
+from clothgym.bench import machine
+from clothgym.simulation import Simulation
+
+RESULTS = Path(__file__).parent / "results" / "overhead.json"
+ENV = "ClothDrape-v0"
+
+
+class Stopwatch:
+    """Adds up the time spent in a simulation's steps [s]."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.seconds = 0.0
+        self._step = simulation.step
+        simulation.step = self.step  # type: ignore[method-assign]
+
+    def step(self, n: int = 1) -> None:
+        begun = time.perf_counter()
+        self._step(n)
+        self.seconds += time.perf_counter() - begun
+
+
+def batch(num_envs: int, steps: int) -> tuple[float, float]:
+    """Microseconds per environment step: beside the physics, and of the physics."""
+    env = make_sb3_vec_env(ENV, num_envs, seed=0, threads=1)
+    rng = np.random.default_rng(0)
+    env.reset()
+    # a release in a hundred, so that the episodes' ends spread over time
+    actions = rng.uniform(-1, 0.51, (steps, num_envs, 8)).astype(np.float32)
+    for action in actions[:110]:
+        env.step(action)
+    watch = Stopwatch(env.env.task.simulation)
+    begun = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    total = time.perf_counter() - begun
+    per_step = 1e6 / (steps * num_envs)
+    return (total - watch.seconds) * per_step, watch.seconds * per_step
+
+
+def single(steps: int) -> tuple[float, float]:
+    """The same for ``gym.make``."""
+    env = gym.make(f"clothgym:{ENV}")
+    rng = np.random.default_rng(0)
+    env.reset(seed=0)
+    env.step(np.zeros(8, np.float32))
+    watch = Stopwatch(env.unwrapped.task.simulation)
+    actions = rng.uniform(-1, 0.51, (steps, 8)).astype(np.float32)
+    begun = time.perf_counter()
+    for action in actions:
+        if env.step(action)[2]:
+            env.reset()
+    total = time.perf_counter() - begun
+    return (total - watch.seconds) / steps * 1e6, watch.seconds / steps * 1e6
+
+
+def main() -> None:
+    rows = []
+    for envs, measure in ((1, lambda: single(1500)), (64, lambda: batch(64, 250)), (256, lambda: batch(256, 250))):
+        beside, physics = np.median([measure() for _ in range(3)], axis=0)
+        rows.append({"envs": envs, "beside physics [us]": round(float(beside), 2), "physics [us]": round(float(physics), 2)})
+        print(f"{envs:4d} environments: {beside:7.1f} us beside the physics, {physics:7.1f} us of physics, per environment step")
+    RESULTS.parent.mkdir(exist_ok=True)
+    RESULTS.write_text(json.dumps({"machine": machine(), "environment": ENV, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
