@@ -66,13 +66,13 @@ MUJOCO = ((DISCRETE, (1, 2, 4, 8, 16, 32)), (MUJOCO_EULER, (30, 32, 40, 64)))
 MUJOCO_CONVERGED = 160
 DRAPE_SUBSTEPS = (46, 50, 57, 70, 115)
 ABOUT = {
-    "scene": "25 x 25 particles, 1 m x 1 m, cotton (E t = 261 N/m, nu 0.243, 0.1503 kg/m^2, plate rigidity 2.34e-6 N m), flat and at "
-    "rest at t = 0, two neighbouring corners held, no contact, no air; error after 0.5 s",
+    "scene": "25 x 25 particles, 1 m x 1 m, cotton (E t = 261 N/m, nu 0.243, 0.1503 kg/m^2, plate rigidity 2.34e-6 N m), flat "
+    "and at rest at t = 0, two neighbouring corners held, no contact, no air; error after 0.5 s",
     "clothgym": "spring grid, float32 (converged: float64, 2560 substeps a frame); damping along springs, damping_time as stated",
-    "mujoco": "2D flex, float64: Saint Venant-Kirchhoff triangles with the same moduli, thickness and masses and, where 'bending', the "
-    "same rigidity; Rayleigh damping 1e-4 s; Newton solver; contact off; converged: the same integrator at dt = 1/9600 s",
-    "claim": "our fastest setting with the cotton's damping whose error is no larger; ratios of frames/s on one core: our batch's sum, "
-    "and our single sheet, over MuJoCo's single sheet",
+    "mujoco": "2D flex, float64: Saint Venant-Kirchhoff triangles with the same moduli, thickness and masses and, where 'bending', "
+    "the same rigidity; Rayleigh damping 1e-4 s; Newton solver; contact off; converged: the same integrator at dt = 1/9600 s",
+    "claim": "our fastest setting with the cotton's damping whose error is no larger; ratios of frames/s on one core: our batch's "
+    "sum, and our single sheet, over MuJoCo's single sheet",
 }
 
 

@@ -33,6 +33,7 @@ GUIDE_POINTS = 32
 COVERED_WITHIN = 0.02 * SIDE
 GUIDE_REACH = 0.15 * SIDE
 CENTRING_SCALE = 0.2  # in sides: performance is halved at this distance
+CALM_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
 ENOUGH_COVERAGE, ENOUGH_CENTRING, ENOUGH_REST = 0.9, 0.1, 0.05
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
@@ -214,7 +215,7 @@ class DrapeTask(Task):
         rms_speed = np.sqrt(summary[SPEED2][envs]).astype(np.float64)
         share = coverage / reference
         return {
-            "normalized_performance": np.minimum(share, 1.0) * _centring(off_center),
+            "normalized_performance": np.minimum(share, 1.0) * _centring(off_center) / (1 + (rms_speed / CALM_SCALE) ** 2),
             "coverage": coverage,
             "off_center": off_center,
             "rms_speed": rms_speed,
@@ -309,10 +310,11 @@ class ClothDrapeEnv(ClothEnv):
     centred on the same target (``benchmarks/drape_reference.py``); e is the horizontal distance of the sheet's centre of area
     from the target's axis.
 
-    ``info["normalized_performance"]`` = min(C / C_ref, 1) / (1 + (e / 0.2 L)^2): 0 for a sheet that does not touch the target's
-    top, 1 for the fine sheet's coverage dead centre.  ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and rms speed under
-    0.05 m/s.  ``info`` also has ``coverage``, ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``,
-    ``settling``, ``failure`` and ``reward_terms``.  What belongs to the judgement is 0 until then.
+    ``info["normalized_performance"]`` = min(C / C_ref, 1) / (1 + (e / 0.2 L)^2) / (1 + (v / 0.1 m/s)^2), with the rms speed v:
+    0 for a sheet that does not touch the target's top, 1 for the fine sheet's coverage, dead centre and at rest.
+    ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and v under 0.05 m/s.  ``info`` also has ``coverage``,
+    ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``, ``settling``, ``failure`` and
+    ``reward_terms``.  What belongs to the judgement is 0 until then.
 
     ## Starting State
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.integrators.base import Integrator, advance_positions, advance_velocities
+from clothgym.integrators.base import Integrator
 from clothgym.mesh import ClothMesh
 
 FIVE_PERCENT = 0.229
@@ -110,17 +110,41 @@ def _project_undamped_springs_of_one(x, w, springs, compliance):
 
 
 @kernel
+def predict(x, v, w, start, gravity, wind, drag_rate, h, row):
+    """Keep the positions in ``start``, then fall freely for a substep; held particles move by their own velocity."""
+    one = x.dtype.type(1)
+    keep = row[0]
+    for l in range(x.shape[2]):
+        keep[l] = one / (one + h * drag_rate[l])
+    for p in range(x.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            xc, vc, sc, gc, ac = x[p, c], v[p, c], start[p, c], gravity[c], wind[c]
+            for l in range(x.shape[2]):
+                free = ac[l] + (vc[l] + h * gc[l] - ac[l]) * keep[l]
+                vc[l] = free if wp[l] > 0 else vc[l]
+                sc[l] = xc[l]
+                xc[l] += h * vc[l]
+
+
+@kernel
+def take_velocities(x, v, w, start, h):
+    """The velocity of a free particle is what it did in the substep."""
+    per_step = x.dtype.type(1) / h
+    for p in range(x.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            vc, xc, sc = v[p, c], x[p, c], start[p, c]
+            for l in range(x.shape[2]):
+                vc[l] = (xc[l] - sc[l]) * per_step if wp[l] > 0 else vc[l]
+
+
+@kernel
 def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, h, work):
     one = x.dtype.type(1)
     lanes = x.shape[2]
     start = work[:-1]
-    row = work[-1]
-    # predict
-    start[:] = 0
-    advance_velocities(v, w, start, gravity, wind, drag_rate, h, row)
-    start[:] = x
-    advance_positions(x, v, h)
-    # project
+    predict(x, v, w, start, gravity, wind, drag_rate, h, work[-1])
     compliance = np.empty_like(stiffness)
     for kind in range(stiffness.shape[0]):
         for l in range(lanes):
@@ -134,14 +158,7 @@ def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind,
         project_springs(x, start, w, springs, compliance, damping)
     else:
         project_undamped_springs(x, w, springs, compliance)
-    # the velocity is what the particle did
-    per_step = one / h
-    for p in range(x.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            vc, xc, sc = v[p, c], x[p, c], start[p, c]
-            for l in range(lanes):
-                vc[l] = (xc[l] - sc[l]) * per_step if wp[l] > 0 else vc[l]
+    take_velocities(x, v, w, start, h)
 
 
 XPBD = Integrator("xpbd", order=1, substep=substep, largest_substep=largest_substep, safety=1.0, springs_by_particle=False)
