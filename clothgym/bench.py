@@ -105,7 +105,7 @@ def env_rows(quick: bool) -> Iterator[Row]:
             for threads in sorted({1, _jit.default_threads()}):
                 vector = gym.make_vec(env_id, num_envs=num_envs, threads=threads, autoreset_mode="SameStep")
                 vector.reset(seed=0)
-                actions = np.random.default_rng(0).uniform(-1, 0.5, vector.action_space.shape)
+                actions = np.random.default_rng(0).uniform(-1, 0.81, vector.action_space.shape)
                 steps = max(1, (20 if quick else 100) * 64 // num_envs)
                 seconds = seconds_per_call(lambda v=vector, a=actions, n=steps: [v.step(a) for _ in range(n)], 1.0)  # type: ignore[misc]
                 yield {

@@ -282,7 +282,7 @@ class ClothDrapeEnv(ClothEnv):
     | Num | Action | Range | Unit |
     | --- | --- | --- | --- |
     | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | let go for good, if above 0.5 | [-1, 1] | |
+    | 3, 7 | let go for good, if above 0.8 | [-1, 1] | |
 
     ## Observation Space
     ``Box`` of 68 numbers for ``obs_mode="keypoints"`` (and 6 x 289 + 14 for ``"particles"``, all particles row by row):

@@ -32,8 +32,8 @@ FAILURE_PENALTY = 0.5
 EFFORT_PRICE = 0.001
 TORN = 2.0  # a structural spring at twice its rest length
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
-HELD, OPEN = (250, 200, 60), (150, 150, 150)  # colours of the anchors' markers
-LETS_GO = 0.5  # an action above this opens the anchor
+HELD = (250, 200, 60)  # colour of the anchors' markers
+LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
 
 
 @dataclass(frozen=True)
@@ -377,7 +377,7 @@ class Task(ABC):
         positions = self.simulation.positions[list(envs)]
         targets, attached = self.episode["targets"], self.simulation.attached
         solids = [self.solids(env) for env in envs]
-        markers = [[(x, HELD if held else OPEN) for x, held in zip(targets[env], attached[env])] for env in envs]
+        markers = [[(x, HELD) for x, held in zip(targets[env], attached[env]) if held] for env in envs]
         if mode == "depth_array":
             return renderer.depth_batch(positions, solids, markers)
         return renderer.rgb_batch(positions, solids, markers)

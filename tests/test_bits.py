@@ -20,7 +20,7 @@ def flatten(info):
 
 def actions(num_envs, steps=STEPS, seed=0):
     """The same actions for environment i whatever the batch; some let go early, so that all phases are met."""
-    each = [np.random.default_rng([seed, i]).uniform(-1, 0.7, (steps, 8)) for i in range(num_envs)]
+    each = [np.random.default_rng([seed, i]).uniform(-1, 0.85, (steps, 8)) for i in range(num_envs)]
     return np.stack(each, axis=1)
 
 
