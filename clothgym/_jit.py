@@ -26,8 +26,13 @@ from typing import Any
 
 import numba
 from numba.core import caching
+from numba.core.runtime import rtsys
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "nogil": True, "boundscheck": False}
+
+# before it loads a function numba fills its tables of typing and lowering, which takes longer than all of our loading; a
+# function that is compiled already needs its runtime only.  Versions with which this was tested:
+LOADS_WITHOUT_TABLES = {(0, 68)}
 
 
 def _source_digest() -> str:
@@ -149,7 +154,11 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         if not folder.path.is_dir():
             folder.announce()
             return None
-        found = super().load_overload(sig, target_context)
+        if numba.version_info.short in LOADS_WITHOUT_TABLES:
+            rtsys.initialize(target_context)
+            found = self._load_overload(sig, target_context)
+        else:
+            found = super().load_overload(sig, target_context)
         if found is None and folder.writable and folder.depth == 0:
             folder.acquire()
             found = super().load_overload(sig, target_context)

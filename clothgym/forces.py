@@ -16,6 +16,8 @@ from clothgym._jit import kernel
 from clothgym.mesh import ClothMesh
 from clothgym.state import State
 
+POWER_STEPS = 16
+
 
 @kernel
 def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
@@ -107,18 +109,29 @@ def largest_frequency(mesh: ClothMesh, stiffness: NDArray, inverse_mass: NDArray
 
 
 def frequency_bound(mesh: ClothMesh, stiffness: NDArray, inverse_mass: NDArray) -> float:
-    """An upper bound on the frequency in any configuration that stretches no spring less than its rest length [rad/s].
+    """An upper bound on ``largest_frequency`` [rad/s], some tenth above it, in a fraction of the time and without scipy.
 
-    Each spring's tangent stiffness is then at most k in every direction, so the graph Laplacian of the k bounds K, and
-    Gershgorin's circles bound that: the largest row sum of ``M^-1 L``.  Cheap, but a third or so above
-    ``largest_frequency`` for a flat sheet.
+    With A the magnitudes of M^-1 K, no eigenvalue exceeds the largest ``(A y)/y`` for any positive y (Collatz and Wielandt);
+    a few steps of the power method make y a good one.  Arguments as there.
     """
     springs = mesh.springs
-    k = springs.weight * stiffness[springs.kind]
-    total = np.zeros(mesh.num_particles)
-    np.add.at(total, springs.particles[:, 0], k)
-    np.add.at(total, springs.particles[:, 1], k)
-    return float(np.sqrt(np.max(2 * total * inverse_mass)))
+    i, j = springs.particles.T
+    n = (mesh.rest_positions[j] - mesh.rest_positions[i]) / springs.rest_length[:, None]
+    blocks = (springs.weight * stiffness[springs.kind])[:, None, None] * n[:, :, None] * n[:, None, :]
+    own = np.zeros((mesh.num_particles, 3, 3))
+    for end in (i, j):
+        np.add.at(own, end, blocks)
+    own, blocks = np.abs(own), np.abs(blocks)
+    y = np.ones((mesh.num_particles, 3))
+    bound = np.inf
+    for _ in range(POWER_STEPS):
+        z = np.einsum("pab,pb->pa", own, y)
+        for end, other in ((i, j), (j, i)):
+            np.add.at(z, end, np.einsum("sab,sb->sa", blocks, y[other]))
+        z = z * inverse_mass[:, None] + 1e-9 * y  # stays positive in directions that no spring has
+        bound = min(bound, float(np.max(z / y)))
+        y = z / z.max()
+    return float(np.sqrt(bound))
 
 
 class Energy(NamedTuple):

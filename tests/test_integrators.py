@@ -132,9 +132,39 @@ def test_explicit_bound_of_a_sheet_is_sharp():
     mesh, stiffness, inverse_mass, bound = sheet_and_bound()
     assert growth(mesh, 0.99 * bound) < 100
     assert not growth(mesh, 1.01 * bound) < 1e6  # or not a number
-    # one spring's 2 sqrt(m/k) would be too generous, the configuration-free bound is safe
+    # one spring's 2 sqrt(m/k) would be too generous
     assert 2 / np.sqrt(np.max(stiffness) * np.median(inverse_mass)) > 1.3 * bound
-    assert frequency_bound(mesh, stiffness, inverse_mass) > largest_frequency(mesh, stiffness, inverse_mass)
+
+
+@pytest.mark.parametrize("shape", [(5, 5, 0.3, 0.3), (9, 6, 0.2, 0.35), (2, 2, 0.1, 0.1)])
+def test_frequencies_against_a_dense_eigenvalue(shape):
+    """K by finite differences of the elastic energy, in float64, at random stiffness and mass."""
+    mesh = grid(*shape)
+    rng = np.random.default_rng(0)
+    stiffness, mass = rng.uniform(50, 300, 5), rng.uniform(1e-4, 1e-3, mesh.num_particles)
+    k = mesh.springs.weight * stiffness[mesh.springs.kind]
+    i, j = mesh.springs.particles.T
+
+    def gradient(x):
+        d = x[j] - x[i]
+        length = np.linalg.norm(d, axis=1, keepdims=True)
+        f = k[:, None] * (length - mesh.springs.rest_length[:, None]) * d / length
+        out = np.zeros_like(x)
+        np.add.at(out, j, f)
+        np.add.at(out, i, -f)
+        return out.ravel()
+
+    size, step = 3 * mesh.num_particles, 1e-6
+    hessian = np.empty((size, size))
+    for q in range(size):
+        shift = np.zeros(size)
+        shift[q] = step
+        shift = shift.reshape(-1, 3)
+        hessian[q] = (gradient(mesh.rest_positions + shift) - gradient(mesh.rest_positions - shift)) / (2 * step)
+    scale = np.repeat(mass**-0.5, 3)
+    exact = np.sqrt(np.linalg.eigvalsh((hessian + hessian.T) / 2 * scale[:, None] * scale).max())
+    assert largest_frequency(mesh, stiffness, 1 / mass) == pytest.approx(exact, rel=1e-4)
+    assert exact <= frequency_bound(mesh, stiffness, 1 / mass) < 1.5 * exact
 
 
 def test_damped_bound_is_sharp(chain):

@@ -34,6 +34,7 @@ class Integrator:
         substep: the kernel, see the module's docstring.
         largest_substep: (mesh, stiffness by kind [N/m], damping time [s], inverse masses [1/kg]) to the largest substep
             [s] that the method should be used with, and why, as a clause of a sentence.
+        surely_allowed: the same arguments to a substep [s] that is certainly no larger than that, found quickly.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
         springs_by_particle: whether the result does not depend on the springs' order, so that the fastest one may be used.
     """
@@ -42,6 +43,7 @@ class Integrator:
     order: int
     substep: Any
     largest_substep: Callable[[ClothMesh, NDArray, float, NDArray], tuple[float, str]]
+    surely_allowed: Callable[[ClothMesh, NDArray, float, NDArray], float]
     safety: float
     springs_by_particle: bool
 

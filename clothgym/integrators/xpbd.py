@@ -28,6 +28,11 @@ def largest_substep(mesh: ClothMesh, stiffness: NDArray, damping_time: float, in
     return float(FIVE_PERCENT / np.sqrt(np.max(k * lightest))), "beyond it the sheet is more than 5 % too soft"
 
 
+def surely_allowed(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inverse_mass: NDArray) -> float:
+    """The formula is quick: the same."""
+    return largest_substep(mesh, stiffness, damping_time, inverse_mass)[0]
+
+
 @kernel
 def project_springs(x, start, w, springs, compliance, damping):
     """Move both ends of each spring towards its rest length, in place.
@@ -161,4 +166,12 @@ def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind,
     take_velocities(x, v, w, start, h)
 
 
-XPBD = Integrator("xpbd", order=1, substep=substep, largest_substep=largest_substep, safety=1.0, springs_by_particle=False)
+XPBD = Integrator(
+    "xpbd",
+    order=1,
+    substep=substep,
+    largest_substep=largest_substep,
+    surely_allowed=surely_allowed,
+    safety=1.0,
+    springs_by_particle=False,
+)
