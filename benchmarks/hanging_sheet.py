@@ -3,7 +3,8 @@
     pip install "mujoco>=4" matplotlib
     python benchmarks/hanging_sheet.py                    # measures what the results lack, prints the tables, draws the plot
     python benchmarks/hanging_sheet.py --only ours        # one section only: ours, mujoco, static or drape
-    python benchmarks/hanging_sheet.py --fresh            # measures again, about five minutes
+    python benchmarks/hanging_sheet.py --again            # times once more and keeps the faster time, on a machine that is shared
+    python benchmarks/hanging_sheet.py --fresh            # measures anew, about six minutes
     python benchmarks/hanging_sheet.py --only yardstick --yardstick PATH/spring_loop.py
 
 A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighbouring corners are held; there is
@@ -274,7 +275,7 @@ def print_table(title: str, rows: list[Row]) -> None:
 
 def draw(results: Row, path: Path) -> None:
     colours = {EULER: "#d1495b", XPBD: "#edae49", DISCRETE: "#2b2d42", MUJOCO_EULER: "#8d99ae"}
-    figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(8.4, 4.4), layout="constrained")
 
     def line(rows: list[Row], label: str, **style: Any) -> None:
         seconds = [1 / (FRAME * row["frames/s"]) for row in rows]
@@ -296,7 +297,7 @@ def draw(results: Row, path: Path) -> None:
         ylabel="rms error after 0.5 s [mm]",
     )
     axes.set_title("Hanging sheet, 25 x 25, cotton, 1 m", loc="left", fontsize=11)
-    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes.legend(frameon=False, fontsize=8.5, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150)
     plt.close(figure)
@@ -306,6 +307,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--only", choices=SECTIONS, help="one section")
     parser.add_argument("--fresh", action="store_true", help="measure again what is there")
+    parser.add_argument("--again", action="store_true", help="time again, and keep the faster time of each case")
     parser.add_argument("--yardstick", type=Path, help="a spring_loop.py with bare spring passes; no such section without it")
     args = parser.parse_args()
     RESULT.parent.mkdir(exist_ok=True)
@@ -328,10 +330,14 @@ def main() -> None:
     for name in cases if args.only is None else cases.keys() & {args.only}:
         rows = results[name] = [] if args.fresh else results.get(name, [])
         for measure, key in cases[name]:
-            if not any(key.items() <= row.items() for row in rows):
+            known = next((row for row in rows if key.items() <= row.items()), None)
+            if known is None:
                 rows.append(key | measure(**key))
-                results["claim"] = claims(results)
-                RESULT.write_text(json.dumps(results, indent=1) + "\n")
+            elif args.again and "frames/s" in known:
+                # whatever else the machine does can only slow a run down
+                known["frames/s"] = max(known["frames/s"], measure(**key)["frames/s"])
+            results["claim"] = claims(results)
+            RESULT.write_text(json.dumps(results, indent=1) + "\n")
     for name in (*SECTIONS, "claim"):
         if results.get(name):
             print_table(name, results[name])

@@ -298,7 +298,8 @@ class ClothDrapeEnv(ClothEnv):
     | 65-67 | settling; share of the episode left; share of the acting time left | 1 |
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure.
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure,
+    plus 0.25 for a success.
     While the episode runs the potential is the mean of how near the sheet is to 32 points of the target's upper surface,
     ``1/(1 + (d/0.15 L)^2)``, and of how central its centre of area is, ``1/(1 + (e/0.2 L)^2)``.  At the end it is the
     normalised performance, at a failure 0: the return is the score, less the start's potential and the small terms.

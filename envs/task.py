@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 REWARD_MODES = ("delta", "sparse")
 FAILURE_PENALTY = 0.5
+SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
 TORN = 2.0  # a structural spring at twice its rest length
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
@@ -276,8 +277,8 @@ class Task(ABC):
         info: dict[str, Any] = dict(self._judgement())
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
-        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info["normalized_performance"])
-        reward = terms["progress"] + terms["effort"] + terms["failure"]
+        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info)
+        reward = terms["progress"] + terms["effort"] + terms["success"] + terms["failure"]
 
         fresh = self._clipped_observation()
         keep = ~running | (failure == 1)
@@ -285,7 +286,7 @@ class Task(ABC):
         episode["over"] |= terminated
         info |= {
             "reward_terms": terms,
-            "strain_max": np.sqrt(summary[STRETCH2]) - 1,
+            "strain_max": np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf),
             "settling": episode["settling_since"] >= 0,
             "failure": np.array(FAILURES)[failure],
         }
@@ -337,15 +338,17 @@ class Task(ABC):
         judged: NDArray,
         failure: NDArray,
         summary: NDArray,
-        performance: NDArray,
+        judgement: dict[str, Any],
     ) -> dict[str, NDArray]:
-        """Reward terms, (num_envs,) each: the change of the potential, which ends at the judged performance, less small prices."""
+        """Reward terms, (num_envs,) each: the potential's change, which ends at the judged performance, and small ones."""
+        performance = judgement["normalized_performance"]
         with np.errstate(invalid="ignore", over="ignore"):
             potential = np.where(judged, performance, np.where(failure > 0, 0.0, self._potential(summary)))
         previous = self.episode["potential"]
         self.episode["potential"] = np.where(running, potential, previous)
         if self.reward_mode == "sparse":
-            return {"progress": performance * judged, "effort": np.zeros(self.num_envs), "failure": np.zeros(self.num_envs)}
+            nothing = np.zeros(self.num_envs)
+            return {"progress": performance * judged, "effort": nothing, "success": nothing.copy(), "failure": nothing.copy()}
         squares = moves[:, :, 0] ** 2 + moves[:, :, 1] ** 2 + moves[:, :, 2] ** 2
         effort = squares[:, 0].copy()
         for a in range(1, self.num_anchors):
@@ -353,6 +356,7 @@ class Task(ABC):
         return {
             "progress": np.where(running, potential - previous, 0.0),
             "effort": -EFFORT_PRICE * effort * acting,
+            "success": SUCCESS_BONUS * (judgement["is_success"] & judged),
             "failure": -FAILURE_PENALTY * (failure > 0),
         }
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 import clothgym
 
-CHECKPOINT, CONFIG = "checkpoint.pt", "config.json"
+CHECKPOINT, BEST, CONFIG = "checkpoint.pt", "best.pt", "config.json"
 Policy = Callable[[Any, NDArray], NDArray]  # (vector env, observations) -> actions
 
 
@@ -68,7 +68,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def learnt(folder: Path, env_id: str) -> Policy:
-    """The deterministic policy of a run."""
+    """The deterministic policy of a run: the best of its held-out evaluations, or the last while there is none."""
     config = read_config(folder)
     if config["env"] != env_id:
         raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
@@ -77,12 +77,13 @@ def learnt(folder: Path, env_id: str) -> Policy:
         env.single_observation_space, env.single_action_space, lambda _: 0.0, **config["hyperparameters"].get("policy_kwargs", {})
     )
     env.close()
-    policy.load_state_dict(_load(folder)["policy"])
+    best = folder / BEST
+    policy.load_state_dict(_load(folder, BEST if best.exists() else CHECKPOINT)["policy"])
     policy.set_training_mode(False)
     return lambda env, observations: policy.predict(observations, deterministic=True)[0]
 
 
-def save_checkpoint(folder: Path, model: PPO) -> None:
+def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
     """Write the learner's tensors; a crash in the middle leaves the previous checkpoint whole."""
     state = {
         "policy": model.policy.state_dict(),
@@ -90,9 +91,9 @@ def save_checkpoint(folder: Path, model: PPO) -> None:
         "num_timesteps": model.num_timesteps,
         "num_updates": model._n_updates,
     }
-    scratch = folder / f"{CHECKPOINT}.new"
+    scratch = folder / f"{name}.new"
     torch.save(state, scratch)
-    os.replace(scratch, folder / CHECKPOINT)
+    os.replace(scratch, folder / name)
 
 
 def load_checkpoint(folder: Path, model: PPO) -> None:
@@ -104,9 +105,10 @@ def load_checkpoint(folder: Path, model: PPO) -> None:
     model._n_updates = int(state["num_updates"])
 
 
-def _load(folder: Path) -> dict[str, Any]:
+def _load(folder: Path, name: str = CHECKPOINT) -> dict[str, Any]:
     folder = folder.parent if folder.name == CHECKPOINT else folder
+    path = folder / name
     try:
-        return torch.load(folder / CHECKPOINT, map_location="cpu", weights_only=True)
+        return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise ValueError(f"{str(folder / CHECKPOINT)!r} cannot be read as a checkpoint ({error}): train anew") from error
+        raise ValueError(f"{str(path)!r} cannot be read as a checkpoint ({error}): train anew") from error

@@ -4,7 +4,7 @@
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
 
-The folder holds: config.json, checkpoint.pt (tensors only), model.zip (Stable-Baselines3's own format, for ``PPO.load``),
+The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success; tensors only), model.zip (Stable-Baselines3's own format, for ``PPO.load``),
 progress.jsonl (one held-out evaluation a line), evaluation.json (the final score), learning_curve.png, policy.gif, and the
 TensorBoard log.  Hyperparameters are read from hyperparams/ppo.yml, in the format of rl_zoo3.
 """
@@ -51,7 +51,7 @@ class Args:
     """Folder of a run to go on with; its configuration is used."""
     hyperparams: Path = HERE / "hyperparams" / "ppo.yml"
     """Hyperparameters by environment id, in rl_zoo3's format."""
-    eval_episodes: int = 100
+    eval_episodes: int = 200
     """Held-out episodes of each evaluation on the way."""
     final_episodes: int = 500
     """Held-out episodes of the final evaluation."""
@@ -66,6 +66,7 @@ class HeldOutEvaluation(BaseCallback):
         super().__init__()
         self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
         self.rollouts = 0
+        self.best = max((line["success_rate"] for line in _lines(folder)), default=-1.0)
         self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
         self.evaluating = 0.0
         self.started = time.perf_counter()
@@ -109,6 +110,9 @@ class HeldOutEvaluation(BaseCallback):
             "normalized_performance": float(episodes["normalized_performance"].mean()),
             "return": float(episodes["return"].mean()),
         }
+        if line["success_rate"] >= self.best:
+            self.best = line["success_rate"]
+            policies.save_checkpoint(self.folder, self.model, policies.BEST)
         with open(self.folder / "progress.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
         for key in ("success_rate", "normalized_performance", "return"):
