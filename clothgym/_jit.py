@@ -15,6 +15,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import pickle
 import sys
 import threading
 import warnings
@@ -26,6 +27,7 @@ from typing import Any
 
 import numba
 from numba.core import caching
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import rtsys
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "nogil": True, "boundscheck": False}
@@ -62,24 +64,32 @@ class _CacheFolder:
         self.depth = 0  # nested compilations that hold the lock; guarded by numba's own compiler lock
         self._file: int | None = None  # a bare descriptor: held for the life of the process
         self._announced = False
-        root = _default_root()
-        self.path = root / _source_digest()
+        self.writable = True
+        self.path = Path(os.devnull) / "none"
         try:
+            self.path = _default_root() / _source_digest()
             self.path.mkdir(parents=True, exist_ok=True)
             self._file = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT)
-            self.writable = True
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
+            self.give_up(error)
+
+    def give_up(self, error: Exception) -> None:
+        """Go on without writing to the folder, and say so once."""
+        if self.writable:
             self.writable = False
             warnings.warn(
-                f"clothgym cannot write its kernel cache {str(root)!r} ({error.strerror}): kernels will be compiled anew in "
+                f"clothgym cannot write its kernel cache {str(self.path.parent)!r} ({error}): kernels will be compiled anew in "
                 "this process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder that can be written.",
                 stacklevel=2,
             )
 
     def acquire(self) -> None:
         if self._file is not None and self.depth == 0:
-            _lock_file(self._file)
-            self.depth = 1
+            try:
+                _lock_file(self._file)
+                self.depth = 1
+            except OSError as error:  # a file system without locks
+                self.give_up(error)
 
     def release(self) -> None:
         if self._file is not None and self.depth == 1:
@@ -151,24 +161,34 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         folder = cache_folder()
-        if not folder.path.is_dir():
-            folder.announce()
-            return None
-        if numba.version_info.short in LOADS_WITHOUT_TABLES:
-            rtsys.initialize(target_context)
-            found = self._load_overload(sig, target_context)
-        else:
-            found = super().load_overload(sig, target_context)
+        found = self._load(sig, target_context)
         if found is None and folder.writable and folder.depth == 0:
             folder.acquire()
-            found = super().load_overload(sig, target_context)
+            found = self._load(sig, target_context)
         if found is None:
+            target_context.refresh()
             folder.announce()
         return found
 
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        if not cache_folder().path.is_dir():
+            return None
+        if numba.version_info.short in LOADS_WITHOUT_TABLES:
+            rtsys.initialize(target_context)
+        else:
+            target_context.refresh()
+        try:
+            return self._load_overload(sig, target_context)
+        except (OSError, EOFError, pickle.UnpicklingError):  # a file cut short, by a full disk for instance: compile anew
+            return None
+
     def save_overload(self, sig: Any, data: Any) -> None:
-        if cache_folder().writable:
-            super().save_overload(sig, data)
+        folder = cache_folder()
+        if folder.writable:
+            try:
+                super().save_overload(sig, data)
+            except OSError as error:
+                folder.give_up(error)
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -176,17 +196,20 @@ def kernel(function: Callable[..., Any]) -> Any:
 
     Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
     """
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return function
     dispatcher = numba.njit(**OPTIONS)(function)
     dispatcher._cache = _Cache(function)
     compile_or_load = dispatcher.compile
 
     def compile_locked(signature: Any) -> Any:
-        held = cache_folder().depth > 0
-        try:
-            return compile_or_load(signature)
-        finally:
-            if not held:
-                cache_folder().release()
+        with global_compiler_lock:  # numba's own, taken before we look whether this thread holds the file's
+            held = cache_folder().depth > 0
+            try:
+                return compile_or_load(signature)
+            finally:
+                if not held:
+                    cache_folder().release()
 
     dispatcher.compile = compile_locked
     return dispatcher
@@ -196,8 +219,13 @@ def specialize(function: Any, name: str, **callees: Any) -> Any:
     """A kernel with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
 
     This is how one substep loop serves every integrator: numba's disk cache misses in each new process when a dispatcher
-    is an argument or a closure variable, and hits when it is a global.  ``name`` keeps the cache entries apart.
+    is an argument or a closure variable, and hits when it is a global.  ``name`` keeps the cache entries apart, with a digest
+    of the source of callees from outside this package, which the folder's name does not cover.
     """
+    for callee in callees.values():
+        path = Path(getattr(callee, "py_func", callee).__code__.co_filename)
+        if Path(__file__).parent not in path.parents:
+            name += "_" + hashlib.sha256(path.read_bytes() if path.is_file() else os.urandom(8)).hexdigest()[:12]
     code = function.__code__.replace(co_name=name, co_qualname=name)
     bound = FunctionType(code, {**function.__globals__, **callees}, name)
     bound.__qualname__ = name

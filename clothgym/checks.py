@@ -2,25 +2,69 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def positive(name: str, value: float) -> float:
-    if not (np.isfinite(value) and value > 0):
+def number(name: str, value: Any) -> float:
+    """A finite number."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    if array.shape != () or not np.isfinite(array):
+        raise ValueError(f"{name}={value!r}: must be a finite number")
+    return float(array)
+
+
+def positive(name: str, value: Any) -> float:
+    """A finite number above zero."""
+    if number(name, value) <= 0:
         raise ValueError(f"{name}={value!r}: must be positive and finite")
     return float(value)
 
 
+def count(name: str, value: Any, what: str = "") -> int:
+    """An integer of at least 1."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(f"{name}={value!r}: must be {what}an integer of at least 1")
+    return int(value)
+
+
 def finite(name: str, value: ArrayLike) -> NDArray:
-    array = np.asarray(value, dtype=np.float64)
+    """An array of finite numbers, as float64."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}={value!r}: must be numbers") from None
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds a value that is not finite: {array[~np.isfinite(array)][0]}")
     return array
 
 
 def vector(name: str, value: ArrayLike) -> NDArray:
+    """Three finite numbers."""
     array = finite(name, value)
     if array.shape != (3,):
         raise ValueError(f"{name}={value!r}: must be three numbers")
     return array
+
+
+def spread(name: str, value: NDArray, shape: tuple[int, ...]) -> NDArray:
+    """``value`` broadcast to ``shape``."""
+    try:
+        return np.broadcast_to(value, shape)
+    except ValueError:
+        raise ValueError(f"{name} has shape {value.shape}: must be one value for all, or {shape}") from None
+
+
+def indices(name: str, value: ArrayLike, end: int, what: str) -> NDArray:
+    """Integers from 0 to ``end - 1``, as a flat array."""
+    array = np.atleast_1d(np.asarray(value))
+    if array.size == 0:
+        return np.zeros(0, np.int64)
+    if array.dtype.kind not in "iu" or array.ndim != 1 or array.min() < 0 or array.max() >= end:
+        raise ValueError(f"{name}={value!r}: must be integers, {what} are 0 to {end - 1}")
+    return array.astype(np.int64)

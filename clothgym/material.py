@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import number
 from clothgym.mesh import BEND_X, BEND_Y, NUM_KINDS, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
 
@@ -40,11 +41,11 @@ class Material:
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            value = getattr(self, field.name)
             if field.name == "source":
                 continue
+            value = number(field.name, getattr(self, field.name))
             positive = field.name in ("density", "stretch_stiffness")
-            if not np.isfinite(value) or value < 0 or (positive and value == 0):
+            if value < 0 or (positive and value == 0):
                 need = "positive" if positive else "zero or positive"
                 raise ValueError(f"{field.name}={value!r}: must be {need} and finite")
 

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import positive
+
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
 
@@ -77,8 +79,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
         if not isinstance(count, (int, np.integer)) or count < 2:
             raise ValueError(f"{name}={count!r}: a sheet needs at least 2 {name} of particles, as an integer")
     for name, side in (("width", width), ("height", height)):
-        if not (np.isfinite(side) and side > 0):
-            raise ValueError(f"{name}={side!r}: a side must be a positive, finite length in metres")
+        positive(name, side)
     rows, cols = int(rows), int(cols)
     dx, dy = width / (cols - 1), height / (rows - 1)
     index = np.arange(rows * cols).reshape(rows, cols)

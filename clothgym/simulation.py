@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, integrators
 from clothgym._jit import specialize
-from clothgym.checks import finite, positive, vector
-from clothgym.collisions import ROWS, Collider, resolve, signed_distances
+from clothgym.checks import count, finite, indices, positive, spread, vector
+from clothgym.collisions import ROWS, Collider, Contacts, resolve, signed_distances
 from clothgym.forces import Energy, energy
 from clothgym.integrators import Integrator
 from clothgym.material import Material, spring_stiffness
@@ -45,13 +45,6 @@ def advance(first, last, x, v, w, springs, fabric, kinds, colliders, h, substeps
 @cache
 def _compiled(integrator: Integrator) -> Any:
     return specialize(advance, f"advance_{integrator.name}", substep=integrator.substep)
-
-
-class Contacts(NamedTuple):
-    """Contact of particles with colliders: signed distance to the nearest [m], and which it is, (num_envs, particles)."""
-
-    distance: NDArray
-    collider: NDArray
 
 
 class View(NamedTuple):
@@ -100,12 +93,17 @@ class Simulation:
         dtype: str = "float32",
         threads: int | None = None,
     ) -> None:
-        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r}: a batch needs at least 1 environment, as an integer")
+        if not isinstance(mesh, ClothMesh):
+            raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
+        if material is not None and not isinstance(material, Material):
+            raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
+        if isinstance(colliders, Collider) or not all(isinstance(c, Collider) for c in colliders):
+            raise ValueError(f"colliders={colliders!r}: must be a sequence of Plane, Sphere, Capsule or Box")
+        count("num_envs", num_envs)
         if dtype not in ("float32", "float64"):
             raise ValueError(f"dtype={dtype!r}: must be 'float32' or 'float64'")
-        if threads is not None and threads < 1:
-            raise ValueError(f"threads={threads!r}: must be at least 1")
+        if threads is not None:
+            count("threads", threads)
         self.mesh = mesh
         self.material = material if material is not None else Material.preset("cotton")
         self.integrator = integrators.get(integrator)
@@ -114,9 +112,7 @@ class Simulation:
         self.dtype = np.dtype(dtype)
         self.threads = threads if threads is not None else _jit.default_threads()
         self.layout = Layout.choose(int(num_envs), self.threads)
-        self.anchors = np.asarray(anchors, np.int64).reshape(-1)
-        if self.anchors.size and (self.anchors.min() < 0 or self.anchors.max() >= mesh.num_particles):
-            raise ValueError(f"anchors={list(anchors)!r}: particles of this mesh are 0 to {mesh.num_particles - 1}")
+        self.anchors = indices("anchors", anchors, mesh.num_particles, "particles of this mesh")
         if len(set(self.anchors.tolist())) < self.anchors.size:
             raise ValueError(f"anchors={list(anchors)!r}: a particle is named twice")
         self.colliders = tuple(colliders)
@@ -125,6 +121,8 @@ class Simulation:
         self._advance = _compiled(self.integrator)
 
         everyone = (self.num_envs,)
+        rows = np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS)
+        solids = np.broadcast_to(rows, (*everyone, *rows.shape))
         state = State(
             positions=np.broadcast_to(mesh.rest_positions, (*everyone, mesh.num_particles, 3)),
             velocities=np.zeros((*everyone, mesh.num_particles, 3)),
@@ -138,9 +136,8 @@ class Simulation:
             gravity=np.broadcast_to(vector("gravity", gravity), (*everyone, 3)),
             wind=np.broadcast_to(vector("wind", wind), (*everyone, 3)),
             parameters=np.broadcast_to([getattr(self.material, name) for name in FIGURES], (*everyone, len(FIGURES))),
-            colliders=np.broadcast_to(
-                np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS), (*everyone, len(self.colliders), ROWS)
-            ),
+            colliders=solids,
+            collider_homes=solids,
             steps=np.zeros(everyone, np.int64),
         )
         self.set_state(state)
@@ -151,6 +148,7 @@ class Simulation:
 
     def step(self, n: int = 1) -> None:
         """Advance all environments by ``n`` control steps; anchors move towards their targets at a bounded speed."""
+        count("n", n)
         h = self.dtype.type(self.time_step / self.substeps)
 
         def work(first: int, last: int) -> None:
@@ -175,9 +173,7 @@ class Simulation:
     def _choose_substeps(self, substeps: int | str) -> int:
         if substeps == "auto":
             return self.integrator.automatic_substeps(self.time_step, self.largest_substep()[0])
-        if isinstance(substeps, str) or not isinstance(substeps, (int, np.integer)) or substeps < 1:
-            raise ValueError(f"substeps={substeps!r}: must be 'auto' or an integer of at least 1")
-        self.substeps = int(substeps)
+        self.substeps = count("substeps", substeps, "'auto' or ")
         self._warn_if_beyond_bound(np.arange(1))
         return self.substeps
 
@@ -230,6 +226,11 @@ class Simulation:
         return View(self._x, self._v, self._springs)
 
     @property
+    def parameters(self) -> NDArray:
+        """Material figures of each environment, in the order of ``FIGURES``, (num_envs, figures); a fresh copy."""
+        return self._parameters.copy()
+
+    @property
     def attached(self) -> NDArray:
         """Whether each anchor holds its particle, (num_envs, anchors); a fresh copy."""
         return self.layout.to_public(self._attached)
@@ -279,9 +280,7 @@ class Simulation:
             which = np.tile(np.arange(self.anchors.size), len(env))
             env = np.repeat(env, self.anchors.size)
         else:
-            which = np.broadcast_to(np.asarray(anchors, np.int64), env.shape)
-            if which.size and (which.min() < 0 or which.max() >= self.anchors.size):
-                raise ValueError(f"anchors={anchors!r}: this simulation has anchors 0 to {self.anchors.size - 1}")
+            which = spread("anchors", indices("anchors", anchors, self.anchors.size, "this simulation's anchors"), env.shape)
         block, lane = self.layout.place(env)
         particle = self.anchors[which]
         newly = self._attached[block, which, lane] != hold
@@ -292,7 +291,8 @@ class Simulation:
         self._apply_masses()
 
     def reset(self, envs: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
-        """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached.
+        """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached, solids
+        that have moved where they began.
 
         positions, velocities: (len(envs), particles, 3), or one sheet for all, (particles, 3).
         """
@@ -306,6 +306,7 @@ class Simulation:
         block, lane = self.layout.place(env)
         self._x[block, :, :, lane] = np.broadcast_to(x, shape)
         self._v[block, :, :, lane] = np.broadcast_to(v, shape)
+        self._colliders[block, :, :, lane] = self._collider_homes[block, :, :, lane]
         self._attached[block, :, lane] = True
         self._targets[block, :, :, lane] = self._x[block, :, :, lane][:, self.anchors]
         self._steps[env] = 0
@@ -325,12 +326,12 @@ class Simulation:
         fields: dict[str, NDArray] = {}
         for name, value in figures.items():
             if name in FIGURES:
-                values = np.broadcast_to(finite(name, value), env.shape)
+                values = spread(name, finite(name, value), env.shape)
                 for one in np.unique(values):
                     replace(self.material, **{name: float(one)})  # type: ignore[arg-type]
                 parameters[:, FIGURES.index(name)] = values
             elif name in ("gravity", "wind"):
-                fields[name] = np.broadcast_to(finite(name, value), (len(env), 3))
+                fields[name] = spread(name, finite(name, value), (len(env), 3))
             else:
                 known = (*FIGURES, "gravity", "wind")
                 near = difflib.get_close_matches(name, known, n=1)
@@ -351,14 +352,16 @@ class Simulation:
         env = self._env_indices(envs)
         if not 0 <= index < len(self.colliders):
             raise ValueError(f"index={index!r}: this simulation has {len(self.colliders)} colliders")
-        if len(colliders) != len(env):
-            raise ValueError(f"{len(colliders)} colliders for {len(env)} environments: give one each")
+        if isinstance(colliders, Collider) or len(colliders) != len(env):
+            raise ValueError(f"colliders={colliders!r}: give a sequence of {len(env)}, one for each environment")
         for collider in colliders:
             if collider.kind != self._kinds[index]:
                 here, there = type(self.colliders[index]).__name__, type(collider).__name__
                 raise ValueError(f"collider {index} is a {here}: a {there} cannot take its place")
         block, lane = self.layout.place(env)
-        self._colliders[block, index, :, lane] = np.array([c.rows() for c in colliders])
+        self._colliders[block, index, :, lane] = self._collider_homes[block, index, :, lane] = np.array(
+            [c.rows() for c in colliders]
+        )
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
@@ -375,6 +378,7 @@ class Simulation:
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
             colliders=public(self._colliders),
+            collider_homes=public(self._collider_homes),
             steps=self._steps.copy(),
         )
 
@@ -402,6 +406,7 @@ class Simulation:
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
         self._colliders = blocks(state.colliders, dtype)
+        self._collider_homes = blocks(state.collider_homes, dtype)
         self._steps = np.array(state.steps, np.int64)
         self._w = self._free_w.copy()
         self._apply_masses()
@@ -435,10 +440,7 @@ class Simulation:
             if index.shape != (self.num_envs,):
                 raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
-        index = index.astype(np.int64)
-        if index.size and (index.min() < 0 or index.max() >= self.num_envs):
-            raise ValueError(f"envs={envs!r}: this batch has environments 0 to {self.num_envs - 1}")
-        return index
+        return indices("envs", envs, self.num_envs, "this batch's environments")
 
     def _checked(self, name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray:
         array = finite(name, value)

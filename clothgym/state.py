@@ -90,6 +90,7 @@ class State:
         stiffness, damping_time, drag_rate, gravity, wind: see ``Fabric``.
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
+        collider_homes: the same where they are put at a reset.
         steps: control steps since the environment's reset, (num_envs,).
     """
 
@@ -106,6 +107,7 @@ class State:
     wind: NDArray
     parameters: NDArray
     colliders: NDArray
+    collider_homes: NDArray
     steps: NDArray
 
     def save(self, path: str | Path) -> None:

@@ -12,9 +12,10 @@ from clothgym import _jit
 from clothgym._jit import kernel
 from clothgym.collisions import Plane
 from clothgym.envs.measures import CENTROID, SPEED2, covered_share, soft_coverage
+from clothgym.envs.physics import Physics
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.targets import SHAPES, Target, reference_coverage
-from clothgym.envs.task import Physics, Task
+from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
@@ -120,6 +121,8 @@ class DrapeTask(Task):
     @staticmethod
     def _draw_target(rng: np.random.Generator, wanted: Mapping[str, Any]) -> Target:
         known = ("shape", "radius", "height", "center", "yaw")
+        if not isinstance(wanted, Mapping):
+            raise ValueError(f"reset option target={wanted!r}: must be a dict with any of {', '.join(known)}")
         unknown = set(wanted) - set(known)
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
@@ -335,7 +338,7 @@ class ClothDrapeEnv(ClothEnv):
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"`` or ``"depth_array"`` |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
 
     ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
     rest is drawn), and ``"material"``, a dict of figures for one episode.

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import finite, number, positive
 from clothgym.collisions import Box, Capsule, Collider, Sphere
 
 if TYPE_CHECKING:
     from clothgym.render import Solid
 
+LARGEST = 0.6  # [m]: sizes and distances beyond this leave no room to drape in
 SHAPES = ("sphere", "box", "post")
 # ranges of (width, height) by shape, in sides of the sheet: sphere radius, box half side, post radius; post height
 SIZES = {"sphere": ((0.2, 0.3), None), "box": ((0.15, 0.25), None), "post": ((0.1, 0.15), (0.4, 0.6))}
@@ -47,14 +49,16 @@ class Target:
         if self.shape not in SHAPES:
             raise ValueError(f"target shape={self.shape!r}: must be one of {', '.join(SHAPES)}")
         for name in ("radius", "height"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"target {name}={getattr(self, name)!r}: must be a positive, finite length in metres")
+            if positive(f"target {name}", getattr(self, name)) > LARGEST:
+                raise ValueError(f"target {name}={getattr(self, name)!r}: must be at most {LARGEST} m, to stand in the arena")
+        if np.shape(self.center) != (2,) or np.max(np.abs(finite("target center", self.center))) > LARGEST:
+            raise ValueError(f"target center={self.center!r}: must be two numbers within {LARGEST} m of the origin")
+        if abs(number("target yaw", self.yaw)) > math.pi / 4 + 1e-9:
+            raise ValueError(f"target yaw={self.yaw!r}: must be within 45 degrees (pi/4); a box looks the same every 90")
         if self.shape in ("sphere", "box") and not math.isclose(self.height, 2 * self.radius, rel_tol=1e-6):
             raise ValueError(f"target height={self.height!r}: that of a {self.shape} is twice its radius {self.radius!r}")
         if self.shape == "post" and self.height < self.radius:
             raise ValueError(f"target height={self.height!r}: that of a post is at least its radius {self.radius!r}")
-        if len(self.center) != 2 or not all(map(math.isfinite, (*self.center, self.yaw))):
-            raise ValueError(f"target center={self.center!r}, yaw={self.yaw!r}: must be two finite numbers and one")
 
     @staticmethod
     def draw(rng: np.random.Generator, side: float, spread: float, shape: str | None = None) -> Target:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from clothgym import _jit
 from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, summarize
-from clothgym.material import Material
-from clothgym.mesh import SHEAR, ClothMesh
+from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, most_demanding
+from clothgym.mesh import SHEAR
 from clothgym.simulation import FIGURES, Simulation
 from clothgym.state import State
 
@@ -35,19 +35,6 @@ TORN = 2.0  # a structural spring at twice its rest length
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
 HELD = (250, 200, 60)  # colour of the anchors' markers
 LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
-
-
-@dataclass(frozen=True)
-class Physics:
-    """What an id fixes: control step [s], sheet, fabric, integrator, substeps, anchors."""
-
-    mesh: ClothMesh
-    material: Material
-    anchors: tuple[int, ...]
-    anchor_speed: float
-    time_step: float
-    integrator: str
-    substeps: int
 
 
 @dataclass
@@ -105,14 +92,15 @@ class Task(ABC):
             if value not in known:
                 raise ValueError(f"{name}={value!r}: must be one of {', '.join(known)}")
         self.obs_mode, self.reward_mode = obs_mode, reward_mode
-        self.randomize = _checked_ranges(randomize or {})
+        self.randomize = checked_ranges(randomize or {})
         physics = self.physics
+        check_springs_exist(physics, self.randomize)
         if substeps is None:
             substeps = physics.substeps if integrator in (None, physics.integrator) and not self.randomize else "auto"
         self.simulation = Simulation(
             physics.mesh,
             # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
-            material=_extreme(physics.material, self.randomize),
+            material=most_demanding(physics.material, self.randomize),
             num_envs=num_envs,
             integrator=integrator if integrator is not None else physics.integrator,
             time_step=physics.time_step,
@@ -198,13 +186,10 @@ class Task(ABC):
     def reset(self, envs: NDArray, seeds: Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> None:
         """Begin new episodes; a seed of None goes on with the environment's generator."""
         options = options or {}
-        unknown = set(options) - set(self.reset_options)
-        if unknown:
-            raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
+        self._check_options(options)
         if not len(envs):
             return
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
-        before = self.episode["material"][envs]
         for k, env in enumerate(envs):
             seed = seeds[k] if seeds is not None else None
             if seed is not None or not self._seeded[env]:
@@ -213,7 +198,7 @@ class Task(ABC):
             self._draw_material(env, options.get("material", {}))
             starts[k] = self._begin(env, self.generators[env], options)
         material = self.episode["material"][envs]
-        if not np.array_equal(material, before):
+        if not np.array_equal(material, self.simulation.parameters[envs]):
             # the declared ranges were held against the integrator's bound at construction; one episode's figures are now
             figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
             self.simulation.set_parameters(envs, warn="material" in options, **figures)
@@ -227,19 +212,24 @@ class Task(ABC):
         episode["potential"][envs] = self._potential(summary)[envs]
         episode["observation"][envs] = self._clipped_observation()[envs]
 
-    def _own_figures(self) -> NDArray:
-        return np.array([getattr(self.physics.material, name) for name in FIGURES])
-
-    def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
-        figures = dict(zip(FIGURES, self._own_figures().tolist()))
-        for name, (low, high) in self.randomize.items():
-            figures[name] = float(self.generators[env].uniform(low, high))
-        for name, value in fixed.items():
+    def _check_options(self, options: Mapping[str, Any]) -> None:
+        """Refuse options that no episode can have, before anything is changed."""
+        unknown = set(options) - set(self.reset_options)
+        if unknown:
+            raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
+        material = options.get("material", {})
+        if not isinstance(material, Mapping):
+            raise ValueError(f"reset option material={material!r}: must be a dict of figures")
+        for name in material:
             if name not in FIGURES:
                 raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
-            figures[name] = float(value)
-        Material(**figures)
-        self.episode["material"][env] = list(figures.values())
+        check_springs_exist(self.physics, self.randomize | {name: (value, value) for name, value in material.items()})
+
+    def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
+        figures = {name: getattr(self.physics.material, name) for name in FIGURES}
+        for name, (low, high) in self.randomize.items():
+            figures[name] = float(self.generators[env].uniform(low, high))
+        self.episode["material"][env] = list((figures | dict(fixed)).values())
 
     def check_actions(self, actions: Any) -> NDArray:
         """Actions as float64, clipped to [-1, 1], (num_envs, actions).
@@ -258,6 +248,8 @@ class Task(ABC):
 
     def step(self, actions: NDArray) -> Outcome:
         """One control step of all environments that are not over; the others keep still and get no reward."""
+        if not self._seeded.all():
+            raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
         actions = self.check_actions(actions)
         episode, simulation = self.episode, self.simulation
         running = ~episode["over"]
@@ -401,11 +393,18 @@ class Task(ABC):
         Raises:
             ValueError: the state is another task's or of another size; nothing is changed then.
         """
-        missing = set(self.episode) ^ set(state.episode)
+        missing = {
+            name
+            for name in {*self.episode, *state.episode}
+            if np.shape(self.episode.get(name, ())) != np.shape(state.episode.get(name, ()))
+        }
         if missing or len(state.generators) != self.num_envs:
             raise ValueError(
-                f"the state is of {len(state.generators)} environments of another task or size: it differs in {sorted(missing)}"
+                f"the state is of {len(state.generators)} environments of another task, observation mode or size: "
+                f"it differs in {', '.join(sorted(missing)) or 'their number'}"
             )
+        if np.any(state.episode["over"] & (state.episode["step"] == 0)):
+            raise ValueError("the state is from before the first reset: there is no episode to continue")
         self.simulation.set_state(state.simulation)
         self.episode = {name: value.copy() for name, value in state.episode.items()}
         for env, text in enumerate(state.generators):
@@ -418,24 +417,3 @@ def _within_ball(vectors: NDArray) -> NDArray:
     """Vectors in the cube [-1, 1]^3 shortened to length 1 where they are longer: the speed limit holds in every direction."""
     squares = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1.0))[..., None]
-
-
-def _checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
-    checked = {}
-    for name, bounds in ranges.items():
-        if name not in FIGURES:
-            raise ValueError(f"randomize: no material figure {name!r} (there are: {', '.join(FIGURES)})")
-        if np.shape(bounds) != (2,) or not np.all(np.isfinite(bounds)) or bounds[0] > bounds[1]:
-            raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
-        for bound in bounds:
-            Material(**{name: float(bound)})  # type: ignore[arg-type]
-        checked[name] = (float(bounds[0]), float(bounds[1]))
-    return checked
-
-
-def _extreme(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:
-    """The fabric of the ranges that needs the smallest substeps: as light, stiff and damped as can be drawn."""
-    figures = {name: getattr(material, name) for name in FIGURES}
-    for name, (low, high) in ranges.items():
-        figures[name] = low if name == "density" else high
-    return replace(material, **figures)  # type: ignore[arg-type]

@@ -77,25 +77,28 @@ class ClothVectorEnv(VectorEnv):
         """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
         over = self.task.episode["over"].copy()
         outcome = self.task.step(actions)
-        info = _with_masks(outcome.info, ~over)
+        info = _with_masks(_only(outcome.info, ~over), ~over)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # those that ended in the last step begin anew in this one: their actions were ignored
             self.task.reset(np.flatnonzero(over))
         elif self.autoreset_mode == AutoresetMode.SAME_STEP:
             ended = outcome.terminated | outcome.truncated
             if ended.any():
-                self._reset_ended(ended, info)
+                info = self._reset_ended(ended, outcome.info)
         return self._observation(), outcome.reward, outcome.terminated, outcome.truncated, info
 
-    def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> None:
-        """Same-step mode: keep the last observations and infos in ``info``, then begin anew."""
+    def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> dict[str, Any]:
+        """Same-step mode: begin anew; what was last goes to ``final_info`` and ``final_obs``, the rest is of those that run on."""
         final = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
             final[env] = self.task.episode["observation"][env].copy()
-        info["final_info"] = _with_masks({key: value for key, value in info.items() if not key.startswith("_")}, ended)
-        info["_final_info"] = ended.copy()
-        info["final_obs"], info["_final_obs"] = final, ended.copy()
         self.task.reset(np.flatnonzero(ended))
+        return _with_masks(_only(info, ~ended), ~ended) | {
+            "final_info": _with_masks(_only(info, ended), ended),
+            "_final_info": ended.copy(),
+            "final_obs": final,
+            "_final_obs": ended.copy(),
+        }
 
     def _observation(self) -> NDArray:
         return self.task.episode["observation"].copy()
@@ -137,6 +140,14 @@ class ClothVectorEnv(VectorEnv):
 
     def set_state(self, state: TaskState) -> None:
         self.task.set_state(state)
+
+
+def _only(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
+    """The info of some environments; the others' entries are zero, false or empty, as Gymnasium leaves them."""
+    return {
+        key: _only(value, mask) if isinstance(value, dict) else np.where(mask, value, np.zeros((), value.dtype))
+        for key, value in info.items()
+    }
 
 
 def _with_masks(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:

@@ -168,3 +168,28 @@ def test_lanes_may_have_different_solids():
     assert found[1] == pytest.approx(1.75, abs=1e-9)
     with pytest.raises(ValueError, match="Plane"):
         simulation.set_collider(0, [Plane()], envs=[0])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_rising_floor_lifts_the_sheet(name):
+    """It moves along its normal: the sheet lies on it, at z0 + v t, with its speed."""
+    mesh = grid(4, 4, 0.06, 0.06)
+    floor = Plane(thickness=0, velocity=(0, 0, 0.5))
+    simulation = Simulation(mesh, Material(air_drag=0.0), integrator=name, colliders=[floor], time_step=1 / 60, dtype="float64")
+    simulation.step(30)
+    assert simulation.positions[0, :, 2] == pytest.approx(0.25, abs=1e-6)
+    assert simulation.velocities[0, :, 2] == pytest.approx(0.5, abs=1e-3)
+    simulation.reset()
+    simulation.step(30)
+    assert simulation.positions[0, :, 2] == pytest.approx(0.25, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_free_sheet_drifts_with_the_wind(name):
+    """v = wind (1 - exp(-b t)), b = drag / density."""
+    mesh = grid(4, 4, 0.06, 0.06)
+    material = Material(air_drag=0.5, density=0.1)
+    simulation = Simulation(mesh, material, integrator=name, wind=(2, 0, 1), gravity=(0, 0, 0), time_step=1 / 60, dtype="float64")
+    simulation.step(30)
+    expected = np.array([2, 0, 1]) * (1 - np.exp(-5 * 0.5))
+    assert simulation.velocities[0] == pytest.approx(np.broadcast_to(expected, (16, 3)), abs=2e-2)

@@ -16,7 +16,7 @@ def test_counts_of_a_17_by_17_sheet():
     assert counts.tolist() == [17 * 16, 17 * 16, 2 * 16 * 16, 17 * 15, 17 * 15]
 
 
-def test_25_by_25_has_the_springs_of_the_yardstick():
+def test_25_by_25_has_3502_springs():
     assert len(grid(25, 25, 1, 1).springs.kind) == 3502
 
 

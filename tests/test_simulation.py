@@ -165,6 +165,12 @@ def test_strain_energy_and_contacts_of_a_stretched_sheet():
         ({"gravity": (0, 0)}, "gravity"),
         ({"gravity": (0, 0, np.nan)}, "gravity"),
         ({"threads": 0}, "threads"),
+        ({"threads": 1.5}, "threads"),
+        ({"substeps": True}, "substeps"),
+        ({"anchors": [0.7]}, "anchors"),
+        ({"time_step": "a"}, "time_step"),
+        ({"material": "cotton"}, "Material.preset"),
+        ({"colliders": Plane()}, "sequence"),
         ({"anchor_speed": 0}, "anchor_speed"),
     ],
 )
@@ -182,9 +188,12 @@ def test_bad_arguments_are_named(kwargs, name):
         (lambda s: s.reset(velocities=np.full((25, 3), np.inf)), "velocities"),
         (lambda s: s.set_parameters(stretch_stiffness=-1), "stretch_stiffness"),
         (lambda s: s.set_parameters(stifness=1), "no parameter 'stifness'"),
-        (lambda s: s.release(envs=[5]), "environments 0 to 0"),
-        (lambda s: s.release(envs=[0], anchors=[2]), "anchors 0 to 1"),
+        (lambda s: s.release(envs=[5]), "environments are 0 to 0"),
+        (lambda s: s.release(envs=[0], anchors=[2]), "anchors are 0 to 1"),
         (lambda s: s.set_collider(0, [Plane()]), "0 colliders"),
+        (lambda s: s.step(-1), "n=-1"),
+        (lambda s: s.release(envs=[0.9]), "integers"),
+        (lambda s: s.set_parameters(density=[0.1, 0.2]), "density has shape"),
     ],
 )
 def test_bad_calls_are_named_and_change_nothing(call, name):

@@ -74,3 +74,34 @@ def test_the_folder_envs_refuses_its_bare_name():
     root = os.path.dirname(os.path.dirname(__file__))
     out, err = start(f"import sys; sys.path.insert(0, {root!r}); import envs").communicate(timeout=60)
     assert "clothgym.envs" in err and "ImportError" in err
+
+
+TWO_THREADS = """
+import threading
+from clothgym import Simulation, grid, _jit
+def run(name):
+    Simulation(grid(3, 3, 0.1, 0.1), integrator=name, anchors=[0]).step(2)
+threads = [threading.Thread(target=run, args=(name,)) for name in ("semi_implicit_euler", "xpbd")]
+[t.start() for t in threads]
+[t.join() for t in threads]
+print(_jit.cache_folder().depth)
+"""
+
+
+def test_two_threads_that_compile_at_once_leave_the_lock_free(tmp_path):
+    out, err = start(TWO_THREADS, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    assert out.strip() == "0", err
+
+
+def test_a_broken_cache_file_is_compiled_anew(tmp_path):
+    start(SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    for path in tmp_path.rglob("*.nbc"):
+        path.write_bytes(path.read_bytes()[:100])
+    out, err = start(SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    assert out.startswith("1 "), err
+
+
+def test_a_folder_that_vanishes_costs_a_sentence(tmp_path):
+    code = "import shutil, os\nfrom clothgym import _jit\n_jit.cache_folder()\nshutil.rmtree(os.environ['CLOTHGYM_CACHE_DIR'])\n"
+    out, err = start(code + SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path / "cache")).communicate(timeout=300)
+    assert out.startswith("1 "), err

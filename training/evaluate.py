@@ -121,12 +121,17 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def main(args: Args) -> None:
+    args.env = args.env.removeprefix("clothgym:")
     if args.episodes < 1:
         raise ValueError(f"--episodes {args.episodes}: must be at least 1")
     scores = {}
+    # a run is scored on the environment that it was trained on, and so are the references beside it
+    kwargs: dict[str, Any] = {}
+    for name in args.policy:
+        kwargs |= policies.env_kwargs(name)
     for name in args.policy:
         policy = policies.named(name, args.env, args.seed)
-        episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)))
+        episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
         scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
     print(f"{args.env}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
     if args.json is not None:

@@ -51,6 +51,11 @@ def named(name: str, env_id: str, seed: int) -> Policy:
     return learnt(Path(name), env_id)
 
 
+def env_kwargs(name: str) -> dict[str, Any]:
+    """Keyword arguments of the environment that a learnt policy was trained on; none for the others."""
+    return {} if name in ("noop", "random", "expert") else dict(read_config(Path(name))["env_kwargs"])
+
+
 def read_config(folder: Path) -> dict[str, Any]:
     folder = folder.parent if folder.name == CHECKPOINT else folder
     if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():

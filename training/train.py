@@ -4,9 +4,10 @@
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
 
-The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success; tensors only), model.zip (Stable-Baselines3's own format, for ``PPO.load``),
-progress.jsonl (one held-out evaluation a line), evaluation.json (the final score), learning_curve.png, policy.gif, and the
-TensorBoard log.  Hyperparameters are read from hyperparams/ppo.yml, in the format of rl_zoo3.
+The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
+(Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), evaluation.json (the final
+score, of best.pt), learning_curve.png, policy.gif, and the TensorBoard log.  Hyperparameters are read from
+hyperparams/ppo.yml, in the format of rl_zoo3.
 """
 
 from __future__ import annotations
@@ -57,6 +58,15 @@ class Args:
     """Held-out episodes of the final evaluation."""
     threads: int = 2
     """Threads of torch while it learns; while the environments run it has one, and they have all processors."""
+
+    def __post_init__(self) -> None:
+        self.env = self.env.removeprefix("clothgym:")
+        for name in ("timesteps", "eval_episodes", "final_episodes", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"--{name.replace('_', '-')} {value}: must be at least 1")
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"--seed {self.seed}: must be from 0 to 2^32 - 1")
 
 
 class HeldOutEvaluation(BaseCallback):
@@ -124,6 +134,8 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
     """The run's folder and configuration: a new one, or that of the run to go on with."""
     if args.resume is not None:
         config = policies.read_config(args.resume)
+        if args.run is not None:
+            raise ValueError("--resume goes on in the run's own folder: leave --run away")
         if args.timesteps is not None:
             config["timesteps"] = args.timesteps
         return args.resume, config
@@ -136,7 +148,7 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         "env": args.env,
         "env_kwargs": hyperparameters.pop("env_kwargs", {}),
         "num_envs": hyperparameters.pop("n_envs"),
-        "timesteps": args.timesteps or int(hyperparameters.pop("n_timesteps")),
+        "timesteps": args.timesteps if args.timesteps is not None else int(hyperparameters["n_timesteps"]),
         "seed": args.seed,
         "threads": args.threads,
         "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
@@ -150,6 +162,11 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
     return folder, config
 
 
+def training_seed(seed: int, done: int, num_envs: int) -> int:
+    """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
+    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
+
+
 def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
     """The learner of a configuration, on its own batch of environments."""
     options = dict(config["hyperparameters"])
@@ -158,7 +175,7 @@ def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
         if isinstance(options.get(key), str):
             options[key] = _linear(options[key])
     env = VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **config["env_kwargs"]))
-    return PPO(policy, env, seed=seed % 2**32, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
+    return PPO(policy, env, seed=seed, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
 
 
 def _linear(text: str) -> Any:
@@ -180,8 +197,7 @@ def train(args: Args) -> Path:
     done = 0
     if args.resume is not None:
         done = int(torch.load(folder / policies.CHECKPOINT, weights_only=True)["num_timesteps"])
-    # a resumed run meets new episodes, not those of its beginning again
-    model = build(folder, config, config["seed"] * 10_000 + done)
+    model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
     if args.resume is not None:
         policies.load_checkpoint(folder, model)
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")

@@ -8,7 +8,10 @@ displacement too, or a sheet at rest on a slope would creep by ``h^2 g sin`` a s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.collisions.shapes import AXES, FRICTION, HALF, PLANE, POINT, RADIUS, REACH2, VELOCITY
@@ -138,3 +141,10 @@ def signed_distances(first, last, x, kinds, colliders, out):
             for p in range(x.shape[1]):
                 distance_and_normal(x[b, p], colliders[b, k], kinds[k], contact)
                 out[b, k, p] = contact[0]
+
+
+class Contacts(NamedTuple):
+    """Contact of particles with colliders: signed distance to the nearest [m], and which it is, (num_envs, particles)."""
+
+    distance: NDArray
+    collider: NDArray

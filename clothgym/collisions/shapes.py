@@ -7,11 +7,13 @@ batch may have another shape in the same slot.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clothgym.checks import number, vector
 
 # rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r, friction, velocity, and the
 # square of |b| + r, beyond which nothing can touch it
@@ -44,14 +46,11 @@ class Collider:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(item.default, tuple) or item.name in ("center", "base", "half_sides", "yaw_axis"):
-                if np.shape(value) != (3,) or not np.all(np.isfinite(value)):
-                    raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be three finite numbers")
-            elif not np.isfinite(value):
-                raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be finite")
-            elif item.name in ("friction", "thickness") and value < 0:
-                raise ValueError(f"{type(self).__name__} {item.name}={value!r}: must be zero or positive")
+            name, value = f"{type(self).__name__} {item.name}", getattr(self, item.name)
+            if isinstance(item.default, tuple):
+                vector(name, value)
+            elif number(name, value) < 0 and item.name in ("friction", "thickness"):
+                raise ValueError(f"{name}={value!r}: must be zero or positive")
 
     def _positive(self, **sizes: float) -> None:
         for name, size in sizes.items():
@@ -143,7 +142,7 @@ class Box(Collider):
 
     kind: ClassVar[int] = ROUNDED_BOX
     center: Vector = (0.0, 0.0, 0.0)
-    half_sides: Vector = field(default=(0.1, 0.1, 0.1))
+    half_sides: Vector = (0.1, 0.1, 0.1)
     yaw: float = 0.0
 
     def __post_init__(self) -> None:

@@ -1,0 +1,58 @@
+"""What an id fixes, and the ranges of fabrics that may be drawn within it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+
+from clothgym.material import Material, spring_stiffness
+from clothgym.mesh import ClothMesh
+from clothgym.simulation import FIGURES
+
+
+@dataclass(frozen=True)
+class Physics:
+    """What an id fixes: control step [s], sheet, fabric, integrator, substeps, anchors."""
+
+    mesh: ClothMesh
+    material: Material
+    anchors: tuple[int, ...]
+    anchor_speed: float
+    time_step: float
+    integrator: str
+    substeps: int
+
+
+def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    checked = {}
+    if not isinstance(ranges, Mapping):
+        raise ValueError(f"randomize={ranges!r}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
+    for name, bounds in ranges.items():
+        if name not in FIGURES:
+            raise ValueError(f"randomize: no material figure {name!r} (there are: {', '.join(FIGURES)})")
+        if np.shape(bounds) != (2,) or not np.all(np.isfinite(bounds)) or bounds[0] > bounds[1]:
+            raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
+        for bound in bounds:
+            Material(**{name: float(bound)})  # type: ignore[arg-type]
+        checked[name] = (float(bounds[0]), float(bounds[1]))
+    return checked
+
+
+def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
+    figures = [ranges.get(name, (getattr(physics.material, name),) * 2) for name in FIGURES]
+    for corner in product(*figures):
+        fabric = Material(**dict(zip(FIGURES, corner)))
+        stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity
+        spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend))
+
+
+def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:
+    """The fabric of the ranges that needs the smallest substeps: as light, stiff and damped as can be drawn."""
+    figures = {name: getattr(material, name) for name in FIGURES}
+    for name, (low, high) in ranges.items():
+        figures[name] = low if name == "density" else high
+    return replace(material, **figures)  # type: ignore[arg-type]
