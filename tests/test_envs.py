@@ -609,6 +609,7 @@ def test_the_expert_succeeds():
     assert success.mean() >= 0.85
 
 
+@pytest.mark.filterwarnings("ignore:.*human")
 def test_the_human_window_comes_from_gymnasium_s_wrapper(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
