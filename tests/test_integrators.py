@@ -246,3 +246,12 @@ def test_automatic_substeps_follow_stiffness(name):
         for k in (200.0, 20000.0)
     )
     assert stiff == pytest.approx(10 * soft, rel=0.01)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_float32_falls_as_fast_in_small_substeps(name):
+    """g h^2 is below half a unit in the last place of the height here: it must not be lost in the velocity."""
+    simulation = Simulation(grid(3, 3, 0.1, 0.1), Material(air_drag=0.0), integrator=name, time_step=1 / 60, substeps=640)
+    simulation.reset(positions=simulation.mesh.rest_positions + (0, 0, 3.0))
+    simulation.step(12)
+    assert simulation.velocities[0, :, 2] == pytest.approx(-9.81 * 0.2, rel=2e-3)
