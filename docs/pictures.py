@@ -43,7 +43,7 @@ def main() -> None:
         import policies
         import report
 
-        report.film(HERE / "drape.gif", "ClothDrape-v0", policies.learnt(options.run, "ClothDrape-v0"), {}, episodes=3, size=280)
+        report.film(HERE / "drape.gif", "ClothDrape-v0", policies.learnt(options.run, "ClothDrape-v0"), {}, episodes=3)
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references:
     plt.close(figure)
 
 
-def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, size: int = 240) -> None:
+def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4) -> None:
     """Some held-out episodes side by side, one after the other's end standing still."""
     env = gym.make_vec(f"clothgym:{env_id}", num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
     observations, _ = env.reset(seed=evaluate.HELD_OUT)
