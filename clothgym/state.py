@@ -62,6 +62,8 @@ class Layout(NamedTuple):
 
     def to_blocks(self, public: NDArray, dtype: NDArray | np.dtype) -> NDArray:
         """(num_envs, ...) to a new contiguous (blocks, ..., lanes)."""
+        if self.num_envs == 1:
+            return np.array(public[..., None], dtype=dtype, order="C")
         spare = self.blocks * self.lanes - self.num_envs
         padded = np.concatenate([public, np.repeat(public[-1:], spare, axis=0)]) if spare else public
         split = padded.reshape(self.blocks, self.lanes, *public.shape[1:])
@@ -69,6 +71,8 @@ class Layout(NamedTuple):
 
     def to_public(self, blocks: NDArray) -> NDArray:
         """(blocks, ..., lanes) to a new contiguous (num_envs, ...)."""
+        if self.num_envs == 1:  # an axis to drop, none to move: the single environment asks often
+            return blocks[..., 0].copy()
         moved = np.moveaxis(blocks, -1, 1)
         return moved.reshape(self.blocks * self.lanes, *moved.shape[2:])[: self.num_envs].copy()
 
