@@ -1,0 +1,298 @@
+"""The drape: its reward, limits, observation and judgement, against figures worked out here."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from clothgym.envs.drape import SHEET, SIDE
+from clothgym.envs.measures import _distance2_to_triangle, covered_share
+from clothgym.envs.targets import Target, reference_coverage
+
+DRAPE = "clothgym:ClothDrape-v0"
+
+
+# --- the reward, the limits and what is seen, against figures made here --------------------------------------------------
+
+
+def start(seed=3, **kwargs):
+    env = gym.make(DRAPE, **kwargs).unwrapped
+    observation, _ = env.reset(seed=seed)
+    return env, observation
+
+
+def potential(env):
+    """The potential of the manual page, from positions and the target alone, in float64."""
+    task, x = env.task, env.task.simulation.positions[0].astype(float)
+    target = task.targets[0]
+    points = target.upper_surface(32)
+    points = points[np.arange(32) % len(points)]
+    nearest = np.min(np.linalg.norm(points[:, None] - x[None], axis=2), axis=1)
+    near = np.mean(1 / (1 + (nearest / (0.15 * SIDE)) ** 2))
+    weights = SHEET.area / SHEET.area.sum()
+    off = np.linalg.norm(weights @ x[:, :2] - target.center) / SIDE
+    return (near + 1 / (1 + (off / 0.2) ** 2)) / 2
+
+
+def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices():
+    env, _ = start()
+    total, effort, before, terminated = 0.0, 0.0, potential(env), False
+    for step in range(100):
+        action = env.expert_action()
+        acting = not env.task.episode["settling_since"][0] >= 0
+        effort += 0.001 * np.sum(action.reshape(2, 4)[:, :3].astype(float) ** 2) * acting
+        _, reward, terminated, _, info = env.step(action)
+        total += reward
+        if step == 10:
+            assert total == pytest.approx(potential(env) - before - effort, abs=1e-5)
+        if terminated:
+            break
+    assert info["is_success"] and info["normalized_performance"] > 0.8
+    assert total == pytest.approx(info["normalized_performance"] - before - effort + 0.25, abs=1e-5)
+
+
+def test_the_sparse_reward_is_the_judgement_alone():
+    env, _ = start(reward_mode="sparse")
+    rewards, terminated = [], False
+    while not terminated:
+        _, reward, terminated, _, info = env.step(env.expert_action())
+        rewards.append(reward)
+    assert rewards[-1] == info["normalized_performance"] > 0.5 and not any(rewards[:-1])
+
+
+def test_no_anchor_moves_faster_than_the_limit_in_any_direction():
+    env, _ = start()
+    anchors = list(env.task.physics.anchors)
+    before = env.task.simulation.positions[0, anchors]
+    env.step(np.array([1, 1, 1, -1, -1, 0.5, 0, -1.0]))
+    moved = np.linalg.norm(env.task.simulation.positions[0, anchors] - before, axis=1)
+    assert moved[0] == pytest.approx(1 / 30, rel=1e-3)
+    assert moved[1] == pytest.approx(1 / 30, rel=1e-3)
+    env.step(np.array([0.3, 0, 0, -1, 0, 0, 0, -1.0]))
+    again = np.linalg.norm(env.task.simulation.positions[0, anchors] - before, axis=1)
+    assert again[1] == pytest.approx(moved[1], rel=1e-3)
+
+
+@pytest.mark.parametrize(("grip", "held"), [(0.79, True), (0.81, False)])
+def test_an_anchor_lets_go_above_four_fifths(grip, held):
+    env, _ = start()
+    env.step(np.array([0, 0, 0, grip, 0, 0, 0, -1.0]))
+    assert env.task.simulation.attached[0].tolist() == [held, True]
+
+
+def test_time_is_up_after_60_steps_and_the_judgement_is_40_later():
+    env, _ = start()
+    for step in range(1, 101):
+        *_, terminated, _, info = env.step(np.zeros(8))
+        assert info["settling"] == (step >= 60) and terminated == (step == 100)
+
+
+def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
+    env, _ = start()
+    task = env.task
+    task.simulation.reset(positions=task.simulation.positions[0], velocities=(0, -60.0, 20.0))
+    task.simulation.release()
+    for _ in range(20):
+        *_, terminated, _, info = env.step(np.zeros(8))
+        if terminated:
+            break
+    assert info["failure"] == "out_of_bounds" and info["normalized_performance"] == 0
+
+
+def test_a_sheet_that_still_moves_is_no_success():
+    env = gym.make(DRAPE).unwrapped
+    env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
+    task = env.task
+    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.244))
+    task.simulation.release()
+    task.episode["settling_since"][0], task.episode["step"][0] = 60, 99
+    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.244), velocities=(0.3, 0, 0))
+    task.simulation.release()
+    *_, terminated, _, info = env.step(np.zeros(8))
+    assert terminated and info["coverage"] > 0.9 and info["off_center"] < 0.1
+    assert info["rms_speed"] > 0.05 and not info["is_success"]
+    calm = 1 / (1 + (info["rms_speed"] / 0.1) ** 2)
+    share = min(info["coverage"] / info["coverage_reference"], 1)
+    assert info["normalized_performance"] == pytest.approx(share * calm / (1 + (info["off_center"] / 0.2) ** 2), rel=1e-6)
+
+
+def test_the_observation_is_what_the_manual_page_says():
+    env, _ = start(seed=8)
+    for _ in range(5):
+        observation, *_ = env.step(np.array([0.5, 1, 0.2, -1, 0.3, 1, 0, -1.0]))
+    task = env.task
+    state, target = task.get_state().simulation, task.targets[0]
+    top = np.array([*target.center, target.height])
+    points = [0, 8, 16, 136, 144, 152, 272, 280, 288]
+    assert observation[:27] == pytest.approx(((state.positions[0, points] - top) / SIDE).ravel(), abs=1e-5)
+    assert observation[27:54] == pytest.approx(state.velocities[0, points].ravel(), abs=1e-5)
+    center = (SHEET.area / SHEET.area.sum()) @ state.positions[0]
+    assert observation[54:57] == pytest.approx((center - top) / SIDE, abs=1e-5)
+    shapes = [float(target.shape == shape) for shape in ("sphere", "box", "post")]
+    assert observation[57:].tolist() == pytest.approx(
+        [1, 1, *shapes, target.radius / SIDE, target.height / SIDE, target.yaw * 4 / np.pi, 0, 0.95, 55 / 60], abs=1e-6
+    )
+
+
+def test_starts_are_drawn_from_the_ranges_of_the_manual_page():
+    env = gym.make_vec(DRAPE, num_envs=200)
+    env.reset(seed=0)
+    task = env.unwrapped.task
+    x = task.simulation.positions
+    centers = np.array([target.center for target in task.targets])
+    ahead = (centers[:, 1] - x[:, :, 1].mean(axis=1)) / SIDE
+    assert 0.749 < ahead.min() < 0.77 and 0.88 < ahead.max() < 0.901
+    assert np.abs((x[:, :, 0].mean(axis=1) - centers[:, 0]) / SIDE).max() < 0.101
+    assert np.linalg.norm(centers, axis=1).max() <= 0.25 * SIDE
+    assert 0.099 < x[:, :, 2].min() / SIDE < 0.11
+    for shape, low, high in (("sphere", 0.2, 0.3), ("box", 0.15, 0.25), ("post", 0.1, 0.15)):
+        radii = np.array([target.radius for target in task.targets if target.shape == shape]) / SIDE
+        assert len(radii) > 40 and low <= radii.min() < 1.1 * low and 0.9 * high < radii.max() <= high
+    heights = np.array([target.height for target in task.targets if target.shape == "post"]) / SIDE
+    assert heights.min() >= 0.4 and heights.max() <= 0.6
+
+
+def test_stepping_before_the_first_reset_is_refused():
+    for env in (gym.make(DRAPE).unwrapped, gym.make_vec(DRAPE, num_envs=2)):
+        with pytest.raises(gym.error.ResetNeeded, match="reset"):
+            env.step(np.zeros(env.action_space.shape))
+
+
+def test_a_refused_reset_leaves_nothing_behind():
+    env = gym.make(DRAPE).unwrapped
+    env.reset(seed=0, options={"material": {"density": 0.3}})
+    with pytest.raises(ValueError, match="cone"):
+        env.reset(seed=0, options={"target": {"shape": "cone"}})
+    for _ in range(2):
+        with pytest.raises(ValueError, match="bend_rigidity"):
+            env.reset(seed=0, options={"material": {"bend_rigidity": 0.1}})
+    env.reset(seed=0)
+    assert env.task.simulation.parameters[0] == pytest.approx([0.1503, 261.1, 105.0, 2.34e-6, 1e-4, 0.72])
+
+
+def test_states_of_another_kind_are_refused():
+    keypoints, particles = gym.make(DRAPE).unwrapped, gym.make(DRAPE, obs_mode="particles").unwrapped
+    with pytest.raises(ValueError, match="before the first reset"):
+        keypoints.set_state(keypoints.get_state())
+    keypoints.reset(seed=0)
+    particles.reset(seed=0)
+    with pytest.raises(ValueError, match="observation"):
+        particles.set_state(keypoints.get_state())
+
+
+# --- the judgement of the drape -------------------------------------------------------------------------------------------
+
+
+def test_distance_to_a_triangle_against_a_fine_sampling():
+    rng = np.random.default_rng(0)
+    u, v = np.meshgrid(np.linspace(0, 1, 120), np.linspace(0, 1, 120))
+    inside = u + v <= 1
+    u, v = u[inside][:, None], v[inside][:, None]
+    for _ in range(60):
+        a, b, c, p = rng.normal(size=(4, 3))
+        sampled = np.min(np.linalg.norm(a + u * (b - a) + v * (c - a) - p, axis=1))
+        assert np.sqrt(_distance2_to_triangle(p, a, b, c)) == pytest.approx(sampled, abs=0.03)
+
+
+def test_coverage_of_a_flat_sheet_that_overhangs_half_a_box():
+    box = Target("box", 0.12, 0.24, (0.0, 0.0))
+    points = box.upper_surface(256)
+    sheet = SHEET.rest_positions + (SIDE / 2, 0, 0.24)  # covers x >= 0
+    share = covered_share(sheet, SHEET.triangles, points, 0.012)
+    columns = (np.arange(16) + 0.5) / 16 * 0.24 - 0.12
+    assert share == np.mean(columns >= -0.012)
+    assert covered_share(sheet + (0, 0, 0.0121), SHEET.triangles, points, 0.012) == 0
+
+
+def test_upper_surface_lies_on_the_solid_and_is_spread_by_area():
+    for target in (
+        Target("sphere", 0.15, 0.3, (0.1, 0.2)),
+        Target("post", 0.07, 0.3, (0.1, 0.2)),
+        Target("box", 0.1, 0.2, (0.1, 0.2), 0.3),
+    ):
+        points = target.upper_surface(400)
+        distance = np.linalg.norm(points - (0.1, 0.2, target.height - target.radius), axis=1)
+        if target.shape == "box":
+            assert np.all(points[:, 2] == 0.2) and np.abs(points - (0.1, 0.2, 0.2)).max() < 0.1 * np.sqrt(2)
+        else:
+            assert distance == pytest.approx(target.radius)
+            slope = np.degrees(np.arccos((points[:, 2] - target.height + target.radius) / target.radius))
+            assert slope.max() < 60
+            # half of the cap's area lies above the mean of its bounding heights (Archimedes)
+            assert np.mean(slope < np.degrees(np.arccos(0.75))) == pytest.approx(0.5, abs=0.01)
+
+
+def test_reference_coverage_interpolates_the_table():
+    low, high = (reference_coverage(Target("sphere", w * SIDE, 2 * w * SIDE, (0, 0)), SIDE) for w in (0.2, 0.225))
+    middle = reference_coverage(Target("sphere", 0.2125 * SIDE, 0.425 * SIDE, (0, 0)), SIDE)
+    assert middle == pytest.approx((low + high) / 2) and 0.8 < middle <= 1
+
+
+def laid(env, offset):
+    """Put the sheet flat on the target's top, ``offset`` sides beside it, held by nothing; let it settle and be judged."""
+    env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
+    task = env.unwrapped.task
+    task.simulation.reset(positions=SHEET.rest_positions + (offset * SIDE, 0, 0.244))
+    terminated = False
+    while not terminated:
+        *_, terminated, _, info = env.step(np.array([0, 0, 0, 1, 0, 0, 0, 1]))
+    return info
+
+
+def test_a_sheet_laid_on_the_target_succeeds_and_one_laid_beside_its_centre_does_not():
+    env = gym.make(DRAPE)
+    centred, aside = laid(env, 0.0), laid(env, 0.25)
+    assert centred["is_success"] and centred["normalized_performance"] > 0.9
+    # what hangs over has no width: the centre of area comes nearer than it was laid
+    assert 0.1 < aside["off_center"] < 0.25
+    assert not aside["is_success"] and aside["normalized_performance"] < 0.8
+
+
+@pytest.mark.parametrize("policy", ["noop", "random", "hover"])
+def test_cheats_do_not_pay(policy):
+    """Doing nothing, flailing, or holding the sheet over the target until time is up."""
+    env = gym.make_vec(DRAPE, num_envs=40, autoreset_mode="Disabled")
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    success, over = np.zeros(40, bool), np.zeros(40, bool)
+    for _ in range(100):
+        if policy == "hover":
+            action = env.unwrapped.expert_actions()
+            action[:, [3, 7]] = -1
+            action[:, [2, 6]] = 0.3
+        else:
+            action = np.zeros((40, 8)) if policy == "noop" else rng.uniform(-1, 1, (40, 8))
+        *_, terminated, _, info = env.step(action)
+        success |= terminated & info["is_success"]
+        over |= terminated
+    assert over.all() and success.mean() < 0.05
+
+
+def test_the_expert_succeeds():
+    env = gym.make_vec(DRAPE, num_envs=60, autoreset_mode="Disabled")
+    env.reset(seed=500)
+    success = np.zeros(60, bool)
+    for _ in range(100):
+        *_, terminated, _, info = env.step(env.unwrapped.expert_actions())
+        success |= terminated & info["is_success"]
+    assert success.mean() >= 0.85
+
+
+@pytest.mark.filterwarnings("ignore:.*human")
+def test_the_human_window_comes_from_gymnasium_s_wrapper(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pytest.importorskip("pygame")
+    env = gym.make(DRAPE, render_mode="human")
+    env.reset(seed=0)
+    env.step(np.zeros(8, np.float32))
+    env.close()
+
+
+def test_pictures():
+    env = gym.make(DRAPE, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (480, 480, 3) and first.dtype == np.uint8 and first.std() > 10
+    depth = gym.make(DRAPE, render_mode="depth_array")
+    depth.reset(seed=0)
+    image = depth.render()
+    assert image.shape == (480, 480) and np.isfinite(image[400:]).all()
