@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from clothgym.collisions import Capsule as Capsule
     from clothgym.collisions import Plane as Plane
     from clothgym.collisions import Sphere as Sphere
+    from clothgym.hands import Gripper as Gripper
     from clothgym.integrators import INTEGRATORS as INTEGRATORS
     from clothgym.material import Material as Material
     from clothgym.mesh import ClothMesh as ClothMesh
     from clothgym.mesh import grid as grid
     from clothgym.simulation import Simulation as Simulation
     from clothgym.state import State as State
+    from clothgym.wind import Wind as Wind
 
 __version__ = "0.1.0"
 
@@ -28,12 +30,14 @@ _HOMES = {
     "Box": "clothgym.collisions",
     "Capsule": "clothgym.collisions",
     "ClothMesh": "clothgym.mesh",
+    "Gripper": "clothgym.hands",
     "INTEGRATORS": "clothgym.integrators",
     "Material": "clothgym.material",
     "Plane": "clothgym.collisions",
     "Simulation": "clothgym.simulation",
     "Sphere": "clothgym.collisions",
     "State": "clothgym.state",
+    "Wind": "clothgym.wind",
     "grid": "clothgym.mesh",
 }
 

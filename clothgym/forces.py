@@ -83,6 +83,51 @@ def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
         f[j, 2] -= fz
 
 
+@kernel
+def add_air_forces(x, v, f, surface, resistance, wind, row):
+    """Add the air's force on each triangle to ``f`` [N], (particles, 3, lanes).
+
+    With A the area, n the normal and u the wind relative to the triangle:
+    ``rho/2 A |u| (C_D (u . n) n + C_F (u - (u . n) n))``.  Face on that is the drag ``rho/2 C_D A u^2``; at an angle the part
+    across the wind is lift, of coefficient ``(C_D - C_F) sin cos`` as of a flat plate that has stalled (Hoerner, Fluid-Dynamic
+    Drag, 1965, 3-15).  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes); wind [m/s], (3, lanes); row: scratch,
+    (3, lanes).
+    """
+    triangles, shares = surface
+    half = x.dtype.type(0.5)
+    tiny = x.dtype.type(1e-18)
+    one = x.dtype.type(1)
+    lanes = x.shape[2]
+    across, along = resistance[0], resistance[1]
+    flat = f.reshape((x.shape[0], 3 * lanes))
+    force = row.reshape(3 * lanes)
+    for t in range(triangles.shape[0]):
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        a, b, c = shares[t, 0], shares[t, 1], shares[t, 2]
+        xi, xj, xk, vi, vj, vk = x[i], x[j], x[k], v[i], v[j], v[k]
+        for l in range(lanes):
+            px, py, pz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            qx, qy, qz = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
+            # normal times twice the area
+            nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+            ux = wind[0, l] - (a * vi[0, l] + b * vj[0, l] + c * vk[0, l])
+            uy = wind[1, l] - (a * vi[1, l] + b * vj[1, l] + c * vk[1, l])
+            uz = wind[2, l] - (a * vi[2, l] + b * vj[2, l] + c * vk[2, l])
+            n2 = nx * nx + ny * ny + nz * nz + tiny
+            speed = np.sqrt(ux * ux + uy * uy + uz * uz)
+            twice = np.sqrt(n2)
+            skin = half * speed * along[l] * twice
+            face = half * speed * (across[l] - along[l]) * (ux * nx + uy * ny + uz * nz) * (one / twice)
+            row[0, l] = face * nx + skin * ux
+            row[1, l] = face * ny + skin * uy
+            row[2, l] = face * nz + skin * uz
+        for corner in range(3):
+            fp = flat[triangles[t, corner]]
+            share = shares[t, corner]
+            for e in range(3 * lanes):
+                fp[e] += share * force[e]
+
+
 def largest_frequency(mesh: ClothMesh, stiffness: NDArray, inverse_mass: NDArray) -> float:
     """Largest angular frequency of the sheet at rest [rad/s]: the root of the largest eigenvalue of M^-1 K.
 

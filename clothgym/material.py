@@ -23,8 +23,10 @@ class Material:
         bend_rigidity: plate rigidity B [N m].  Skip-one springs have no rigidity in the flat state; theirs is chosen to
             store the energy B kappa^2 / 2 per area when the radius of curvature is two grid spacings.
         damping_time: Kelvin-Voigt retardation time [s]: each spring's damper is this time its stiffness.
-        air_drag: force per area and velocity relative to the air [N s/m^3]; the default is the quadratic law's
-            ``rho C_D v / 2`` at 1 m/s, with 1.2 kg/m^3 and C_D = 1.2 of a plate.
+        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_air_forces``; 1.2 is a square plate's.
+        skin_friction: its coefficient edge on to the wind, by the area of one side.
+        air_drag: linear drag, force per area and velocity relative to the air [N s/m^3].  Air itself has none; it calms slow
+            swings, which the quadratic law hardly does.  0.72 is that law's force at 1 m/s.
         source: where the figures come from.
 
     Raises:
@@ -36,7 +38,9 @@ class Material:
     shear_stiffness: float = 105.0
     bend_rigidity: float = 2.34e-6
     damping_time: float = 1e-4
-    air_drag: float = 0.72
+    drag_coefficient: float = 1.2
+    skin_friction: float = 0.02
+    air_drag: float = 0.0
     source: str = ""
 
     def __post_init__(self) -> None:
@@ -67,7 +71,14 @@ PRESETS: dict[str, Material] = {
         shear_stiffness=105.0,
         bend_rigidity=2.34e-6,
         source="100 % cotton of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457): 472.64 kg/m^3, 0.318 mm, 0.821 MPa, "
-        "nu 0.243; damping_time and air_drag are not measured there and are ours",
+        "nu 0.243; damping_time and what concerns the air are not measured there and are ours",
+    ),
+    "knit": Material(
+        density=0.1782,
+        stretch_stiffness=24.93,
+        shear_stiffness=11.64,
+        bend_rigidity=2.25e-7,
+        source="95 % wool, 5 % lycra of the same driver: 543.29 kg/m^3, 0.328 mm, 0.076 MPa, nu 0.071",
     ),
 }
 

@@ -5,10 +5,8 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -17,27 +15,33 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, integrators
 from clothgym._jit import specialize
-from clothgym.checks import count, finite, indices, positive, spread, vector
+from clothgym.checks import count, finite, indices, number, positive, spread, vector
 from clothgym.collisions import ROWS, Collider, Contacts, resolve, signed_distances
-from clothgym.forces import Energy, energy
+from clothgym.forces import Energy, add_air_forces, energy
+from clothgym.hands import Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
-from clothgym.material import Material, spring_stiffness
-from clothgym.mesh import BEND_X, SHEAR, ClothMesh
-from clothgym.state import Fabric, Layout, SpringArrays, State, spring_arrays
+from clothgym.material import Material
+from clothgym.mesh import SHEAR, ClothMesh
+from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
+from clothgym.state import Fabric, Layout, SpringArrays, State, at_rest, spring_arrays, surface_arrays
 
 GRAVITY = 9.81
-FIGURES = ("density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")
+AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
 
 
-def advance(first, last, x, v, w, springs, fabric, kinds, colliders, h, substeps):
+def advance(first, last, x, v, w, springs, surface, fabric, kinds, colliders, h, substeps, air_every):
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
-    stiffness, damping_time, drag_rate, gravity, wind = fabric
+    stiffness, damping_time, drag_rate, resistance, gravity, wind = fabric
     for b in range(first, last):
         work = np.empty((x.shape[1] + 1, 3, x.shape[3]), x.dtype)
+        push = np.zeros(x.shape[1:], x.dtype)
         contact = np.empty((4, x.shape[3]), x.dtype)
-        for _ in range(substeps):
+        for step in range(substeps):
+            if air_every > 0 and step % air_every == 0:
+                push[:] = 0
+                add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(  # noqa: F821 - the integrator's, bound by specialize
-                x[b], v[b], w[b], springs, stiffness[b], damping_time[b], drag_rate[b], gravity[b], wind[b], h, work
+                x[b], v[b], w[b], springs, stiffness[b], damping_time[b], drag_rate[b], gravity[b], wind[b], push, h, work
             )
             resolve(x[b], v[b], w[b], kinds, colliders[b], h, contact)
 
@@ -66,10 +70,13 @@ class Simulation:
         time_step: control step [s].
         substeps: substeps of a control step; "auto" takes them from the integrator's bound for this mesh and material.
         gravity: [m/s^2], (3,).
-        wind: velocity of the air [m/s], (3,).
+        wind: velocity of the air [m/s], (3,); ``set_wind`` changes it.
+        air_density: [kg/m^3]; 0 takes drag and lift away.
         colliders: solids, the same for all environments until ``set_collider``.
-        anchors: particles that can be held; all are attached at first and stay where they are until ``move_anchors``.
+        anchors: particles that can be held, or patches of them, the first of which is where the anchor is; all are attached at
+            first and stay where they are until ``move_anchors``.
         anchor_speed: largest speed of an anchor [m/s].
+        grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         dtype: "float32", or "float64" for reference runs.
         threads: threads to use; all processors by default.  The outcome does not depend on it.
 
@@ -87,9 +94,11 @@ class Simulation:
         substeps: int | Literal["auto"] = "auto",
         gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
         wind: ArrayLike = (0.0, 0.0, 0.0),
+        air_density: float = AIR_DENSITY,
         colliders: Sequence[Collider] = (),
-        anchors: Sequence[int] = (),
+        anchors: Sequence[int | Sequence[int]] = (),
         anchor_speed: float = 10.0,
+        grippers: Sequence[Gripper] = (),
         dtype: str = "float32",
         threads: int | None = None,
     ) -> None:
@@ -99,7 +108,11 @@ class Simulation:
             raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
         if isinstance(colliders, Collider) or not all(isinstance(c, Collider) for c in colliders):
             raise ValueError(f"colliders={colliders!r}: must be a sequence of Plane, Sphere, Capsule or Box")
+        if isinstance(grippers, Gripper) or not all(isinstance(g, Gripper) for g in grippers):
+            raise ValueError(f"grippers={grippers!r}: must be a sequence of Gripper")
         count("num_envs", num_envs)
+        if number("air_density", air_density) < 0:
+            raise ValueError(f"air_density={air_density!r}: must be zero or positive")
         if dtype not in ("float32", "float64"):
             raise ValueError(f"dtype={dtype!r}: must be 'float32' or 'float64'")
         if threads is not None:
@@ -108,67 +121,56 @@ class Simulation:
         self.material = material if material is not None else Material.preset("cotton")
         self.integrator = integrators.get(integrator)
         self.time_step = positive("time_step", time_step)
-        self.anchor_speed = positive("anchor_speed", anchor_speed)
+        self.air_density = float(air_density)
         self.dtype = np.dtype(dtype)
         self.threads = threads if threads is not None else _jit.default_threads()
         self.layout = Layout.choose(int(num_envs), self.threads)
-        self.anchors = indices("anchors", anchors, mesh.num_particles, "particles of this mesh")
-        if len(set(self.anchors.tolist())) < self.anchors.size:
-            raise ValueError(f"anchors={list(anchors)!r}: a particle is named twice")
+        patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
+        self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step)
+        self.anchors = self._hands.anchors
+        self.grippers = Grippers(self._hands)
         self.colliders = tuple(colliders)
         self._kinds = np.array([c.kind for c in self.colliders], np.int64)
         self._springs = spring_arrays(mesh, self.dtype, self.integrator.springs_by_particle)
+        self._surface = surface_arrays(mesh, self.dtype)
         self._advance = _compiled(self.integrator)
 
-        everyone = (self.num_envs,)
-        rows = np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS)
-        solids = np.broadcast_to(rows, (*everyone, *rows.shape))
-        state = State(
-            positions=np.broadcast_to(mesh.rest_positions, (*everyone, mesh.num_particles, 3)),
-            velocities=np.zeros((*everyone, mesh.num_particles, 3)),
-            free_inverse_mass=np.zeros((*everyone, mesh.num_particles)),
-            anchors=np.broadcast_to(self.anchors, (*everyone, self.anchors.size)),
-            attached=np.ones((*everyone, self.anchors.size), bool),
-            anchor_targets=np.broadcast_to(mesh.rest_positions[self.anchors], (*everyone, self.anchors.size, 3)),
-            stiffness=np.zeros((*everyone, BEND_X + 2)),
-            damping_time=np.zeros(everyone),
-            drag_rate=np.zeros(everyone),
-            gravity=np.broadcast_to(vector("gravity", gravity), (*everyone, 3)),
-            wind=np.broadcast_to(vector("wind", wind), (*everyone, 3)),
-            parameters=np.broadcast_to([getattr(self.material, name) for name in FIGURES], (*everyone, len(FIGURES))),
-            colliders=solids,
-            collider_homes=solids,
-            steps=np.zeros(everyone, np.int64),
+        self.set_state(
+            at_rest(
+                mesh,
+                self.num_envs,
+                anchors=self._hands.members,
+                hands=self._hands.count,
+                parameters=of_material(self.material),
+                gravity=vector("gravity", gravity),
+                wind=vector("wind", wind),
+                colliders=np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS),
+            )
         )
-        self.set_state(state)
         self._apply_parameters(np.arange(self.num_envs))
+        self.reset()
         self.substeps = self._choose_substeps(substeps)
 
     # --- time -----------------------------------------------------------------------------------------------------------
 
     def step(self, n: int = 1) -> None:
-        """Advance all environments by ``n`` control steps; anchors move towards their targets at a bounded speed."""
+        """Advance all environments by ``n`` control steps; hands move towards their targets at a bounded speed."""
         count("n", n)
         h = self.dtype.type(self.time_step / self.substeps)
+        air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
+            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
-                first, last, self._x, self._v, self._w, self._springs, self._fabric, self._kinds, self._colliders, h, self.substeps
-            )
+                first, last, self._x, self._v, self._w, self._springs, self._surface, self._fabric, self._kinds, self._colliders,
+                h, self.substeps, air_every,
+            )  # fmt: skip
 
         for _ in range(n):
-            self._steer_anchors()
             _jit.run_spans(work, self.layout.blocks, self.threads)
+            if self._hands.can_slip:
+                self._hands.slip(self._pulls(), self._w, self._free_w)
             self._steps += 1
-
-    def _steer_anchors(self) -> None:
-        """Give each held particle the velocity that brings it to its target in one control step, if the limit allows."""
-        for a, particle in enumerate(self.anchors):
-            away = self._targets[:, a] - self._x[:, particle]
-            speed = np.sqrt(away[:, 0] ** 2 + away[:, 1] ** 2 + away[:, 2] ** 2) / self.dtype.type(self.time_step)
-            slow = np.maximum(speed / self.dtype.type(self.anchor_speed), self.dtype.type(1)) * self.dtype.type(self.time_step)
-            held = self._attached[:, a][:, None]
-            self._v[:, particle] = np.where(held, away / slow[:, None], self._v[:, particle])
 
     def _choose_substeps(self, substeps: int | str) -> int:
         if substeps == "auto":
@@ -227,19 +229,39 @@ class Simulation:
 
     @property
     def parameters(self) -> NDArray:
-        """Material figures of each environment, in the order of ``FIGURES``, (num_envs, figures); a fresh copy."""
+        """Material figures of each environment, in the order of ``parameters.FIGURES``, (num_envs, figures); a fresh copy."""
         return self._parameters.copy()
 
     @property
     def attached(self) -> NDArray:
         """Whether each anchor holds its particle, (num_envs, anchors); a fresh copy."""
-        return self.layout.to_public(self._attached)
+        return self._hands.attached()
+
+    @property
+    def hand_positions(self) -> NDArray:
+        """Where each anchor and then each gripper is [m], (num_envs, hands, 3); a fresh copy."""
+        return self.layout.to_public(self._hands.x)
+
+    def pulls(self) -> NDArray:
+        """Force with which the cloth pulls at each anchor and then each gripper [N], (num_envs, hands, 3): the springs',
+        the weight's and the air's on the particles that it holds; not what accelerates these."""
+        return self.layout.to_public(self._pulls())
+
+    def _pulls(self) -> NDArray:
+        out = np.empty_like(self._hands.x)
+
+        def work(first: int, last: int) -> None:
+            self._hands.pulls(first, last, self._x, self._v, self._free_w, self._springs, self._surface, self._fabric, out)
+
+        _jit.run_spans(work, self.layout.blocks, self.threads)
+        return out
 
     def strain(self) -> NDArray:
         """Stretch over rest length, minus one, of the structural springs, (num_envs, structural springs)."""
-        structural = self.mesh.springs.kind < SHEAR
-        lengths = self._lengths()[:, structural]
-        return lengths / self.mesh.springs.rest_length[structural].astype(self.dtype) - 1
+        springs, x = self.mesh.springs, self.positions
+        structural = springs.kind < SHEAR
+        ends = x[:, springs.particles[structural]]
+        return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / springs.rest_length[structural].astype(self.dtype) - 1
 
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy [J], in float64."""
@@ -255,44 +277,42 @@ class Simulation:
         distances = self.layout.to_public(out)
         return Contacts(distances.min(axis=1), distances.argmin(axis=1))
 
-    def _lengths(self) -> NDArray:
-        x = self.positions
-        ends = self.mesh.springs.particles
-        return np.linalg.norm(x[:, ends[:, 1]] - x[:, ends[:, 0]], axis=2)
-
     # --- what can be done -----------------------------------------------------------------------------------------------
 
     def move_anchors(self, targets: ArrayLike) -> None:
         """Where the anchors are to be at the end of the next step [m], (num_envs, anchors, 3), as far as their speed allows."""
-        self._targets[:] = self.layout.to_blocks(self._checked("targets", targets, (self.anchors.size, 3)), self.dtype)
+        shape = (self.num_envs, self.anchors.size, 3)
+        self._hands.move(slice(0, self.anchors.size), spread("targets", finite("targets", targets), shape))
 
     def release(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Let go: pairs of environment and anchor (its place in ``anchors``), or all anchors, or all environments."""
-        self._hold(envs, anchors, False)
+        block, lane, which = self._pairs(envs, anchors)
+        self._hands.let_go(block, which, lane)
+        self._apply_masses(block, lane)
 
     def attach(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Take hold again, where the particle now is; arguments as for ``release``."""
-        self._hold(envs, anchors, True)
+        block, lane, which = self._pairs(envs, anchors)
+        self._hands.hold(block, which, lane, self._x)
+        self._apply_masses(block, lane)
 
-    def _hold(self, envs: ArrayLike | None, anchors: ArrayLike | None, hold: bool) -> None:
+    def _pairs(self, envs: ArrayLike | None, anchors: ArrayLike | None) -> tuple[NDArray, NDArray, NDArray]:
+        """Block, lane and anchor of each pair."""
         env = self._env_indices(envs)
         if anchors is None:
             which = np.tile(np.arange(self.anchors.size), len(env))
             env = np.repeat(env, self.anchors.size)
         else:
             which = spread("anchors", indices("anchors", anchors, self.anchors.size, "this simulation's anchors"), env.shape)
-        block, lane = self.layout.place(env)
-        particle = self.anchors[which]
-        newly = self._attached[block, which, lane] != hold
-        self._attached[block, which, lane] = hold
-        if hold:
-            b, a, p, l = block[newly], which[newly], particle[newly], lane[newly]
-            self._targets[b, a, :, l] = self._x[b, p, :, l]
-        self._apply_masses()
+        return (*self.layout.place(env), which)
+
+    def set_wind(self, wind: ArrayLike) -> None:
+        """Velocity of the air from now on [m/s], (num_envs, 3) or (3,)."""
+        self._fabric.wind[:] = self.layout.to_blocks(spread("wind", finite("wind", wind), (self.num_envs, 3)), self.dtype)
 
     def reset(self, envs: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
-        """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached, solids
-        that have moved where they began.
+        """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached, grippers
+        open and at home, solids that have moved where they began.
 
         positions, velocities: (len(envs), particles, 3), or one sheet for all, (particles, 3).
         """
@@ -307,10 +327,9 @@ class Simulation:
         self._x[block, :, :, lane] = np.broadcast_to(x, shape)
         self._v[block, :, :, lane] = np.broadcast_to(v, shape)
         self._colliders[block, :, :, lane] = self._collider_homes[block, :, :, lane]
-        self._attached[block, :, lane] = True
-        self._targets[block, :, :, lane] = self._x[block, :, :, lane][:, self.anchors]
+        self._hands.begin(block, lane, self._x[block, :, :, lane])
         self._steps[env] = 0
-        self._apply_masses()
+        self._apply_masses(block, lane)
 
     def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **figures: ArrayLike) -> None:
         """Change material figures (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
@@ -322,30 +341,16 @@ class Simulation:
         """
         env = self._env_indices(envs)
         block, lane = self.layout.place(env)
-        parameters = self._parameters[env]
-        fields: dict[str, NDArray] = {}
-        for name, value in figures.items():
-            if name in FIGURES:
-                values = spread(name, finite(name, value), env.shape)
-                for one in np.unique(values):
-                    replace(self.material, **{name: float(one)})  # type: ignore[arg-type]
-                parameters[:, FIGURES.index(name)] = values
-            elif name in ("gravity", "wind"):
-                fields[name] = spread(name, finite(name, value), (len(env), 3))
-            else:
-                known = (*FIGURES, "gravity", "wind")
-                near = difflib.get_close_matches(name, known, n=1)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                raise ValueError(f"no parameter {name!r}{hint} (there are: {', '.join(known)})")
-        self._spring_constants(parameters)
+        parameters, fields = changed(self.material, self._parameters[env], figures)
+        fabric_rows(self.mesh, parameters, self.air_density)
         self._parameters[env] = parameters
         for name, value in fields.items():
             getattr(self._fabric, name)[block, :, lane] = value
-        if any(name in FIGURES for name in figures):
+        if len(fields) < len(figures):
             self._apply_parameters(env)
-        if warn and any(name in FIGURES for name in figures):
-            _, first = np.unique(parameters, axis=0, return_index=True)
-            self._warn_if_beyond_bound(env[first])
+            if warn:
+                _, first = np.unique(parameters, axis=0, return_index=True)
+                self._warn_if_beyond_bound(env[first])
 
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
         """Put other solids of the same family (a plane, or any other) in place of collider ``index``, one an environment."""
@@ -367,14 +372,17 @@ class Simulation:
 
     def get_state(self) -> State:
         """All that is needed to go on bit for bit, as fresh copies."""
-        public = self.layout.to_public
+        public, hands = self.layout.to_public, self._hands
         return State(
             positions=self.positions,
             velocities=self.velocities,
             free_inverse_mass=public(self._free_w),
-            anchors=np.repeat(self.anchors[None], self.num_envs, axis=0),
-            attached=public(self._attached),
-            anchor_targets=public(self._targets),
+            anchors=np.repeat(hands.members[None], self.num_envs, axis=0),
+            holder=public(hands.holder),
+            hand_positions=public(hands.x),
+            hand_targets=public(hands.targets),
+            openings=public(hands.opening),
+            wanted_openings=public(hands.wanted),
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
             colliders=public(self._colliders),
@@ -393,44 +401,40 @@ class Simulation:
                 f"the state holds positions of shape {state.positions.shape}, this simulation (num_envs, particles, 3) = "
                 f"{(self.num_envs, self.mesh.num_particles, 3)}"
             )
-        if not np.array_equal(state.anchors, np.broadcast_to(self.anchors, (self.num_envs, self.anchors.size))):
-            raise ValueError(f"the state has anchors {state.anchors[0].tolist()}, this simulation {self.anchors.tolist()}")
+        if not np.array_equal(state.anchors, np.tile(self._hands.members, (self.num_envs, 1))):
+            raise ValueError(f"the state has anchors {state.anchors[0].tolist()}, this simulation {self._hands.members.tolist()}")
+        if state.hand_positions.shape[1] != self._hands.count:
+            here = f"{self.anchors.size} anchors and {len(self.grippers)} grippers"
+            raise ValueError(f"the state has {state.hand_positions.shape[1]} hands, this simulation {here}")
         if state.colliders.shape[1] != len(self.colliders):
             raise ValueError(f"the state has {state.colliders.shape[1]} colliders, this simulation {len(self.colliders)}")
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
-        self._attached = blocks(state.attached, np.dtype(bool))
-        self._targets = blocks(state.anchor_targets, dtype)
+        self._hands.restore(state.hand_positions, state.hand_targets, state.openings, state.wanted_openings, state.holder, dtype)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
         self._colliders = blocks(state.colliders, dtype)
         self._collider_homes = blocks(state.collider_homes, dtype)
         self._steps = np.array(state.steps, np.int64)
         self._w = self._free_w.copy()
-        self._apply_masses()
+        self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
-
-    def _spring_constants(self, parameters: NDArray) -> NDArray:
-        """Spring constants of environments, (envs, kinds), from their material figures, (envs, figures)."""
-        _, stretch, shear, bend, _, _ = parameters.T
-        return spring_stiffness(self.mesh, stretch, shear, bend).T
 
     def _apply_parameters(self, env: NDArray) -> None:
         """Write spring constants, dampers, drag and masses of environments from their material figures."""
         block, lane = self.layout.place(env)
-        density, _, _, _, damping_time, air_drag = self._parameters[env].T
-        self._fabric.stiffness[block, :, lane] = self._spring_constants(self._parameters[env])
-        self._fabric.damping_time[block, lane] = damping_time
-        self._fabric.drag_rate[block, lane] = air_drag / density
-        self._free_w[block, :, lane] = self._w[block, :, lane] = 1 / (density[:, None] * self.mesh.area)
-        self._apply_masses()
+        for name, rows in fabric_rows(self.mesh, self._parameters[env], self.air_density).items():
+            array = getattr(self._fabric, name)
+            array[(block, slice(None), lane) if rows.ndim == 2 else (block, lane)] = rows
+        self._free_w[block, :, lane] = inverse_masses(self.mesh, self._parameters[env])
+        self._apply_masses(block, lane)
 
-    def _apply_masses(self) -> None:
-        """A held particle has no inverse mass: nothing but its anchor moves it."""
-        self._w[:, self.anchors] = np.where(self._attached, 0, self._free_w[:, self.anchors])
+    def _apply_masses(self, block: NDArray, lane: NDArray) -> None:
+        """A held particle has no inverse mass: nothing but its hand moves it."""
+        self._w[block, :, lane] = np.where(self._hands.holder[block, :, lane] >= 0, 0, self._free_w[block, :, lane])
 
     def _env_indices(self, envs: ArrayLike | None) -> NDArray:
         if envs is None:
@@ -441,9 +445,3 @@ class Simulation:
                 raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
         return indices("envs", envs, self.num_envs, "this batch's environments")
-
-    def _checked(self, name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray:
-        array = finite(name, value)
-        if array.shape != (self.num_envs, *shape):
-            raise ValueError(f"{name} has shape {array.shape}: must be {(self.num_envs, *shape)}")
-        return array

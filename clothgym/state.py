@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.mesh import ClothMesh
+from clothgym.mesh import NUM_KINDS, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
@@ -30,16 +30,25 @@ class SpringArrays(NamedTuple):
     weight: NDArray
 
 
+class SurfaceArrays(NamedTuple):
+    """The mesh's triangles, (triangles, 3), and the shares of each that its corners stand for, (triangles, 3)."""
+
+    triangles: NDArray
+    shares: NDArray
+
+
 class Fabric(NamedTuple):
     """Parameters that may differ by lane.
 
     stiffness: spring constants by kind [N/m], (block, kinds, lane).  damping_time [s], (block, lane).
-    drag_rate: air drag per mass [1/s], (block, lane).  gravity [m/s^2] and wind [m/s], (block, 3, lane).
+    drag_rate: linear air drag per mass [1/s], (block, lane).  resistance: half the air's density times the coefficients
+    of drag and skin friction [kg/m^3], (block, 2, lane).  gravity [m/s^2] and wind [m/s], (block, 3, lane).
     """
 
     stiffness: NDArray
     damping_time: NDArray
     drag_rate: NDArray
+    resistance: NDArray
     gravity: NDArray
     wind: NDArray
 
@@ -89,9 +98,10 @@ class State:
         positions, velocities: [m], [m/s], (num_envs, particles, 3).
         free_inverse_mass: inverse masses were nothing held [1/kg], (num_envs, particles).
         anchors: the anchored particles, (num_envs, anchors).
-        attached: whether the anchor holds its particle, (num_envs, anchors).
-        anchor_targets: where each anchor is going [m], (num_envs, anchors, 3).
-        stiffness, damping_time, drag_rate, gravity, wind: see ``Fabric``.
+        holder: which hand holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
+        hand_positions, hand_targets: where each hand is and is going [m], (num_envs, hands, 3).
+        openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, hands).
+        stiffness, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
@@ -102,11 +112,15 @@ class State:
     velocities: NDArray
     free_inverse_mass: NDArray
     anchors: NDArray
-    attached: NDArray
-    anchor_targets: NDArray
+    holder: NDArray
+    hand_positions: NDArray
+    hand_targets: NDArray
+    openings: NDArray
+    wanted_openings: NDArray
     stiffness: NDArray
     damping_time: NDArray
     drag_rate: NDArray
+    resistance: NDArray
     gravity: NDArray
     wind: NDArray
     parameters: NDArray
@@ -132,6 +146,48 @@ class State:
             return State(**{field.name: file[field.name] for field in fields(State)})
 
 
+def at_rest(
+    mesh: ClothMesh,
+    num_envs: int,
+    anchors: NDArray,
+    hands: int,
+    parameters: NDArray,
+    gravity: NDArray,
+    wind: NDArray,
+    colliders: NDArray,
+) -> State:
+    """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
+
+    anchors: particles, (anchors,).  hands: how many.  parameters: (figures,).  gravity, wind: (3,).  colliders: (colliders,
+    rows).
+    """
+
+    def each(value: NDArray) -> NDArray:
+        return np.broadcast_to(value, (num_envs, *np.shape(value)))
+
+    return State(
+        positions=each(mesh.rest_positions),
+        velocities=np.zeros((num_envs, mesh.num_particles, 3)),
+        free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
+        anchors=each(anchors),
+        holder=np.full((num_envs, mesh.num_particles), -1, np.int8),
+        hand_positions=np.zeros((num_envs, hands, 3)),
+        hand_targets=np.zeros((num_envs, hands, 3)),
+        openings=np.zeros((num_envs, hands)),
+        wanted_openings=np.zeros((num_envs, hands)),
+        stiffness=np.zeros((num_envs, NUM_KINDS)),
+        damping_time=np.zeros(num_envs),
+        drag_rate=np.zeros(num_envs),
+        resistance=np.zeros((num_envs, 2)),
+        gravity=each(gravity),
+        wind=each(wind),
+        parameters=each(parameters),
+        colliders=each(colliders),
+        collider_homes=each(colliders),
+        steps=np.zeros(num_envs, np.int64),
+    )
+
+
 def spring_arrays(mesh: ClothMesh, dtype: np.dtype, by_particle: bool) -> SpringArrays:
     """The mesh's springs as a kernel of this dtype wants them: sorted by colour, or by particle if ``by_particle``.
 
@@ -141,3 +197,15 @@ def spring_arrays(mesh: ClothMesh, dtype: np.dtype, by_particle: bool) -> Spring
     s = mesh.springs
     order = np.lexsort((s.particles.max(axis=1), s.particles.min(axis=1))) if by_particle else np.arange(len(s.kind))
     return SpringArrays(s.particles[order], s.rest_length[order].astype(dtype), s.kind[order], s.weight[order].astype(dtype))
+
+
+def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
+    """The mesh's triangles as a kernel of this dtype wants them.
+
+    A corner's share of a triangle follows from the area that the particle stands for: on a grid, whose diagonals alternate,
+    thirds would give every second particle twice its neighbours' force.
+    """
+    triangles = mesh.triangles
+    around = np.bincount(triangles.ravel(), minlength=mesh.num_particles)
+    shares = mesh.area[triangles] / np.maximum(around, 1)[triangles]
+    return SurfaceArrays(triangles, (shares / shares.sum(axis=1, keepdims=True)).astype(dtype))

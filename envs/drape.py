@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import _jit
-from clothgym._jit import kernel
 from clothgym.collisions import Plane
-from clothgym.envs.measures import CENTROID, SPEED2, covered_share, soft_coverage
+from clothgym.envs.measures import CENTROID, SPEED2, covered_share, key_particles, soft_coverage
 from clothgym.envs.physics import Physics
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.targets import SHAPES, Target, reference_coverage
-from clothgym.envs.task import Task
+from clothgym.envs.task import POSITION_BOUND, Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
@@ -41,24 +40,7 @@ ENOUGH_COVERAGE, ENOUGH_CENTRING, ENOUGH_REST = 0.9, 0.1, 0.05
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.25, 0.55, 0.25
 EXPERT_SPEED = 0.8  # share of the anchors' speed limit
 
-POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # in sides, and in m/s
-
-
-def _key_points() -> NDArray:
-    """Corners, middles of the edges, centre: particles of a 3 x 3 subgrid."""
-    line = np.array([0, ROWS // 2, ROWS - 1])
-    return (line[:, None] * ROWS + line[None, :]).ravel()
-
-
-@kernel
-def _gather(first, last, x, v, particles, origin, out):
-    """Positions relative to ``origin`` [m] and velocities [m/s] of some particles: (blocks, 6 * count, lanes)."""
-    for b in range(first, last):
-        for k in range(len(particles)):
-            for c in range(3):
-                for l in range(x.shape[3]):
-                    out[b, 3 * k + c, l] = x[b, particles[k], c, l] - origin[b, c, l]
-                    out[b, 3 * (len(particles) + k) + c, l] = v[b, particles[k], c, l]
+LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
 
 
 class DrapeTask(Task):
@@ -66,16 +48,18 @@ class DrapeTask(Task):
 
     physics = Physics(
         mesh=SHEET,
-        material=Material.preset("cotton"),
-        anchors=(SHEET.corners[2], SHEET.corners[3]),
-        anchor_speed=1.0,
+        material=Material.preset("cotton", air_drag=0.72),
         time_step=1 / 30,
         integrator="semi_implicit_euler",
         substeps=50,
+        hand_speed=1.0,
+        anchors=(SHEET.corners[2], SHEET.corners[3]),
+        air_density=0.0,
     )
     acting_steps = 60
     settling_steps = 40
-    obs_modes = ("keypoints", "particles")
+    hand_actions = 4
+    key_particles = key_particles(SHEET)
     reset_options = ("material", "target")
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
@@ -86,14 +70,8 @@ class DrapeTask(Task):
             "target": np.zeros((num_envs, 6)),  # shape, radius, height, center, yaw
             "reference": np.ones(num_envs),
         }
-        self._origin = np.zeros((layout.blocks, 3, layout.lanes), np.float32)
         self._guide = np.zeros((layout.blocks, GUIDE_POINTS, 3, layout.lanes), np.float32)
         self._guided = np.zeros((layout.blocks, layout.lanes), np.float32)
-        self._seen = np.zeros((layout.blocks, 6 * len(self._particles), layout.lanes), np.float32)
-
-    @property
-    def _particles(self) -> NDArray:
-        return _key_points() if self.obs_mode == "keypoints" else np.arange(SHEET.num_particles)
 
     def _colliders(self) -> list:
         floor = Plane(friction=FRICTION, thickness=THICKNESS)
@@ -138,7 +116,7 @@ class DrapeTask(Task):
         self.episode["reference"][env] = reference_coverage(target, SIDE)
         self.simulation.set_collider(1, [target.collider(FRICTION, THICKNESS)], np.array([env]))
         block, lane = divmod(env, self.simulation.layout.lanes)
-        self._origin[block, :, lane] = target.top
+        self._set_origin(env, target.top)
         points = target.upper_surface(GUIDE_POINTS)
         self._guide[block, :, :, lane] = points[np.arange(GUIDE_POINTS) % len(points)]
 
@@ -149,43 +127,40 @@ class DrapeTask(Task):
 
     # --- what the agent sees --------------------------------------------------------------------------------------------
 
-    def _observation_bound(self) -> NDArray:
-        points = 3 * len(self._particles)
-        rest = [POSITION_BOUND] * 3 + [1.0] * (self.num_anchors + len(SHAPES) + 6)
-        return np.array([POSITION_BOUND] * points + [VELOCITY_BOUND] * points + rest, np.float32)
+    def _more_bounds(self) -> list[float]:
+        return [POSITION_BOUND] * 3 + [1.0] * (self.num_hands + len(SHAPES) + 6)
 
-    def _observe(self) -> NDArray:
-        view = self.simulation.view
-
-        def work(first: int, last: int) -> None:
-            _gather(first, last, view.x, view.v, self._particles, self._origin, self._seen)
-
-        _jit.run_spans(work, len(self._seen), self.threads)
-        points = self.simulation.layout.to_public(self._seen)
-        half = points.shape[1] // 2
-        points[:, :half] *= np.float32(1 / SIDE)
+    def _observe_more(self) -> list[NDArray]:
         episode = self.episode
         shape, radius, height, *_, yaw = episode["target"].T
         settling = episode["settling_since"] >= 0
         center = (self.simulation.layout.to_public(self._summary)[:, :3] - self._tops()) / SIDE
-        return np.concatenate(
-            [
-                points,
-                center,
-                self.simulation.attached,
-                shape[:, None] == np.arange(len(SHAPES)),
-                (radius / SIDE)[:, None],
-                (height / SIDE)[:, None],
-                (yaw * (4 / np.pi))[:, None],
-                settling[:, None],
-                (1 - episode["step"] / (self.acting_steps + self.settling_steps))[:, None],
-                (np.maximum(self.acting_steps - episode["step"], 0) / self.acting_steps)[:, None],
-            ],
-            axis=1,
-        )
+        return [
+            center,
+            self.simulation.attached,
+            shape[:, None] == np.arange(len(SHAPES)),
+            (radius / SIDE)[:, None],
+            (height / SIDE)[:, None],
+            (yaw * (4 / np.pi))[:, None],
+            settling[:, None],
+            (1 - episode["step"] / (self.acting_steps + self.settling_steps))[:, None],
+            (np.maximum(self.acting_steps - episode["step"], 0) / self.acting_steps)[:, None],
+        ]
 
     def _tops(self) -> NDArray:
         return self.episode["target"][:, [3, 4, 2]]
+
+    # --- letting go ---------------------------------------------------------------------------------------------------------
+
+    def _grip(self, moves: NDArray, acting: NDArray) -> None:
+        """Open the anchors that the action opens, or all when time is up."""
+        late = self.episode["step"] >= self.acting_steps
+        opens = self.simulation.attached & acting[:, None] & ((moves[:, :, 3] > LETS_GO) | late[:, None])
+        if opens.any():
+            self.simulation.release(*np.nonzero(opens))
+
+    def _done(self) -> NDArray:
+        return np.logical_not(self.simulation.attached.any(axis=1))
 
     # --- how it is rewarded and judged ----------------------------------------------------------------------------------
 
@@ -244,11 +219,11 @@ class DrapeTask(Task):
         low = np.maximum(tops[:, 2] - EXPERT_DROP * SIDE, 0.02)
         goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * SIDE)], axis=1)
         # half of the way in each step, as far as the speed goes
-        move = (goal - middle) / (2 * self.physics.time_step * self.physics.anchor_speed)
+        move = (goal - middle) / (2 * self.physics.time_step * self.physics.hand_speed)
         length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
         move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[:, None]
         release = arrived & (np.abs(middle[:, 2] - low) < 0.02)
-        actions = np.empty((self.num_envs, self.num_anchors, 4))
+        actions = np.empty((self.num_envs, self.num_hands, 4))
         actions[:, :, :3] = move[:, None]
         actions[:, :, 3] = np.where(release, 1.0, -1.0)[:, None]
         return actions.reshape(self.num_envs, -1)

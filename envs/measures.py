@@ -7,8 +7,10 @@ loops over lanes inner, and nothing is summed across lanes.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym._jit import kernel
+from clothgym.mesh import ClothMesh
 
 # columns of ``summarize``'s output
 CENTROID, SPEED2, STRETCH2, FINITE = 0, 3, 4, 5
@@ -53,6 +55,29 @@ def summarize(first, last, x, v, share, springs, structural, out):
             c2 = total[0, l] * total[0, l] + total[1, l] * total[1, l] + total[2, l] * total[2, l]
             sane = c2 < far2 and total[SPEED2, l] < far2 and total[STRETCH2, l] < far2
             total[FINITE, l] = one if sane else zero
+
+
+@kernel
+def see_points(first, last, x, v, particles, origin, scale, out):
+    """Positions of some particles relative to ``origin`` [m], times ``scale``, and their velocities [m/s].
+
+    particles: (count,); origin: (blocks, 3, lanes); out: (blocks, 6 * count, lanes).
+    """
+    count = len(particles)
+    for b in range(first, last):
+        for k in range(count):
+            for c in range(3):
+                xc, vc, here = x[b, particles[k], c], v[b, particles[k], c], origin[b, c]
+                for l in range(x.shape[3]):
+                    out[b, 3 * k + c, l] = (xc[l] - here[l]) * scale
+                for l in range(x.shape[3]):
+                    out[b, 3 * (count + k) + c, l] = vc[l]
+
+
+def key_particles(mesh: ClothMesh) -> NDArray:
+    """Corners, middles of the edges, centre of a grid: particles of a 3 x 3 subgrid, row by row, (9,)."""
+    rows, columns = (np.array([0, n // 2, n - 1]) for n in mesh.shape)
+    return (rows[:, None] * mesh.shape[1] + columns[None, :]).ravel()
 
 
 @kernel

@@ -3,27 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
+from clothgym.hands import Gripper
 from clothgym.material import Material, spring_stiffness
 from clothgym.mesh import ClothMesh
-from clothgym.simulation import FIGURES
+from clothgym.parameters import AIR_DENSITY, FIGURES
+from clothgym.wind import Wind
 
 
 @dataclass(frozen=True)
 class Physics:
-    """What an id fixes: control step [s], sheet, fabric, integrator, substeps, anchors."""
+    """What an id fixes.
+
+    Attributes:
+        mesh, material: the sheet and its fabric.
+        time_step: control step [s].
+        integrator, substeps: how it is advanced.
+        hand_speed: speed limit of anchors and grippers [m/s].
+        anchors, grippers: see ``Simulation``.
+        air_density: [kg/m^3]; 0 where the linear drag alone stands for the air.
+        wind: what the air does, unless the environment's keyword says otherwise.
+    """
 
     mesh: ClothMesh
     material: Material
-    anchors: tuple[int, ...]
-    anchor_speed: float
     time_step: float
     integrator: str
     substeps: int
+    hand_speed: float
+    anchors: tuple[int | tuple[int, ...], ...] = ()
+    grippers: tuple[Gripper, ...] = ()
+    air_density: float = AIR_DENSITY
+    wind: Wind | None = None
 
 
 def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
@@ -39,6 +55,21 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
             Material(**{name: float(bound)})  # type: ignore[arg-type]
         checked[name] = (float(bounds[0]), float(bounds[1]))
     return checked
+
+
+def checked_wind(figures: Mapping[str, Any]) -> Wind:
+    """A wind of these figures.
+
+    Raises:
+        ValueError: an unknown figure, or one that makes no wind.
+    """
+    known = [field.name for field in fields(Wind)]
+    if not isinstance(figures, Mapping):
+        raise ValueError(f"wind={figures!r}: must be a dict with any of {', '.join(known)}")
+    for name in figures:
+        if name not in known:
+            raise ValueError(f"wind: no figure {name!r} (there are: {', '.join(known)})")
+    return Wind(**figures)
 
 
 def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]]) -> None:

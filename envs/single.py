@@ -8,7 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.envs.task import Task, TaskState
+from clothgym.envs.episode import TaskState
+from clothgym.envs.task import Task
 
 RENDER_MODES = ["rgb_array", "depth_array"]
 FRAMES_PER_SECOND = 30

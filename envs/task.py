@@ -1,7 +1,8 @@
 """A task, written once for a batch: what ``ClothEnv`` (a batch of one) and ``ClothVectorEnv`` (a batch of many) both run.
 
-An episode: the agent moves the anchors until it has let go of all of them, or until its time is up and they are released for
-it; then the sheet settles for a fixed number of steps, in which actions are ignored; then it is judged, which terminates.
+An episode: the agent moves its hands (anchors or grippers) until it is done, at the latest until its time is up; then, in the
+tasks that have it so, the sheet settles for a fixed number of steps, in which actions are ignored; then it is judged, which
+terminates.
 """
 
 from __future__ import annotations
@@ -9,20 +10,20 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit
-from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, summarize
-from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, most_demanding
+from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, within_ball
+from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, see_points, summarize
+from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, checked_wind, most_demanding
 from clothgym.mesh import SHEAR
-from clothgym.simulation import FIGURES, Simulation
-from clothgym.state import State
+from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
+from clothgym.simulation import Simulation
 
 if TYPE_CHECKING:
     from clothgym.render import Camera, Renderer, Solid
@@ -31,29 +32,8 @@ REWARD_MODES = ("delta", "sparse")
 FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
-TORN = 2.0  # a structural spring at twice its rest length
-FAILURES = ("", "diverged", "torn", "out_of_bounds")
 HELD = (250, 200, 60)  # colour of the anchors' markers
-LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
-
-
-@dataclass
-class TaskState:
-    """All that is needed to continue a batch of episodes bit for bit: physics, episode, random generators."""
-
-    simulation: State
-    episode: dict[str, NDArray]
-    generators: list[str]
-
-
-@dataclass
-class Outcome:
-    """What a step brought, arrays over the batch; ``info`` may nest one level."""
-
-    reward: NDArray
-    terminated: NDArray
-    truncated: NDArray
-    info: dict[str, Any]
+POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides, and in m/s
 
 
 class Task(ABC):
@@ -66,6 +46,7 @@ class Task(ABC):
         obs_mode: one of ``obs_modes``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the judgement alone).
         randomize: ranges of material figures drawn at each reset, ``{"density": [0.1, 0.2]}``.
+        wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for a calm.
         threads: threads to use; all processors by default for a batch.
 
     Raises:
@@ -74,8 +55,10 @@ class Task(ABC):
 
     physics: ClassVar[Physics]
     acting_steps: ClassVar[int]
-    settling_steps: ClassVar[int]
-    obs_modes: ClassVar[tuple[str, ...]]
+    settling_steps: ClassVar[int] = 0
+    hand_actions: ClassVar[int] = 3  # numbers for each hand: a velocity, and what comes after it
+    key_particles: ClassVar[NDArray]  # those that are observed with obs_mode="keypoints"
+    obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
     reset_options: ClassVar[tuple[str, ...]] = ("material",)
 
     def __init__(
@@ -86,6 +69,7 @@ class Task(ABC):
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",
         randomize: Mapping[str, Sequence[float]] | None = None,
+        wind: Mapping[str, Any] | None = None,
         threads: int | None = None,
     ) -> None:
         for name, value, known in (("obs_mode", obs_mode, self.obs_modes), ("reward_mode", reward_mode, REWARD_MODES)):
@@ -94,6 +78,7 @@ class Task(ABC):
         self.obs_mode, self.reward_mode = obs_mode, reward_mode
         self.randomize = checked_ranges(randomize or {})
         physics = self.physics
+        self.wind = physics.wind if wind is None else checked_wind(wind)
         check_springs_exist(physics, self.randomize)
         if substeps is None:
             substeps = physics.substeps if integrator in (None, physics.integrator) and not self.randomize else "auto"
@@ -106,14 +91,17 @@ class Task(ABC):
             time_step=physics.time_step,
             substeps=substeps,  # type: ignore[arg-type]
             colliders=self._colliders(),
-            anchors=physics.anchors,
-            anchor_speed=2 * physics.anchor_speed,
+            air_density=physics.air_density if wind is None else AIR_DENSITY,
+            anchors=physics.anchors,  # type: ignore[arg-type]
+            anchor_speed=2 * physics.hand_speed,
+            grippers=physics.grippers,
             threads=threads,
         )
         self.num_envs = num_envs
         self.threads = self.simulation.threads
-        self.num_anchors = len(physics.anchors)
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (4 * self.num_anchors,), np.float32)
+        self.num_hands = len(physics.anchors) + len(physics.grippers)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.hand_actions * self.num_hands,), np.float32)
+        self.particles = self.key_particles if obs_mode == "keypoints" else np.arange(physics.mesh.num_particles)
         bound = self._observation_bound()
         self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
@@ -124,15 +112,18 @@ class Task(ABC):
         self._structural = np.flatnonzero(self.simulation.view.springs.kind < SHEAR)
         layout = self.simulation.layout
         self._summary = np.zeros((layout.blocks, SUMMARY, layout.lanes), np.float32)
+        self._origin = np.zeros((layout.blocks, 3, layout.lanes), np.float32)
+        self._seen = np.zeros((layout.blocks, 6 * len(self.particles), layout.lanes), np.float32)
         # the episode: arrays over the batch, all of them part of the state
         self.episode: dict[str, NDArray] = {
             "step": np.zeros(num_envs, np.int64),
             "settling_since": np.full(num_envs, -1, np.int64),
             "over": np.ones(num_envs, bool),
-            "targets": np.zeros((num_envs, self.num_anchors, 3)),
+            "targets": np.zeros((num_envs, self.num_hands, 3)),
             "potential": np.zeros(num_envs),
             "observation": np.zeros((num_envs, len(bound)), np.float32),
-            "material": np.tile([getattr(self.simulation.material, name) for name in FIGURES], (num_envs, 1)),
+            "material": np.tile(of_material(self.simulation.material), (num_envs, 1)),
+            "wind": np.zeros((num_envs, self.acting_steps + self.settling_steps if self.wind is not None else 0, 3)),
         }
 
     # --- what each task says --------------------------------------------------------------------------------------------
@@ -142,20 +133,31 @@ class Task(ABC):
         """The scene's solids; those that change at reset are replaced by ``_begin``."""
 
     @abstractmethod
-    def _observation_bound(self) -> NDArray:
-        """Largest magnitude of each component of the observation, (size,)."""
+    def _more_bounds(self) -> list[float]:
+        """Largest magnitude of each component of ``_observe_more``."""
 
     @abstractmethod
     def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         """Draw one environment's scene; the sheet's particles at the start [m], (particles, 3)."""
 
     @abstractmethod
-    def _observe(self) -> NDArray:
-        """Observations of the whole batch, (num_envs, size), not yet clipped to the bounds."""
+    def _observe_more(self) -> list[NDArray]:
+        """What is observed beside the points of the sheet, arrays (num_envs, size)."""
 
     @abstractmethod
     def _potential(self, summary: NDArray) -> NDArray:
         """How far along each environment is, in [0, 1], (num_envs,); its change is the reward on the way."""
+
+    def _order(self, targets: NDArray) -> None:
+        """Tell the simulation where the hands are to be [m], (num_envs, hands, 3)."""
+        self.simulation.move_anchors(targets)
+
+    def _grip(self, moves: NDArray, acting: NDArray) -> None:  # noqa: B027 - some only move
+        """Do what an action says beside where to move, after the step; all must have let go where the time for acting is up."""
+
+    def _done(self) -> NDArray:
+        """Whether each environment's agent is done before its time is up, (num_envs,)."""
+        return np.zeros(self.num_envs, bool)
 
     @abstractmethod
     def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
@@ -167,7 +169,7 @@ class Task(ABC):
 
     @abstractmethod
     def _arena(self) -> tuple[NDArray, NDArray]:
-        """Lowest and highest corner of the room in which anchors move [m]; the sheet is out of bounds 0.5 m beyond it."""
+        """Lowest and highest corner of the room in which hands move [m]; the sheet is out of bounds 0.5 m beyond it."""
 
     @abstractmethod
     def expert_actions(self) -> NDArray:
@@ -190,12 +192,15 @@ class Task(ABC):
         if not len(envs):
             return
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
+        length = self.episode["wind"].shape[1]
         for k, env in enumerate(envs):
             seed = seeds[k] if seeds is not None else None
             if seed is not None or not self._seeded[env]:
                 self.generators[env] = seeding.np_random(seed)[0]
                 self._seeded[env] = True
             self._draw_material(env, options.get("material", {}))
+            if self.wind is not None:
+                self.episode["wind"][env] = self.wind.series(self.generators[env], length, self.physics.time_step)
             starts[k] = self._begin(env, self.generators[env], options)
         material = self.episode["material"][envs]
         if not np.array_equal(material, self.simulation.parameters[envs]):
@@ -203,14 +208,18 @@ class Task(ABC):
             figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
             self.simulation.set_parameters(envs, warn="material" in options, **figures)
         self.simulation.reset(envs, positions=starts)
+        self._place_hands(envs)
         episode = self.episode
         episode["step"][envs] = 0
         episode["settling_since"][envs] = -1
         episode["over"][envs] = False
-        episode["targets"][envs] = starts[:, self.physics.anchors]
+        episode["targets"][envs] = self.simulation.hand_positions[envs]
         summary = self._summarize()
         episode["potential"][envs] = self._potential(summary)[envs]
         episode["observation"][envs] = self._clipped_observation()[envs]
+
+    def _place_hands(self, envs: NDArray) -> None:  # noqa: B027 - anchors need nothing
+        """Put grippers where an episode begins with them; anchors hold their particles."""
 
     def _check_options(self, options: Mapping[str, Any]) -> None:
         """Refuse options that no episode can have, before anything is changed."""
@@ -254,14 +263,18 @@ class Task(ABC):
         episode, simulation = self.episode, self.simulation
         running = ~episode["over"]
         acting = running & (episode["settling_since"] < 0)
-        moves = actions.reshape(self.num_envs, self.num_anchors, 4)
-        self._move_anchors(moves, acting)
+        moves = actions.reshape(self.num_envs, self.num_hands, self.hand_actions)
+        self._move_hands(moves, acting)
+        if self.wind is not None:
+            simulation.set_wind(episode["wind"][np.arange(self.num_envs), episode["step"]])
         simulation.step()
         episode["step"][running] += 1
-        self._let_go(moves, acting)
+        self._grip(moves, acting)
 
         summary = self._summarize()
-        failure = self._failures(summary)
+        failure = failures(summary, *self._arena())
+        done = acting & (self._done() | (episode["step"] >= self.acting_steps))
+        episode["settling_since"][done] = episode["step"][done]
         settled = (episode["settling_since"] >= 0) & (episode["step"] - episode["settling_since"] >= self.settling_steps)
         failure[~running] = 0
         judged = running & settled & (failure == 0)
@@ -270,7 +283,9 @@ class Task(ABC):
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
         terms = self._reward_terms(moves, acting, running, judged, failure, summary, info)
-        reward = terms["progress"] + terms["effort"] + terms["success"] + terms["failure"]
+        reward = np.zeros(self.num_envs)
+        for term in terms.values():
+            reward += term
 
         fresh = self._clipped_observation()
         keep = ~running | (failure == 1)
@@ -284,24 +299,13 @@ class Task(ABC):
         }
         return Outcome(reward, terminated, np.zeros(self.num_envs, bool), info)
 
-    def _move_anchors(self, moves: NDArray, acting: NDArray) -> None:
+    def _move_hands(self, moves: NDArray, acting: NDArray) -> None:
         low, high = self._arena()
-        reach = self.physics.anchor_speed * self.physics.time_step
+        reach = self.physics.hand_speed * self.physics.time_step
         targets = self.episode["targets"]
-        wanted = np.clip(targets + reach * _within_ball(moves[:, :, :3]), low, high)
+        wanted = np.clip(targets + reach * within_ball(moves[:, :, :3]), low, high)
         self.episode["targets"] = np.where(acting[:, None, None], wanted, targets)
-        self.simulation.move_anchors(self.episode["targets"])
-
-    def _let_go(self, moves: NDArray, acting: NDArray) -> None:
-        """Open the anchors that the action opens, or all when time is up; who holds nothing any more begins to settle."""
-        episode, simulation = self.episode, self.simulation
-        held = simulation.attached
-        late = episode["step"] >= self.acting_steps
-        opens = held & acting[:, None] & ((moves[:, :, 3] > LETS_GO) | late[:, None])
-        if opens.any():
-            simulation.release(*np.nonzero(opens))
-        done = acting & ~(held & ~opens).any(axis=1)
-        episode["settling_since"][done] = episode["step"][done]
+        self._order(self.episode["targets"])
 
     def _summarize(self) -> NDArray:
         """Summary of the batch, (SUMMARY, num_envs) (see ``measures.summarize``)."""
@@ -312,15 +316,6 @@ class Task(ABC):
 
         _jit.run_spans(work, len(self._summary), self.threads)
         return self.simulation.layout.to_public(self._summary).T
-
-    def _failures(self, summary: NDArray) -> NDArray:
-        """Index into FAILURES, (num_envs,)."""
-        low, high = self._arena()
-        center = summary[:3].T
-        outside = np.any((center < low - 0.5) | (center > high + 0.5), axis=1)
-        torn = summary[STRETCH2] > TORN**2
-        diverged = summary[FINITE] == 0
-        return np.where(diverged, 1, np.where(torn, 2, np.where(outside, 3, 0)))
 
     def _reward_terms(
         self,
@@ -343,7 +338,7 @@ class Task(ABC):
             return {"progress": performance * judged, "effort": nothing, "success": nothing.copy(), "failure": nothing.copy()}
         squares = moves[:, :, 0] ** 2 + moves[:, :, 1] ** 2 + moves[:, :, 2] ** 2
         effort = squares[:, 0].copy()
-        for a in range(1, self.num_anchors):
+        for a in range(1, self.num_hands):
             effort += squares[:, a]
         return {
             "progress": np.where(running, potential - previous, 0.0),
@@ -352,10 +347,27 @@ class Task(ABC):
             "failure": -FAILURE_PENALTY * (failure > 0),
         }
 
+    def _observation_bound(self) -> NDArray:
+        points = 3 * len(self.particles)
+        return np.array([POSITION_BOUND] * points + [VELOCITY_BOUND] * points + self._more_bounds(), np.float32)
+
     def _clipped_observation(self) -> NDArray:
+        """Points of the sheet relative to the origin, in sides, their velocities [m/s], and more; within the bounds."""
+        view, scale = self.simulation.view, np.float32(1 / max(self.physics.mesh.size))
+
+        def work(first: int, last: int) -> None:
+            see_points(first, last, view.x, view.v, self.particles, self._origin, scale, self._seen)
+
+        _jit.run_spans(work, len(self._seen), self.threads)
         space = self.single_observation_space
-        with np.errstate(invalid="ignore"):
-            return np.clip(self._observe(), space.low, space.high).astype(np.float32)
+        with np.errstate(invalid="ignore", over="ignore"):
+            seen = [self.simulation.layout.to_public(self._seen), *self._observe_more()]
+            return np.clip(np.concatenate(seen, axis=1, dtype=np.float32, casting="unsafe"), space.low, space.high)
+
+    def _set_origin(self, env: int, origin: ArrayLike) -> None:
+        """Observe an environment's positions relative to this point [m]."""
+        block, lane = divmod(env, self.simulation.layout.lanes)
+        self._origin[block, :, lane] = origin
 
     # --- pictures -------------------------------------------------------------------------------------------------------
 
@@ -371,12 +383,15 @@ class Task(ABC):
     def draw(self, renderer: Renderer, mode: str, envs: Sequence[int]) -> NDArray:
         """Frames: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array"."""
         positions = self.simulation.positions[list(envs)]
-        targets, attached = self.episode["targets"], self.simulation.attached
-        solids = [self.solids(env) for env in envs]
-        markers = [[(x, HELD) for x, held in zip(targets[env], attached[env]) if held] for env in envs]
+        solids, markers = [self.solids(env) for env in envs], [self.markers(env) for env in envs]
         if mode == "depth_array":
             return renderer.depth_batch(positions, solids, markers)
         return renderer.rgb_batch(positions, solids, markers)
+
+    def markers(self, env: int) -> list[Any]:
+        """What is drawn and casts no lift on the sheet: hands that hold it, and what else a task shows."""
+        hands, attached = self.simulation.hand_positions[env], self.simulation.attached[env]
+        return [(x, HELD) for x, held in zip(hands, attached) if held]
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
@@ -411,9 +426,3 @@ class Task(ABC):
             self.generators[env] = np.random.default_rng()
             self.generators[env].bit_generator.state = json.loads(text)
         self._seeded[:] = True
-
-
-def _within_ball(vectors: NDArray) -> NDArray:
-    """Vectors in the cube [-1, 1]^3 shortened to length 1 where they are longer: the speed limit holds in every direction."""
-    squares = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
-    return vectors / np.sqrt(np.maximum(squares, 1.0))[..., None]

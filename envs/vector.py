@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from clothgym.envs.episode import TaskState
 from clothgym.envs.single import FRAMES_PER_SECOND, RENDER_MODES, check_render_mode
-from clothgym.envs.task import Task, TaskState
+from clothgym.envs.task import Task
 
 IMAGE_SIZE = 240
 

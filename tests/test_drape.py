@@ -166,7 +166,7 @@ def test_a_refused_reset_leaves_nothing_behind():
         with pytest.raises(ValueError, match="bend_rigidity"):
             env.reset(seed=0, options={"material": {"bend_rigidity": 0.1}})
     env.reset(seed=0)
-    assert env.task.simulation.parameters[0] == pytest.approx([0.1503, 261.1, 105.0, 2.34e-6, 1e-4, 0.72])
+    assert env.task.simulation.parameters[0] == pytest.approx([0.1503, 261.1, 105.0, 2.34e-6, 1e-4, 1.2, 0.02, 0.72])
 
 
 def test_states_of_another_kind_are_refused():

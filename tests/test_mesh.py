@@ -110,7 +110,9 @@ def test_impossible_moduli_are_refused_with_a_remedy():
         Simulation(grid(5, 21, 0.1, 1.0), Material(stretch_stiffness=10.0, shear_stiffness=1000.0))
 
 
-@pytest.mark.parametrize("field", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag"])
+@pytest.mark.parametrize(
+    "field", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "drag_coefficient", "air_drag"]
+)
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
 def test_bad_material_figures_are_named(field, value):
     with pytest.raises(ValueError, match=field):

@@ -2,12 +2,14 @@
 
 To add one: write a file whose last function is its whole substep, a kernel with the signature
 
-    substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, h, work)
+    substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, push, h, work)
 
 on one block of lanes, and describe it by an ``Integrator``.  The substep advances positions ``x`` [m] and velocities ``v``
 [m/s], (particles, 3, lanes), by ``h`` [s].  ``w``: inverse masses [1/kg], (particles, lanes); a particle with ``w = 0`` is
-held: it keeps its velocity, and moves with it.  The other arguments are a block's part of ``state.SpringArrays`` and
-``state.Fabric``; ``work`` is scratch, (particles + 1, 3, lanes), whose content does not outlive the substep.
+held: it keeps its velocity, and moves with it.  ``push``: forces from outside [N], (particles, 3, lanes), of the air for
+instance: slow against the springs, and not to be written to.  The other arguments are a block's part of
+``state.SpringArrays`` and ``state.Fabric``; ``work`` is scratch, (particles + 1, 3, lanes), whose content does not outlive
+the substep.
 Contact is resolved after each substep, by the simulation, on the positions and velocities that the substep leaves.
 """
 

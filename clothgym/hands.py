@@ -1,0 +1,320 @@
+"""Floor 4: what holds the cloth from outside.
+
+A hand is a point that moves at a bounded speed and carries the particles that it holds.  An anchor is a hand bound to one
+particle, or to a patch of them, as a clip is; a gripper takes what lies between its fingers when they close.  Held particles
+have no inverse mass: nothing but their hand moves them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym._jit import kernel
+from clothgym.checks import finite, indices, number, spread, vector
+from clothgym.forces import add_air_forces, add_spring_forces
+from clothgym.state import Fabric, Layout, SpringArrays, SurfaceArrays
+
+# columns of what a kernel must know of each hand
+SPEED, FINGER_STEP, REACH2, SLIP2 = 0, 1, 2, 3
+FREE = -1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gripper:
+    """A gripper with two fingers, a kinematic body: it moves as it is told, and its fingers do not push the cloth.
+
+    Attributes:
+        position: of its tip, where it begins [m].
+        speed: its speed limit [m/s].
+        reach: particles within this distance of the tip when the fingers have closed are held [m].
+        span: distance of the open fingers [m], for the picture.
+        closing_time: of the fingers, from open to closed [s].
+        slip_force: pull of the cloth beyond which it slips out of the fingers [N]; None for a firm hold.
+
+    Raises:
+        ValueError: a figure that is not positive, or a position that is not three finite numbers.
+    """
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.5)
+    speed: float = 1.0
+    reach: float = 0.03
+    span: float = 0.06
+    closing_time: float = 0.1
+    slip_force: float | None = None
+
+    def __post_init__(self) -> None:
+        vector("Gripper position", self.position)
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name == "position" or (field.name == "slip_force" and value is None):
+                continue
+            if number(f"Gripper {field.name}", value) <= 0:
+                raise ValueError(f"Gripper {field.name}={value!r}: must be positive")
+
+
+class Hands:
+    """The anchors and then the grippers of a batch, in the memory layout of the kernels.
+
+    Attributes:
+        x, targets: where each hand is, and is to be [m], (block, hands, 3, lane).
+        opening, wanted: of the fingers, from 0 (closed) to 1, (block, hands, lane); an anchor's is 0.
+        holder: which hand holds each particle, or FREE, (block, particles, lane).
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        patches: Sequence[NDArray],
+        anchor_speed: float,
+        grippers: Sequence[Gripper],
+        time_step: float,
+    ) -> None:
+        self.layout, self.grippers, self.time_step = layout, tuple(grippers), time_step
+        self.members = np.concatenate([np.zeros(0, np.int64), *patches])
+        self.member_of = np.repeat(np.arange(len(patches)), [len(patch) for patch in patches])
+        if len(set(self.members.tolist())) < len(self.members) or not all(len(patch) for patch in patches):
+            raise ValueError(f"anchors={[patch.tolist() for patch in patches]}: a particle is named twice, or an anchor has none")
+        # an anchor is where its patch's first particle is
+        self.anchors = anchors = np.array([patch[0] for patch in patches], np.int64)
+        self.count = len(anchors) + len(self.grippers)
+        # anchors have no fingers and never slip
+        rows = [(anchor_speed, 0.0, 0.0, np.inf)] * len(anchors)
+        for g in self.grippers:
+            slip = np.inf if g.slip_force is None else g.slip_force**2
+            rows.append((g.speed, time_step / g.closing_time, g.reach**2, slip))
+        self.limits = np.array(rows).reshape(-1, 4)
+        self.can_slip = bool(np.isfinite(self.limits[:, SLIP2]).any())
+        self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
+
+    def restore(self, x: NDArray, targets: NDArray, opening: NDArray, wanted: NDArray, holder: NDArray, dtype: np.dtype) -> None:
+        """Take over public arrays, (num_envs, ...)."""
+        blocks = self.layout.to_blocks
+        self.x, self.targets = blocks(x, dtype), blocks(targets, dtype)
+        self.opening, self.wanted = blocks(opening, dtype), blocks(wanted, dtype)
+        self.holder = blocks(holder, np.dtype(np.int8))
+        self.limits = self.limits.astype(dtype)
+
+    def begin(self, block: NDArray, lane: NDArray, particles: NDArray) -> None:
+        """Put hands back: anchors hold their particles where these are, grippers are open and at home.
+
+        particles: positions of environments' particles [m], (particles, 3) or (len(block), particles, 3).
+        """
+        count = len(self.anchors)
+        self.holder[block, :, lane] = FREE
+        self.holder[block[:, None], self.members, lane[:, None]] = self.member_of
+        for array in (self.x, self.targets):
+            array[block, :count, :, lane] = particles[..., self.anchors, :]
+        self.place(block, lane, self.homes)
+        self.opening[block, count:, lane] = self.wanted[block, count:, lane] = 1
+
+    def place(self, block: NDArray, lane: NDArray, positions: NDArray) -> None:
+        """Put grippers somewhere at once [m], (grippers, 3) or (len(block), grippers, 3)."""
+        for array in (self.x, self.targets):
+            array[block, len(self.anchors) :, :, lane] = positions
+
+    def move(self, which: slice, targets: NDArray) -> None:
+        """Where some hands are to be at the end of the next step [m], (num_envs, hands, 3)."""
+        self.targets[:, which] = self.layout.to_blocks(targets, self.x.dtype)
+
+    def hold(self, block: NDArray, anchor: NDArray, lane: NDArray, x: NDArray) -> None:
+        """Make anchors hold their particles, where these now are, but for those that something holds already."""
+        for k, first in enumerate(self.anchors):
+            b, l = block[anchor == k], lane[anchor == k]
+            loose = self.holder[b, first, l] == FREE
+            self.x[b[loose], k, :, l[loose]] = self.targets[b[loose], k, :, l[loose]] = x[b[loose], first, :, l[loose]]
+            for particle in self.members[self.member_of == k]:
+                free = self.holder[b, particle, l] == FREE
+                self.holder[b[free], particle, l[free]] = k
+
+    def let_go(self, block: NDArray, anchor: NDArray, lane: NDArray) -> None:
+        """Make anchors let go of their particles."""
+        for k in range(len(self.anchors)):
+            b, l = block[anchor == k], lane[anchor == k]
+            for particle in self.members[self.member_of == k]:
+                held = self.holder[b, particle, l] == k
+                self.holder[b[held], particle, l[held]] = FREE
+
+    def attached(self) -> NDArray:
+        """Whether each anchor holds its particle, (num_envs, anchors)."""
+        return self.layout.to_public(self.holder[:, self.anchors] == np.arange(len(self.anchors))[:, None])
+
+    def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray) -> None:
+        """Begin a control step of blocks ``first`` to ``last``."""
+        steer_blocks(
+            first, last, x, v, w, free_w, self.x, self.targets, self.opening, self.wanted, self.holder, self.limits,
+            len(self.anchors), x.dtype.type(self.time_step),
+        )  # fmt: skip
+
+    def pulls(
+        self,
+        first: int,
+        last: int,
+        x: NDArray,
+        v: NDArray,
+        free_w: NDArray,
+        springs: SpringArrays,
+        surface: SurfaceArrays,
+        fabric: Fabric,
+        out: NDArray,
+    ) -> None:
+        """Force of the cloth on each hand [N], into (blocks, hands, 3, lanes)."""
+        add_pulls(first, last, x, v, free_w, springs, surface, fabric, self.holder, out)
+
+    def slip(self, pull: NDArray, w: NDArray, free_w: NDArray) -> None:
+        """Let go of what pulls harder than its gripper can hold."""
+        let_slip(pull, self.holder, w, free_w, self.limits)
+
+
+class Grippers:
+    """The grippers of a simulation, as ``simulation.grippers``: move them, and see where they are."""
+
+    def __init__(self, hands: Hands) -> None:
+        self._hands = hands
+        self._first = len(hands.anchors)
+
+    def __len__(self) -> int:
+        return len(self._hands.grippers)
+
+    @property
+    def positions(self) -> NDArray:
+        """Of the tips [m], (num_envs, grippers, 3); a fresh copy."""
+        return self._hands.layout.to_public(self._hands.x)[:, self._first :]
+
+    @property
+    def openings(self) -> NDArray:
+        """How far the fingers are open, from 0 to 1, (num_envs, grippers); a fresh copy."""
+        return self._hands.layout.to_public(self._hands.opening)[:, self._first :]
+
+    @property
+    def held(self) -> NDArray:
+        """Number of particles in each gripper's hold, (num_envs, grippers)."""
+        holder = self._hands.holder
+        count = np.empty((holder.shape[0], len(self), holder.shape[2]), np.int64)
+        count_held(holder, self._first, count)
+        return self._hands.layout.to_public(count)
+
+    def move(self, targets: ArrayLike, openings: ArrayLike) -> None:
+        """Where the tips are to be at the end of the next step [m], (num_envs, grippers, 3), as far as their speed allows, and
+        how far open, from 0 to 1, (num_envs, grippers), as far as the fingers' speed does.
+
+        Fingers take hold of what is in reach when they have closed, and let go when they begin to open.
+
+        Raises:
+            ValueError: a wrong shape, a value that is not finite, or an opening that is not from 0 to 1.
+        """
+        hands, num_envs = self._hands, self._hands.layout.num_envs
+        x = spread("targets", finite("targets", targets), (num_envs, len(self), 3))
+        wanted = spread("openings", finite("openings", openings), (num_envs, len(self)))
+        if np.any((wanted < 0) | (wanted > 1)):
+            raise ValueError(f"openings hold {wanted[(wanted < 0) | (wanted > 1)][0]}: must be from 0 to 1")
+        hands.move(slice(self._first, None), x)
+        hands.wanted[:, self._first :] = hands.layout.to_blocks(wanted, hands.x.dtype)
+
+    def place(self, positions: ArrayLike, envs: ArrayLike | None = None) -> None:
+        """Put tips somewhere at once [m], (len(envs), grippers, 3); what they hold stays where it is.
+
+        Raises:
+            ValueError: a wrong shape, or a value that is not finite.
+        """
+        layout = self._hands.layout
+        env = np.arange(layout.num_envs) if envs is None else indices("envs", envs, layout.num_envs, "this batch's environments")
+        x = spread("positions", finite("positions", positions), (len(env), len(self), 3))
+        self._hands.place(*layout.place(env), x)
+
+
+@kernel
+def count_held(holder, anchors, out):
+    """Particles in each gripper's hold, (blocks, grippers, lanes)."""
+    out[:] = 0
+    for b in range(holder.shape[0]):
+        for p in range(holder.shape[1]):
+            for l in range(holder.shape[2]):
+                k = holder[b, p, l] - anchors
+                if k >= 0:
+                    out[b, k, l] += 1
+
+
+@kernel
+def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+    """Begin a control step of one block: move fingers, take hold or let go, and set the velocity of what is held.
+
+    hand: moved on to where it is at the end of the step.  limits: (hands, 4).  anchors: how many of the hands have no fingers.
+    """
+    one = x.dtype.type(1)
+    zero = x.dtype.type(0)
+    lanes = x.shape[2]
+    move = np.empty((3, lanes), x.dtype)
+    for k in range(hand.shape[0]):
+        if k >= anchors:
+            step = limits[k, FINGER_STEP]
+            for l in range(lanes):
+                before = opening[k, l]
+                now = min(max(wanted[k, l], before - step), before + step)
+                opening[k, l] = now
+                if now > zero and before <= zero:
+                    for p in range(x.shape[0]):
+                        if holder[p, l] == k:
+                            holder[p, l] = FREE
+                            w[p, l] = free_w[p, l]
+                elif now <= zero and before > zero:
+                    for p in range(x.shape[0]):
+                        dx, dy, dz = x[p, 0, l] - hand[k, 0, l], x[p, 1, l] - hand[k, 1, l], x[p, 2, l] - hand[k, 2, l]
+                        near = dx * dx + dy * dy + dz * dz <= limits[k, REACH2]
+                        if near and holder[p, l] == FREE:
+                            holder[p, l] = k
+                            w[p, l] = zero
+        for l in range(lanes):
+            dx, dy, dz = targets[k, 0, l] - hand[k, 0, l], targets[k, 1, l] - hand[k, 1, l], targets[k, 2, l] - hand[k, 2, l]
+            speed = np.sqrt(dx * dx + dy * dy + dz * dz) / time_step
+            slow = one / (max(speed / limits[k, SPEED], one) * time_step)
+            move[0, l], move[1, l], move[2, l] = dx * slow, dy * slow, dz * slow
+        for c in range(3):
+            for l in range(lanes):
+                hand[k, c, l] += move[c, l] * time_step
+        for p in range(x.shape[0]):
+            for l in range(lanes):
+                if holder[p, l] == k:
+                    for c in range(3):
+                        v[p, c, l] = move[c, l]
+
+
+@kernel
+def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+    for b in range(first, last):
+        steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
+
+
+@kernel
+def add_pulls(first, last, x, v, free_w, springs, surface, fabric, holder, out):
+    """Force of the cloth on each hand [N], (blocks, hands, 3, lanes): springs, weight and air of the particles that it holds."""
+    stiffness, damping_time, _, resistance, gravity, wind = fabric
+    for b in range(first, last):
+        f = np.zeros(x.shape[1:], x.dtype)
+        row = np.empty((3, x.shape[3]), x.dtype)
+        add_spring_forces(x[b], v[b], f, springs, stiffness[b], damping_time[b], row)
+        add_air_forces(x[b], v[b], f, surface, resistance[b], wind[b], row)
+        out[b] = 0
+        for p in range(x.shape[1]):
+            for l in range(x.shape[3]):
+                k = holder[b, p, l]
+                if k >= 0:
+                    for c in range(3):
+                        out[b, k, c, l] += f[p, c, l] + gravity[b, c, l] / free_w[b, p, l]
+
+
+@kernel
+def let_slip(pull, holder, w, free_w, limits):
+    """Let go of what pulls harder than its gripper can hold."""
+    for b in range(holder.shape[0]):
+        for p in range(holder.shape[1]):
+            for l in range(holder.shape[2]):
+                k = holder[b, p, l]
+                if k >= 0:
+                    px, py, pz = pull[b, k, 0, l], pull[b, k, 1, l], pull[b, k, 2, l]
+                    if px * px + py * py + pz * pz > limits[k, SLIP2]:
+                        holder[b, p, l] = FREE
+                        w[b, p, l] = free_w[b, p, l]

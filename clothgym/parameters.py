@@ -1,0 +1,73 @@
+"""Floor 2: the material figures of each environment, and the rows that kernels read in their place."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import finite, spread
+from clothgym.material import Material, spring_stiffness
+from clothgym.mesh import ClothMesh
+
+AIR_DENSITY = 1.2  # [kg/m^3]
+FIGURES = (
+    "density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time",
+    "drag_coefficient", "skin_friction", "air_drag",
+)  # fmt: skip
+FIELDS = ("gravity", "wind")
+
+
+def of_material(material: Material) -> NDArray[np.float64]:
+    """A fabric's figures, in the order of ``FIGURES``."""
+    return np.array([getattr(material, name) for name in FIGURES])
+
+
+def changed(
+    material: Material, parameters: NDArray, changes: Mapping[str, Any]
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Environments' figures, (envs, figures), with some changed, and the fields among the changes, (envs, 3) each.
+
+    Raises:
+        ValueError: an unknown name, or a value that ``Material`` would not take.
+    """
+    parameters = parameters.copy()
+    fields: dict[str, NDArray[np.float64]] = {}
+    for name, value in changes.items():
+        if name in FIGURES:
+            values = spread(name, finite(name, value), (len(parameters),))
+            for one in np.unique(values):
+                replace(material, **{name: float(one)})  # type: ignore[arg-type]
+            parameters[:, FIGURES.index(name)] = values
+        elif name in FIELDS:
+            fields[name] = spread(name, finite(name, value), (len(parameters), 3))
+        else:
+            known = (*FIGURES, *FIELDS)
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"no parameter {name!r}{hint} (there are: {', '.join(known)})")
+    return parameters, fields
+
+
+def fabric_rows(mesh: ClothMesh, parameters: NDArray, air_density: float) -> dict[str, NDArray[np.float64]]:
+    """What becomes of figures, (envs, figures), on a mesh: rows of ``state.Fabric`` without the fields, (envs, ...).
+
+    Raises:
+        ValueError: no spring network on this mesh has these moduli.
+    """
+    density, stretch, shear, bend, damping_time, drag_coefficient, skin_friction, air_drag = parameters.T
+    return {
+        "stiffness": spring_stiffness(mesh, stretch, shear, bend).T,
+        "damping_time": damping_time,
+        "drag_rate": air_drag / density,
+        "resistance": np.stack([drag_coefficient, skin_friction], axis=1) * air_density / 2,
+    }
+
+
+def inverse_masses(mesh: ClothMesh, parameters: NDArray) -> NDArray[np.float64]:
+    """Of the particles, if nothing holds them [1/kg], (envs, particles)."""
+    return 1 / (parameters[:, FIGURES.index("density"), None] * mesh.area)

@@ -1,0 +1,67 @@
+"""Floor 1: steady wind and gusts, as a series of air velocities drawn from a generator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.checks import finite, number
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wind:
+    """What the air may do in an episode.
+
+    Attributes:
+        speed: range of the steady part's speed [m/s]; it blows horizontally.
+        direction: range of where it blows to, as an angle from the x axis [rad].
+        gust: root mean square of each of the gusts' three components [m/s].
+        gust_time: their correlation time [s].
+
+    Gusts are a first-order Markov process, ``u' = u r + sqrt(1 - r^2) gust xi`` with ``r = exp(-dt/gust_time)``: Dryden's
+    longitudinal turbulence (MIL-F-8785C, 3.7.1), of scale ``gust_time`` times the speed.
+
+    Raises:
+        ValueError: a range that is none, a speed or gust below zero, or a time that is not positive.
+    """
+
+    speed: Sequence[float] = (0.0, 0.0)
+    direction: Sequence[float] = (-np.pi, np.pi)
+    gust: float = 0.0
+    gust_time: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "direction"):
+            bounds = finite(f"wind {name}", getattr(self, name))
+            if bounds.shape != (2,) or bounds[0] > bounds[1]:
+                raise ValueError(f"wind {name}={getattr(self, name)!r}: must be a range [low, high]")
+        if self.speed[0] < 0:
+            raise ValueError(f"wind speed={self.speed!r}: must not be below zero; turn the direction instead")
+        if number("wind gust", self.gust) < 0:
+            raise ValueError(f"wind gust={self.gust!r}: must be zero or positive")
+        if number("wind gust_time", self.gust_time) <= 0:
+            raise ValueError(f"wind gust_time={self.gust_time!r}: must be positive")
+
+    def series(self, rng: np.random.Generator, steps: int, time_step: float) -> NDArray[np.float64]:
+        """Velocities of the air in successive control steps [m/s], (steps, 3): one steady wind, and gusts on it."""
+        speed, direction = rng.uniform(self.speed[0], self.speed[1]), rng.uniform(self.direction[0], self.direction[1])
+        noise = rng.standard_normal((steps, 3))
+        out = np.empty((steps, 3))
+        gusts(noise, self.gust, float(np.exp(-time_step / self.gust_time)), out)
+        return out + speed * np.array([np.cos(direction), np.sin(direction), 0.0])
+
+
+@kernel
+def gusts(noise, rms, keep, out):
+    """The process of the class, from its stationary distribution on."""
+    fresh = np.sqrt(1 - keep * keep)
+    for c in range(noise.shape[1]):
+        u = rms * noise[0, c]
+        out[0, c] = u
+        for step in range(1, noise.shape[0]):
+            u = keep * u + fresh * rms * noise[step, c]
+            out[step, c] = u
