@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-ENVIRONMENTS = {"ClothDrape-v0": "ClothDrape"}
+ENVIRONMENTS = {"ClothDrape-v0": "ClothDrape", "ClothReach-v0": "ClothReach"}
 
 
 def register() -> None:

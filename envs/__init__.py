@@ -5,8 +5,19 @@ if __name__ != "clothgym.envs":
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
 from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
+from clothgym.envs.episode import TaskState
+from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
-from clothgym.envs.task import Task, TaskState
+from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 
-__all__ = ["ClothDrapeEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothVectorEnv", "Task", "TaskState"]
+__all__ = [
+    "ClothDrapeEnv",
+    "ClothDrapeVectorEnv",
+    "ClothEnv",
+    "ClothReachEnv",
+    "ClothReachVectorEnv",
+    "ClothVectorEnv",
+    "Task",
+    "TaskState",
+]

@@ -12,7 +12,6 @@ from clothgym.envs.episode import TaskState
 from clothgym.envs.task import Task
 
 RENDER_MODES = ["rgb_array", "depth_array"]
-FRAMES_PER_SECOND = 30
 IMAGE_SIZE = 480
 
 
@@ -20,13 +19,14 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
     """Base of the single environments; a subclass names its ``Task``."""
 
     task_class: ClassVar[type[Task]]
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012 - Gymnasium's own
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30}  # noqa: RUF012 - Gymnasium's own
 
     def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
         check_render_mode(render_mode)
         self.render_mode = render_mode
         kwargs.setdefault("threads", 1)
         self.task = self.task_class(1, **kwargs)
+        self.metadata = self.metadata | {"render_fps": round(1 / self.task.physics.time_step)}
         self.observation_space = self.task.single_observation_space
         self.action_space = self.task.single_action_space
         self._renderer: Any = None

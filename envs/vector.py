@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import TaskState
-from clothgym.envs.single import FRAMES_PER_SECOND, RENDER_MODES, check_render_mode
+from clothgym.envs.single import RENDER_MODES, check_render_mode
 from clothgym.envs.task import Task
 
 IMAGE_SIZE = 240
@@ -45,7 +45,11 @@ class ClothVectorEnv(VectorEnv):
             raise ValueError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
         check_render_mode(render_mode)
         self.render_mode = render_mode
-        self.metadata = {"render_modes": RENDER_MODES, "render_fps": FRAMES_PER_SECOND, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            "render_modes": RENDER_MODES,
+            "render_fps": round(1 / self.task_class.physics.time_step),
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.task = self.task_class(int(num_envs), **kwargs)
         self.num_envs = int(num_envs)
         self.single_observation_space = self.task.single_observation_space

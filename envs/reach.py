@@ -1,0 +1,251 @@
+"""ClothReach-v0: bring the free corner of a hanging sheet to a point, by its opposite corner, and calm it there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import vector
+from clothgym.envs.measures import key_particles
+from clothgym.envs.physics import Physics
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.task import POSITION_BOUND, Task
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.material import Material
+from clothgym.mesh import grid
+from clothgym.simulation import Simulation
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera, Solid
+
+SIDE = 0.6  # L [m]
+SHEET = grid(9, 9, SIDE, SIDE)
+DRIVEN, FREE = SHEET.corners[2], SHEET.corners[1]  # opposite corners: the sheet hangs from the one, the other is lowest
+
+NEAR_ENOUGH, CALM_ENOUGH = 0.05, 0.1  # in sides, and sides a second
+CALM_SCALE = 0.2  # sides a second: performance is halved at this speed
+CLOSE_SCALE = 0.15  # in sides: how the potential rises near the goal
+LOW, HIGH = np.array([-0.8, -0.8, 0.9]), np.array([0.8, 0.8, 1.7])  # room of the driven corner [m]
+GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that room [m]
+GOAL = (90, 170, 110)  # colour of the goal's marker
+
+EXPERT_GAIN = 4.0  # how fast the scripted expert closes on the place above the goal [1/s]
+
+
+class ReachTask(Task):
+    """The task of ``ClothReach-v0``, see ``ClothReachEnv``."""
+
+    physics = Physics(
+        mesh=SHEET,
+        material=Material.preset("cotton", air_drag=0.72),
+        time_step=1 / 15,
+        integrator="semi_implicit_euler",
+        substeps=50,
+        hand_speed=0.5,
+        anchors=(DRIVEN,),
+        air_density=0.0,
+    )
+    acting_steps = 40
+    key_particles = key_particles(SHEET)
+    reset_options = ("material", "goal")
+
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
+        super().__init__(num_envs, **kwargs)
+        self.episode |= {"goal": np.zeros((num_envs, 3)), "distance": np.ones(num_envs)}
+
+    def _colliders(self) -> list:
+        return []  # the floor is out of reach
+
+    def _arena(self) -> tuple[NDArray, NDArray]:
+        return LOW, HIGH
+
+    # --- reset ----------------------------------------------------------------------------------------------------------
+
+    def _check_options(self, options: Mapping[str, Any]) -> None:
+        super()._check_options(options)
+        if "goal" in options:
+            goal = vector("reset option goal", options["goal"])
+            low, high = LOW + hanging()[FREE], HIGH + hanging()[FREE]
+            if np.any((goal < low) | (goal > high)):
+                raise ValueError(f"reset option goal={options['goal']!r}: the free corner can rest from {low} to {high} only")
+
+    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        middle = (LOW + HIGH) / 2
+        start = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
+        rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
+        goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
+        x = start + hanging() + rng.normal(scale=1e-3, size=hanging().shape)
+        self._place_goal(env, goal)
+        self.episode["distance"][env] = _length(x[FREE] - goal)
+        return x
+
+    def _place_goal(self, env: int, goal: NDArray) -> None:
+        self.episode["goal"][env] = goal
+        self._set_origin(env, goal)
+
+    def set_state(self, state: Any) -> None:
+        super().set_state(state)
+        for env, goal in enumerate(self.episode["goal"]):
+            self._place_goal(env, goal)
+
+    # --- what the agent sees --------------------------------------------------------------------------------------------
+
+    def _more_bounds(self) -> list[float]:
+        return [10 * POSITION_BOUND] * 3 + [1.0]
+
+    def _observe_more(self) -> list[NDArray]:
+        return [self._way() * (10 / SIDE), (1 - self.episode["step"] / self.acting_steps)[:, None]]
+
+    def _way(self) -> NDArray:
+        """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
+        return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
+
+    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
+
+    def _corner(self) -> tuple[NDArray, NDArray]:
+        """The free corner's vector to the goal [m] and velocity [m/s], (num_envs, 3) each."""
+        view, public = self.simulation.view, self.simulation.layout.to_public
+        return self.episode["goal"] - public(view.x[:, FREE]), public(view.v[:, FREE]).astype(np.float64)
+
+    def _nearer(self, away: NDArray) -> NDArray:
+        """How much of the way is done, in [0, 1]."""
+        return np.clip(1 - _length(away) / self.episode["distance"], 0, 1)
+
+    def _potential(self, summary: NDArray) -> NDArray:
+        away, velocity = self._corner()
+        close = 1 / (1 + (_length(away) / (CLOSE_SCALE * SIDE)) ** 2)
+        return (self._nearer(away) + close * _calm(velocity)) / 2
+
+    def _judgement(self) -> dict[str, NDArray]:
+        names = ("normalized_performance", "goal_distance", "corner_speed")
+        return {name: np.zeros(self.num_envs) for name in names} | {"is_success": np.zeros(self.num_envs, bool)}
+
+    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
+        away, velocity = self._corner()
+        distance, speed = _length(away)[envs] / SIDE, _length(velocity)[envs] / SIDE
+        return {
+            "normalized_performance": (self._nearer(away) * _calm(velocity))[envs],
+            "goal_distance": distance,
+            "corner_speed": speed,
+            "is_success": (distance <= NEAR_ENOUGH) & (speed < CALM_ENOUGH),
+        }
+
+    # --- expert and picture ---------------------------------------------------------------------------------------------
+
+    def expert_actions(self) -> NDArray:
+        """To the place from which the corner hangs in the goal, ever slower: the air calms the rest."""
+        return EXPERT_GAIN * self._way() / self.physics.hand_speed
+
+    def solids(self, env: int) -> list[Solid]:
+        return []
+
+    def markers(self, env: int) -> list[Any]:
+        return [*super().markers(env), (self.episode["goal"][env], GOAL)]
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera  # imported here: training draws nothing
+
+        return Camera(eye=(2.0, -2.3, 1.2), target=(0.0, 0.0, 0.85), vertical_fov=42.0)
+
+
+def _length(vectors: NDArray) -> NDArray:
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
+
+
+def _calm(velocity: NDArray) -> NDArray:
+    """1 at rest, 1/2 at CALM_SCALE."""
+    return 1 / (1 + (_length(velocity) / (CALM_SCALE * SIDE)) ** 2)
+
+
+@cache
+def hanging() -> NDArray:
+    """The sheet at rest under its driven corner, relative to it [m], (particles, 3): a strongly damped simulation's end."""
+    physics = ReachTask.physics
+    cloth = Simulation(
+        SHEET, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
+        anchors=physics.anchors, air_density=0, threads=1,
+    )  # fmt: skip
+    cloth.set_parameters(air_drag=1.0)
+    rest = SHEET.rest_positions
+    # the driven corner up, both wings turned to one side: so they come to hang, whatever they began with
+    along, across = (rest[:, 0] - rest[:, 1]) / np.sqrt(2), (rest[:, 0] + rest[:, 1]) / np.sqrt(2)
+    cloth.reset(positions=np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1))
+    cloth.step(480)
+    x = cloth.positions[0]
+    return x - x[DRIVEN]
+
+
+class ClothReachEnv(ClothEnv):
+    """Bring the free corner of a hanging sheet to a point where it can rest, and calm it there.
+
+    ## Description
+    A square cotton sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner.  The agent moves that corner; the
+    opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner, and calm, when
+    40 steps are over.  The task is for teaching and for tests: any learner solves it in a minute.
+
+    The id fixes the physics: 15 Hz control, ``semi_implicit_euler`` with 50 substeps, linear air drag of 0.72 N s/m3.
+
+    ## Action Space
+    ``Box(-1, 1, (3,))``: velocity x, y, z of the driven corner, scaled by 0.5 m/s; a vector longer than 1 is shortened.
+
+    ## Observation Space
+    ``Box`` of 58 numbers for ``obs_mode="keypoints"`` (and 6 x 81 + 4 for ``"particles"``, all particles row by row):
+
+    | Num | Observation | Bound |
+    | --- | --- | --- |
+    | 0-26 | 3 x 3 points of the sheet (corners, edge middles, centre) relative to the goal, in L | 4 |
+    | 27-53 | their velocities [m/s] | 5 |
+    | 54-56 | from the driven corner to the place from which the free one hangs in the goal, in L/10 | 40 |
+    | 57 | share of the time left | 1 |
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  With the free corner's distance d to the goal, d0 at the start, and its speed v, the potential on the
+    way is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``; at the end it is the normalised
+    performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+
+    ## Judgement
+    ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: 0 for doing
+    nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
+    ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``settling``, ``failure`` and ``reward_terms``.
+    What belongs to the judgement is 0 until then.
+
+    ## Starting State
+    The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
+    x 0.3 m; the sheet hangs at rest, with a ripple of a millimetre.
+
+    ## Episode End
+    Terminated when judged, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice
+    its rest length), "out_of_bounds" (the sheet's centre 0.5 m outside the room of the driven corner), "diverged" (not finite;
+    the last finite observation goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    | Argument | Default | Meaning |
+    | --- | --- | --- |
+    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``substeps`` | 50 | or ``"auto"`` |
+    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
+    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
+    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
+    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
+    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+
+    ``reset(options=...)`` takes ``"goal"``, three coordinates [m], and ``"material"``, a dict of figures for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = ReachTask
+
+
+class ClothReachVectorEnv(ClothVectorEnv):
+    """``ClothReach-v0`` as a batch, see ``ClothReachEnv``."""
+
+    task_class = ReachTask
