@@ -36,7 +36,7 @@ def coverage(solids: list[Target]) -> list[float]:
     mesh = grid(ROWS, ROWS, SIDE, SIDE)
     material = replace(Material.preset("cotton"), air_drag=1.0)
     colliders = [Plane(friction=FRICTION, thickness=THICKNESS), solids[0].collider(FRICTION, THICKNESS)]
-    simulation = Simulation(mesh, material, num_envs=len(solids), time_step=1 / 60, colliders=colliders)
+    simulation = Simulation(mesh, material, num_envs=len(solids), time_step=1 / 60, air_density=0, colliders=colliders)
     simulation.set_collider(1, [solid.collider(FRICTION, THICKNESS) for solid in solids])
     start = np.array([mesh.rest_positions + (0, 0, solid.height + 2 * THICKNESS) for solid in solids])
     simulation.reset(positions=start)

@@ -190,6 +190,12 @@ class Grippers:
         return self._hands.layout.to_public(self._hands.opening)[:, self._first :]
 
     @property
+    def holder(self) -> NDArray:
+        """Which gripper holds each particle, -1 if none does, (num_envs, particles)."""
+        holder = self._hands.layout.to_public(self._hands.holder)
+        return np.where(holder >= self._first, holder - self._first, -1)
+
+    @property
     def held(self) -> NDArray:
         """Number of particles in each gripper's hold, (num_envs, grippers)."""
         holder = self._hands.holder

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-ENVIRONMENTS = {"ClothDrape-v0": "ClothDrape", "ClothReach-v0": "ClothReach"}
+ENVIRONMENTS = {
+    "ClothReach-v0": "ClothReach",
+    "ClothDrape-v0": "ClothDrape",
+    "ClothDrapeGripper-v0": "ClothDrapeGripper",
+    "ClothStrain-v0": "ClothStrain",
+}
 
 
 def register() -> None:

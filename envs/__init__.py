@@ -5,18 +5,24 @@ if __name__ != "clothgym.envs":
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
 from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
+from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
+from clothgym.envs.strain import ClothStrainEnv, ClothStrainVectorEnv
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 
 __all__ = [
     "ClothDrapeEnv",
+    "ClothDrapeGripperEnv",
+    "ClothDrapeGripperVectorEnv",
     "ClothDrapeVectorEnv",
     "ClothEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
+    "ClothStrainEnv",
+    "ClothStrainVectorEnv",
     "ClothVectorEnv",
     "Task",
     "TaskState",

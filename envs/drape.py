@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,7 @@ class DrapeTask(Task):
     settling_steps = 40
     hand_actions = 4
     key_particles = key_particles(SHEET)
-    reset_options = ("material", "target")
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
@@ -137,7 +137,7 @@ class DrapeTask(Task):
         center = (self.simulation.layout.to_public(self._summary)[:, :3] - self._tops()) / SIDE
         return [
             center,
-            self.simulation.attached,
+            self._holds(),
             shape[:, None] == np.arange(len(SHAPES)),
             (radius / SIDE)[:, None],
             (height / SIDE)[:, None],
@@ -146,6 +146,10 @@ class DrapeTask(Task):
             (1 - episode["step"] / (self.acting_steps + self.settling_steps))[:, None],
             (np.maximum(self.acting_steps - episode["step"], 0) / self.acting_steps)[:, None],
         ]
+
+    def _holds(self) -> NDArray:
+        """Whether each hand holds the sheet, (num_envs, hands)."""
+        return self.simulation.attached
 
     def _tops(self) -> NDArray:
         return self.episode["target"][:, [3, 4, 2]]

@@ -8,11 +8,13 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym.hands import Gripper
 from clothgym.material import Material, spring_stiffness
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, FIGURES
+from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 
@@ -87,3 +89,15 @@ def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]
     for name, (low, high) in ranges.items():
         figures[name] = low if name == "density" else high
     return replace(material, **figures)  # type: ignore[arg-type]
+
+
+def settled(physics: Physics, start: NDArray, seconds: float) -> NDArray:
+    """The sheet of an id at rest under its anchors [m], (particles, 3): a strongly damped simulation in still air."""
+    cloth = Simulation(
+        physics.mesh, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
+        anchors=physics.anchors, air_density=0, threads=1,
+    )  # fmt: skip
+    cloth.set_parameters(air_drag=1.0)
+    cloth.reset(positions=start)
+    cloth.step(round(seconds / physics.time_step))
+    return cloth.positions[0].astype(np.float64)

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import vector
 from clothgym.envs.measures import key_particles
-from clothgym.envs.physics import Physics
+from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.task import POSITION_BOUND, Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
-from clothgym.simulation import Simulation
 
 if TYPE_CHECKING:
     from clothgym.render import Camera, Solid
@@ -51,7 +50,7 @@ class ReachTask(Task):
     )
     acting_steps = 40
     key_particles = key_particles(SHEET)
-    reset_options = ("material", "goal")
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
@@ -163,19 +162,11 @@ def _calm(velocity: NDArray) -> NDArray:
 
 @cache
 def hanging() -> NDArray:
-    """The sheet at rest under its driven corner, relative to it [m], (particles, 3): a strongly damped simulation's end."""
-    physics = ReachTask.physics
-    cloth = Simulation(
-        SHEET, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
-        anchors=physics.anchors, air_density=0, threads=1,
-    )  # fmt: skip
-    cloth.set_parameters(air_drag=1.0)
+    """The sheet at rest under its driven corner, relative to it [m], (particles, 3)."""
     rest = SHEET.rest_positions
     # the driven corner up, both wings turned to one side: so they come to hang, whatever they began with
     along, across = (rest[:, 0] - rest[:, 1]) / np.sqrt(2), (rest[:, 0] + rest[:, 1]) / np.sqrt(2)
-    cloth.reset(positions=np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1))
-    cloth.step(480)
-    x = cloth.positions[0]
+    x = settled(ReachTask.physics, np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
     return x - x[DRIVEN]
 
 

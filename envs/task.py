@@ -33,7 +33,7 @@ FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
 HELD = (250, 200, 60)  # colour of the anchors' markers
-POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides, and in m/s
+POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
 
 
 class Task(ABC):
@@ -59,6 +59,7 @@ class Task(ABC):
     hand_actions: ClassVar[int] = 3  # numbers for each hand: a velocity, and what comes after it
     key_particles: ClassVar[NDArray]  # those that are observed with obs_mode="keypoints"
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
+    position_bound: ClassVar[float] = POSITION_BOUND
     reset_options: ClassVar[tuple[str, ...]] = ("material",)
 
     def __init__(
@@ -148,12 +149,16 @@ class Task(ABC):
     def _potential(self, summary: NDArray) -> NDArray:
         """How far along each environment is, in [0, 1], (num_envs,); its change is the reward on the way."""
 
-    def _order(self, targets: NDArray) -> None:
+    def _order(self, targets: NDArray, moves: NDArray, acting: NDArray) -> None:
         """Tell the simulation where the hands are to be [m], (num_envs, hands, 3)."""
         self.simulation.move_anchors(targets)
 
     def _grip(self, moves: NDArray, acting: NDArray) -> None:  # noqa: B027 - some only move
         """Do what an action says beside where to move, after the step; all must have let go where the time for acting is up."""
+
+    def _account(self, running: NDArray, strain: NDArray) -> dict[str, NDArray]:
+        """What else ``info`` tells of a step, (num_envs,) each; strain: the largest of the structural springs', (num_envs,)."""
+        return {}
 
     def _done(self) -> NDArray:
         """Whether each environment's agent is done before its time is up, (num_envs,)."""
@@ -279,7 +284,9 @@ class Task(ABC):
         failure[~running] = 0
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
-        info: dict[str, Any] = dict(self._judgement())
+        with np.errstate(invalid="ignore"):
+            strain = np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf)
+        info: dict[str, Any] = {"strain_max": strain} | self._account(running, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
         terms = self._reward_terms(moves, acting, running, judged, failure, summary, info)
@@ -293,7 +300,6 @@ class Task(ABC):
         episode["over"] |= terminated
         info |= {
             "reward_terms": terms,
-            "strain_max": np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf),
             "settling": episode["settling_since"] >= 0,
             "failure": np.array(FAILURES)[failure],
         }
@@ -305,7 +311,7 @@ class Task(ABC):
         targets = self.episode["targets"]
         wanted = np.clip(targets + reach * within_ball(moves[:, :, :3]), low, high)
         self.episode["targets"] = np.where(acting[:, None, None], wanted, targets)
-        self._order(self.episode["targets"])
+        self._order(self.episode["targets"], moves, acting)
 
     def _summarize(self) -> NDArray:
         """Summary of the batch, (SUMMARY, num_envs) (see ``measures.summarize``)."""
@@ -325,10 +331,10 @@ class Task(ABC):
         judged: NDArray,
         failure: NDArray,
         summary: NDArray,
-        judgement: dict[str, Any],
+        info: dict[str, Any],
     ) -> dict[str, NDArray]:
         """Reward terms, (num_envs,) each: the potential's change, which ends at the judged performance, and small ones."""
-        performance = judgement["normalized_performance"]
+        performance = info["normalized_performance"]
         with np.errstate(invalid="ignore", over="ignore"):
             potential = np.where(judged, performance, np.where(failure > 0, 0.0, self._potential(summary)))
         previous = self.episode["potential"]
@@ -343,13 +349,13 @@ class Task(ABC):
         return {
             "progress": np.where(running, potential - previous, 0.0),
             "effort": -EFFORT_PRICE * effort * acting,
-            "success": SUCCESS_BONUS * (judgement["is_success"] & judged),
+            "success": SUCCESS_BONUS * (info["is_success"] & judged),
             "failure": -FAILURE_PENALTY * (failure > 0),
         }
 
     def _observation_bound(self) -> NDArray:
         points = 3 * len(self.particles)
-        return np.array([POSITION_BOUND] * points + [VELOCITY_BOUND] * points + self._more_bounds(), np.float32)
+        return np.array([self.position_bound] * points + [VELOCITY_BOUND] * points + self._more_bounds(), np.float32)
 
     def _clipped_observation(self) -> NDArray:
         """Points of the sheet relative to the origin, in sides, their velocities [m/s], and more; within the bounds."""

@@ -31,8 +31,12 @@ class Args:
 
     env: str = "ClothDrape-v0"
     """Id of the environment."""
-    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,PATH} ...")] = ("noop", "random", "expert")
-    """Policies: noop, random, expert, or the path of a run's folder."""
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,careless,PATH} ...")] = (
+        "noop",
+        "random",
+        "expert",
+    )
+    """Policies: noop, random, expert, careless (of ClothStrain-v0), or the path of a run's folder."""
     episodes: int = 500
     """Episodes for each policy."""
     seed: int = HELD_OUT
@@ -93,6 +97,11 @@ def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
         values = episodes[key].astype(float)
         half = 1.96 * values.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
         row[key], row[f"{key}_ci95"] = values.mean(), (values.mean() - half, values.mean() + half)
+    if "episode_cost" in episodes:
+        costs = episodes["episode_cost"].astype(float)
+        half = 1.96 * costs.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
+        row["cost"], row["cost_ci95"] = costs.mean(), (costs.mean() - half, costs.mean() + half)
+        row["safe_success_rate"] = float(episodes["is_safe_success"].mean())
     for failure in ("diverged", "torn", "out_of_bounds"):
         row[failure] = int((episodes["failure"] == failure).sum())
     row["mean_length"] = float(episodes["length"].mean())
@@ -101,7 +110,9 @@ def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
     """The scores as text, one policy a line."""
-    lines = [f"{'policy':<28} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}"]
+    costly = any("cost" in row for row in scores.values())
+    more = f" {'cost':>15} {'safe':>6}" if costly else ""
+    lines = [f"{'policy':<28} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}{more}"]
     for name, row in scores.items():
         low, high = row["success_rate_ci95"]
         spread = [(row[f"{key}_ci95"][1] - row[f"{key}_ci95"][0]) / 2 for key in ("normalized_performance", "return")]
@@ -109,6 +120,9 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
             f"{name:<28} {row['success_rate']:6.3f} [{low:.3f}, {high:.3f}] {row['normalized_performance']:8.3f} ± {spread[0]:.3f} "
             f"{row['return']:8.3f} ± {spread[1]:.3f} {row['torn']:6d} {row['diverged']:9d} {row['mean_length']:6.1f}"
         )
+        if costly:
+            half = (row["cost_ci95"][1] - row["cost_ci95"][0]) / 2
+            lines[-1] += f" {row['cost']:7.2f} ± {half:5.2f} {row['safe_success_rate']:6.3f}"
     return "\n".join(lines)
 
 

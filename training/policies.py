@@ -33,19 +33,28 @@ def expert(env: Any, observations: NDArray) -> NDArray:
     return env.expert_actions()
 
 
+def careless(env: Any, observations: NDArray) -> NDArray:
+    if not hasattr(env.unwrapped.task, "careless_actions"):
+        raise ValueError("careless: only ClothStrain-v0 has a careless expert")
+    return env.unwrapped.task.careless_actions().astype(np.float32)
+
+
 def random(seed: int) -> Policy:
     rng = np.random.default_rng(seed)
     return lambda env, observations: rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
 
 
+SCRIPTED: dict[str, Policy] = {"noop": noop, "expert": expert, "careless": careless}
+
+
 def named(name: str, env_id: str, seed: int) -> Policy:
-    """The policy called noop, random or expert, or the learnt one in the run's folder of that path.
+    """The policy called noop, random, expert or careless, or the learnt one in the run's folder of that path.
 
     Raises:
         FileNotFoundError, ValueError: no such policy, or a checkpoint of another environment or version.
     """
-    if name in ("noop", "expert"):
-        return {"noop": noop, "expert": expert}[name]
+    if name in SCRIPTED:
+        return SCRIPTED[name]
     if name == "random":
         return random(seed)
     return learnt(Path(name), env_id)
@@ -53,7 +62,7 @@ def named(name: str, env_id: str, seed: int) -> Policy:
 
 def env_kwargs(name: str) -> dict[str, Any]:
     """Keyword arguments of the environment that a learnt policy was trained on; none for the others."""
-    return {} if name in ("noop", "random", "expert") else dict(read_config(Path(name))["env_kwargs"])
+    return {} if name in (*SCRIPTED, "random") else dict(read_config(Path(name))["env_kwargs"])
 
 
 def read_config(folder: Path) -> dict[str, Any]:

@@ -2,22 +2,24 @@
 
     python training/train.py --env ClothDrape-v0                    # runs/ClothDrape-v0_0
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
+    python training/train.py --env ClothStrain-v0 --algo ppo_lagrange   # runs/ClothStrain-v0_ppo_lagrange_0
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
 
 The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
 (Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), evaluation.json (the final
 score, of best.pt), learning_curve.png, policy.gif, and the TensorBoard log.  Hyperparameters are read from
-hyperparams/ppo.yml, in the format of rl_zoo3.
+hyperparams/ALGO.yml, in the format of rl_zoo3.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import platform
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import evaluate
 import numpy as np
@@ -25,6 +27,7 @@ import policies
 import torch
 import tyro
 import yaml
+from lagrange import LagrangeMultiplier
 from report import draw_learning_curve, film
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -44,14 +47,16 @@ class Args:
     """Id of the environment."""
     seed: int = 0
     """Seed of the learner and of its environments."""
+    algo: Literal["ppo", "ppo_lagrange"] = "ppo"
+    """PPO, or PPO with a Lagrange multiplier on the episodes' cost."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
     run: Path | None = None
-    """Folder of the run; runs/ENV_SEED by default."""
+    """Folder of the run; runs/ENV_SEED by default, or runs/ENV_ALGO_SEED."""
     resume: Path | None = None
     """Folder of a run to go on with; its configuration is used."""
-    hyperparams: Path = HERE / "hyperparams" / "ppo.yml"
-    """Hyperparameters by environment id, in rl_zoo3's format."""
+    hyperparams: Path | None = None
+    """Hyperparameters by environment id, in rl_zoo3's format; hyperparams/ALGO.yml by default."""
     eval_episodes: int = 200
     """Held-out episodes of each evaluation on the way."""
     final_episodes: int = 500
@@ -76,7 +81,7 @@ class HeldOutEvaluation(BaseCallback):
         super().__init__()
         self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
         self.rollouts = 0
-        self.best = max((line["success_rate"] for line in _lines(folder)), default=-1.0)
+        self.best = max((_rank(line, config) for line in _lines(folder)), default=-math.inf)
         self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
         self.evaluating = 0.0
         self.started = time.perf_counter()
@@ -120,12 +125,14 @@ class HeldOutEvaluation(BaseCallback):
             "normalized_performance": float(episodes["normalized_performance"].mean()),
             "return": float(episodes["return"].mean()),
         }
-        if line["success_rate"] >= self.best:
-            self.best = line["success_rate"]
+        if "episode_cost" in episodes:
+            line["cost"] = float(episodes["episode_cost"].mean())
+        if _rank(line, self.config) >= self.best:
+            self.best = _rank(line, self.config)
             policies.save_checkpoint(self.folder, self.model, policies.BEST)
         with open(self.folder / "progress.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
-        for key in ("success_rate", "normalized_performance", "return"):
+        for key in line.keys() - {"timesteps", "training_seconds"}:
             self.logger.record(f"held_out/{key}", line[key])
         self.evaluating += time.perf_counter() - begun
 
@@ -139,13 +146,16 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         if args.timesteps is not None:
             config["timesteps"] = args.timesteps
         return args.resume, config
-    table = yaml.safe_load(args.hyperparams.read_text())
+    path = args.hyperparams or HERE / "hyperparams" / f"{args.algo}.yml"
+    table = yaml.safe_load(path.read_text())
     if args.env not in table:
-        raise ValueError(f"{args.hyperparams} has no hyperparameters for {args.env!r} (there are: {', '.join(table)})")
+        raise ValueError(f"{path} has no hyperparameters for {args.env!r} (there are: {', '.join(table)})")
     hyperparameters = dict(table[args.env])
     config = {
         "clothgym": clothgym.__version__,
         "env": args.env,
+        "algo": args.algo,
+        "lagrange": hyperparameters.pop("lagrange", {}),
         "env_kwargs": hyperparameters.pop("env_kwargs", {}),
         "num_envs": hyperparameters.pop("n_envs"),
         "timesteps": args.timesteps if args.timesteps is not None else int(hyperparameters["n_timesteps"]),
@@ -154,7 +164,8 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
         "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
     }
-    folder = args.run or Path("runs") / f"{args.env}_{args.seed}"
+    name = args.env if args.algo == "ppo" else f"{args.env}_{args.algo}"
+    folder = args.run or Path("runs") / f"{name}_{args.seed}"
     if (folder / policies.CHECKPOINT).exists():
         raise FileExistsError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
     folder.mkdir(parents=True, exist_ok=True)
@@ -187,6 +198,12 @@ def _linear(text: str) -> Any:
     return lambda remaining: start * remaining
 
 
+def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
+    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit."""
+    limit = config["lagrange"].get("cost_limit", math.inf)
+    return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
+
+
 def _lines(folder: Path) -> list[dict[str, float]]:
     path = folder / "progress.jsonl"
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
@@ -203,10 +220,15 @@ def train(args: Args) -> Path:
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
     per_rollout = config["num_envs"] * model.n_steps
     watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), args.eval_episodes)
+    callbacks: list[BaseCallback] = [watch]
+    if config["algo"] == "ppo_lagrange":
+        callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
     try:
         if config["timesteps"] > done:
             # learn() counts its steps on top of those done when the counter is not reset
-            model.learn(config["timesteps"] - done, callback=watch, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo")
+            model.learn(
+                config["timesteps"] - done, callback=callbacks, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo"
+            )
     except KeyboardInterrupt:
         policies.save_checkpoint(folder, model)
         raise SystemExit(f"interrupted: go on with  python training/train.py --resume {folder}") from None
@@ -220,7 +242,10 @@ def train(args: Args) -> Path:
 def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:
     """Final score beside the references, learning curve and film."""
     scores = {}
-    for name in ("noop", "random", "expert", str(folder)):
+    names = ["noop", "random", "expert", str(folder)]
+    if config["env"] == "ClothStrain-v0":
+        names.insert(3, "careless")
+    for name in names:
         policy = policies.named(name, config["env"], evaluate.HELD_OUT)
         seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + episodes))
         scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))

@@ -38,6 +38,7 @@ class Integrator:
             [s] that the method should be used with, and why, as a clause of a sentence.
         surely_allowed: the same arguments to a substep [s] that is certainly no larger than that, found quickly.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
+        limits_strain: whether it bounds the springs' stretch whatever the forces are.
         springs_by_particle: whether the result does not depend on the springs' order, so that the fastest one may be used.
     """
 
@@ -48,6 +49,7 @@ class Integrator:
     surely_allowed: Callable[[ClothMesh, NDArray, float, NDArray], float]
     safety: float
     springs_by_particle: bool
+    limits_strain: bool = False
 
     def automatic_substeps(self, time_step: float, largest: float) -> int:
         """Substeps of a control step [s] so that each is at most ``safety`` times the largest substep [s]."""

@@ -1,0 +1,59 @@
+"""The rumpled sheets with which ClothDrapeGripper-v0 may begin.
+
+    python benchmarks/rumpled_sheets.py            # writes envs/rumpled.npz, in a few seconds
+
+Sheets that lie flat are picked up at a random particle, carried some way and dropped, twice, and settle.  What is kept is in
+tenths of a millimetre, relative to the middle of the sheet on the floor.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from clothgym import Gripper, Plane, Simulation
+from clothgym.envs.drape import FRICTION, SHEET, SIDE, THICKNESS, DrapeTask
+
+COUNT, SEED = 64, 0
+BANK = Path(__file__).parent.parent / "envs" / "rumpled.npz"
+
+
+def pick_and_drop(simulation: Simulation, rng: np.random.Generator) -> None:
+    """Lift a particle of each sheet by 0.1 to 0.4 sides, carry it by up to 0.4 sides, and let go."""
+    x = simulation.positions
+    start = x[np.arange(COUNT), rng.integers(SHEET.num_particles, size=COUNT)]
+    simulation.grippers.place(start[:, None])
+    way = np.concatenate([rng.uniform(-0.4, 0.4, (COUNT, 2)), rng.uniform(0.1, 0.4, (COUNT, 1))], axis=1) * SIDE
+    for share, opening in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)):
+        for _ in range(20):
+            simulation.grippers.move((start + share * way)[:, None], np.full((COUNT, 1), opening))
+            simulation.step()
+    simulation.step(40)
+
+
+def main() -> None:
+    rng = np.random.default_rng(SEED)
+    physics = DrapeTask.physics
+    simulation = Simulation(
+        SHEET,
+        physics.material,
+        num_envs=COUNT,
+        time_step=physics.time_step,
+        substeps=physics.substeps,
+        air_density=physics.air_density,
+        colliders=[Plane(friction=FRICTION, thickness=THICKNESS)],
+        grippers=[Gripper(speed=0.5)],
+    )
+    simulation.reset(positions=SHEET.rest_positions + (0, 0, THICKNESS))
+    for _ in range(2):
+        pick_and_drop(simulation, rng)
+    x = simulation.positions
+    x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
+    print(f"highest particle: {x[:, :, 2].max() * 1000:.0f} mm, largest speed: {np.abs(simulation.velocities).max():.2f} m/s")
+    np.savez_compressed(BANK, positions=np.round(x * 1e4).astype(np.int16))
+    print(f"{BANK}: {BANK.stat().st_size / 1024:.0f} KiB")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,198 @@
+"""ClothDrapeGripper-v0: pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from importlib import resources
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.drape import EXPERT_SPEED, SHEET, SIDE, THICKNESS, DrapeTask
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.task import POSITION_BOUND
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.hands import Gripper
+
+REACH = 0.03  # of the fingers [m]
+CLOSES, OPENS = -0.2, 0.6  # actions below and above these give the fingers an order; between them they go on with the last
+PICKING = 0.2  # share of the potential that is for taking hold
+PICK_SCALE = 0.15 * SIDE  # how the potential rises as a gripper nears its place [m]
+# the particles that each gripper is to take: both corners of the edge at the target, or its middle
+PLACES = {1: (SHEET.corners[2] + SHEET.shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
+FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
+
+# the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
+# above it before it sets out
+EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
+
+
+class DrapeGripperTask(DrapeTask):
+    """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
+
+    acting_steps = 100
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
+
+    def __init__(self, num_envs: int, grippers: int = 2, slip_force: float | None = None, **kwargs: Any) -> None:
+        if grippers not in PLACES:
+            raise ValueError(f"grippers={grippers!r}: must be 1 or 2")
+        hand = Gripper(speed=2 * DrapeTask.physics.hand_speed, reach=REACH, slip_force=slip_force)
+        self.physics = replace(DrapeTask.physics, anchors=(), grippers=(hand,) * grippers)  # type: ignore[misc]
+        self.places = np.array(PLACES[grippers])
+        super().__init__(num_envs, **kwargs)
+        self.episode |= {
+            "wanted": np.ones((num_envs, grippers)),  # opening that the fingers were told
+            "picked": np.zeros((num_envs, grippers), bool),  # whether each place has ever been held
+            "holding": np.zeros((num_envs, grippers), bool),
+            "homes": np.zeros((num_envs, grippers, 3)),
+        }
+
+    # --- reset ----------------------------------------------------------------------------------------------------------
+
+    def _check_options(self, options: Mapping[str, Any]) -> None:
+        super()._check_options(options)
+        if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
+            raise ValueError(f"reset option rumpled={options['rumpled']!r}: must be True or False")
+
+    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        target = self._draw_target(rng, options.get("target", {}))
+        self._place_target(env, target)
+        gap, sideways, yaw = SIDE * rng.uniform(0.05, 0.15), SIDE * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
+        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(_rumpled())))
+        x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, THICKNESS)
+        c, s = np.cos(yaw), np.sin(yaw)
+        x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
+        # before the target, whose half width is at most sqrt(2) radii
+        edge = target.center[1] - np.sqrt(2) * target.radius - gap
+        x += (target.center[0] + sideways, edge - x[:, 1].max(), 0)
+        x[:, 2] += np.abs(rng.normal(scale=1e-4, size=len(x)))
+        count = len(self.places)
+        away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
+        self.episode["homes"][env] = x[self.places] + SIDE * away
+        self.episode["wanted"][env] = 1
+        self.episode["picked"][env] = False
+        self.episode["holding"][env] = False
+        return x
+
+    def _place_hands(self, envs: NDArray) -> None:
+        self.simulation.grippers.place(self.episode["homes"][envs], envs)
+
+    # --- gripping -------------------------------------------------------------------------------------------------------
+
+    def _order(self, targets: NDArray, moves: NDArray, acting: NDArray) -> None:
+        """Fingers do what the action says last, and open when time is up."""
+        order = moves[:, :, 3]
+        told = np.where(order < CLOSES, 0.0, np.where(order > OPENS, 1.0, self.episode["wanted"]))
+        self.episode["wanted"] = np.where(acting[:, None], told, 1.0)
+        self.simulation.grippers.move(targets, self.episode["wanted"])
+
+    def _grip(self, moves: NDArray, acting: NDArray) -> None:
+        """See who holds what."""
+        holder = self.simulation.grippers.holder[:, self.places]
+        self.episode["holding"] = self.simulation.grippers.held > 0
+        self.episode["picked"] |= holder >= 0  # one gripper may have taken two corners that lay together
+
+    def _done(self) -> NDArray:
+        """Never before its time is up: it may take hold anew."""
+        return np.zeros(self.num_envs, bool)
+
+    # --- what the agent sees --------------------------------------------------------------------------------------------
+
+    def _holds(self) -> NDArray:
+        return self.episode["holding"]
+
+    def _more_bounds(self) -> list[float]:
+        return [*super()._more_bounds(), *([POSITION_BOUND] * 3 + [10 * POSITION_BOUND] * 3 + [1.0]) * self.num_hands]
+
+    def _observe_more(self) -> list[NDArray]:
+        hands = self.simulation.grippers.positions
+        from_top = (hands - self._tops()[:, None]) / SIDE
+        to_place = self._to_places(hands) * (10 / SIDE)
+        openings = self.simulation.grippers.openings[:, :, None]
+        mine = np.concatenate([from_top, to_place, openings], axis=2).reshape(self.num_envs, 7 * self.num_hands)
+        return [*super()._observe_more(), mine]
+
+    def _to_places(self, hands: NDArray) -> NDArray:
+        """From each gripper to the particle that it is to take [m], (num_envs, grippers, 3)."""
+        return self.simulation.layout.to_public(self.simulation.view.x[:, self.places]) - hands
+
+    # --- how it is rewarded ---------------------------------------------------------------------------------------------
+
+    def _potential(self, summary: NDArray) -> NDArray:
+        away = self._to_places(self.simulation.grippers.positions).astype(np.float64)
+        near = 1 / (1 + (away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2) / PICK_SCALE**2)
+        taken = np.where(self.episode["picked"], 1.0, near / 2)
+        share = taken[:, 0] if self.num_hands == 1 else (taken[:, 0] + taken[:, 1]) / 2
+        return PICKING * share + (1 - PICKING) * super()._potential(summary)
+
+    # --- expert and picture ---------------------------------------------------------------------------------------------
+
+    def expert_actions(self) -> NDArray:
+        """To the corners, close, up, over the target and a quarter of a side beyond it, down, open, and away.
+
+        Without memory: where the hands are, and what they hold, says which part of the way they are on.
+        """
+        episode, hands = self.episode, self.simulation.grippers.positions.astype(np.float64)
+        tops = self._tops()[:, None]
+        to_place = self._to_places(hands).astype(np.float64)
+        own = self.simulation.grippers.holder[:, self.places] >= 0
+        ready = np.logical_and.reduce(own, axis=1, keepdims=True)
+        begun = np.logical_and.reduce(episode["picked"], axis=1, keepdims=True)
+
+        # over the target, both at the height of the lower one's way, as far apart as the corners are at rest
+        beyond = tops[..., 1] + EXPERT_BEYOND * SIDE
+        low = np.maximum(tops[..., 2] - EXPERT_DROP * SIDE, 0.02)
+        arrived = np.abs(hands[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
+        lift = tops[..., 2] + EXPERT_LIFT * SIDE
+        high = hands[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * SIDE
+        goal = np.empty_like(hands)
+        goal[..., 0] = tops[..., 0] + SHEET.rest_positions[self.places, 0]
+        goal[..., 1] = np.where(high | arrived, beyond, hands[..., 1])
+        goal[..., 2] = np.where(arrived, low, lift)
+        carry = (goal - hands) / 2
+        down = arrived & (np.abs(hands[..., 2] - low) < 0.03)
+
+        # half of the way in each step, as far as the speed goes
+        move = np.where(ready[..., None], carry, np.where((begun & ~ready)[..., None], (0.0, 0.0, 0.1), to_place / 2))
+        move = np.where((own & ~ready)[..., None], 0.0, move)
+        move /= self.physics.time_step * self.physics.hand_speed
+        length = np.sqrt(move[..., 0] ** 2 + move[..., 1] ** 2 + move[..., 2] ** 2)
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[..., None]
+        near = to_place[..., 0] ** 2 + to_place[..., 1] ** 2 + to_place[..., 2] ** 2 < (REACH / 2) ** 2
+        grip = np.where(begun & (down | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
+        return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
+
+    def markers(self, env: int) -> list[Any]:
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        solids = []
+        for hand in range(self.num_hands):
+            x, y, z = self.simulation.grippers.positions[env, hand].tolist()
+            opening = 0.0 if self.episode["holding"][env, hand] else float(self.simulation.grippers.openings[env, hand])
+            half = 0.006 + opening * self.physics.grippers[hand].span / 2
+            for finger in (x - half, x + half):
+                solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))
+            solids.append(Solid(kind="box", center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012), color=PALM))
+        return solids
+
+
+@cache
+def _rumpled() -> NDArray:
+    """Sheets that were picked up and dropped (``benchmarks/rumpled_sheets.py``), about the origin [m], (sheets, particles, 3)."""
+    with resources.as_file(resources.files("clothgym.envs").joinpath("rumpled.npz")) as path, np.load(path) as file:
+        return file["positions"] * 1e-4
+
+
+class ClothDrapeGripperEnv(ClothEnv):
+    """TODO"""
+
+    task_class = DrapeGripperTask
+
+
+class ClothDrapeGripperVectorEnv(ClothVectorEnv):
+    """``ClothDrapeGripper-v0`` as a batch, see ``ClothDrapeGripperEnv``."""
+
+    task_class = DrapeGripperTask

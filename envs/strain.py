@@ -1,0 +1,353 @@
+"""ClothStrain-v0: carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym import _jit, integrators
+from clothgym.checks import number, positive
+from clothgym.collisions import Capsule
+from clothgym.envs.measures import FINITE, STRETCH2, key_particles, stretch_quantile
+from clothgym.envs.physics import Physics, settled
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.task import Task
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.material import Material
+from clothgym.mesh import grid
+from clothgym.wind import Wind
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera, Solid
+
+SIDE = 0.3  # L [m]
+ROWS = 13
+SHEET = grid(ROWS, ROWS, SIDE, SIDE)
+FABRIC = Material.preset("knit", damping_time=1e-3)
+WEIGHT = FABRIC.density * SIDE**2 * 9.81  # [N]
+
+
+def _clip(columns: range) -> tuple[int, ...]:
+    """A clip at a corner: 3 x 2 particles of the upper edge, the corner first."""
+    return tuple(row * ROWS + column for row in (ROWS - 1, ROWS - 2) for column in columns)
+
+
+CLIPS = (_clip(range(3)), _clip(range(ROWS - 1, ROWS - 4, -1)))
+
+POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
+FRICTION = 0.3
+CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first way-point [m]
+WAYPOINTS = 3  # beside the post, beyond it, and the goal
+PASSED, ARRIVED = 0.1, 0.15 * SIDE  # mean distance of the clips from a way-point; of the farther clip from the goal [m]
+LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # room of the clips [m]
+MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
+FAR = 10.0  # bound of observed distances, in sides
+
+# the careful expert: its speed, and how fast that may change [m/s, m/s^2]
+CAREFUL_SPEED, CAREFUL_ACCELERATION = 0.5, 2.0
+
+WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colours of the markers
+
+
+class StrainTask(Task):
+    """The task of ``ClothStrain-v0``, see ``ClothStrainEnv``."""
+
+    physics = Physics(
+        mesh=SHEET,
+        material=FABRIC,
+        time_step=1 / 30,
+        integrator="semi_implicit_euler",
+        substeps=35,
+        hand_speed=1.0,
+        anchors=CLIPS,
+        wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
+    )
+    acting_steps = 150
+    key_particles = key_particles(SHEET)
+    position_bound = FAR
+
+    def __init__(
+        self,
+        num_envs: int,
+        threshold: float = 0.10,
+        cost_penalty: float = 0.0,
+        strain_limit: float | None = None,
+        integrator: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if strain_limit is not None or integrators.get(integrator or self.physics.integrator).limits_strain:
+            what = f"strain_limit={strain_limit!r}" if strain_limit is not None else f"integrator={integrator!r}"
+            raise ValueError(
+                f"{what}: a limiter would keep the strain below the threshold whatever the agent does, and the task would be "
+                "empty; take an integrator without one"
+            )
+        self.threshold = positive("threshold", threshold)
+        self.cost_penalty = checked_penalty(cost_penalty)
+        super().__init__(num_envs, integrator=integrator, **kwargs)
+        self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
+        layout = self.simulation.layout
+        self._stretch = np.zeros((layout.blocks, layout.lanes), np.float32)
+        self.episode |= {
+            "post": np.zeros((num_envs, 2)),
+            "places": np.zeros((num_envs, WAYPOINTS, 2, 3)),  # where each clip is to be [m]
+            "next": np.zeros(num_envs, np.int64),
+            "way": np.ones(num_envs),  # its length [m]
+            "strain_p95": np.zeros(num_envs),
+            "tension": np.zeros((num_envs, 2)),
+            "episode_cost": np.zeros(num_envs),
+        }
+
+    def _colliders(self) -> list:
+        return [_post(0.0, 0.0)]
+
+    def _arena(self) -> tuple[NDArray, NDArray]:
+        return LOW, HIGH
+
+    # --- reset ----------------------------------------------------------------------------------------------------------
+
+    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        post = rng.uniform(-0.1, 0.1, 2)
+        side = 1 if rng.uniform() < 0.5 else -1
+        middles = np.array(
+            [
+                [-0.65, 0.0, 1.05] + rng.uniform(-1, 1, 3) * (0.1, 0.1, 0.05),
+                [post[0], post[1] + side * CLEARANCE, 1.05 + rng.uniform(-0.1, 0.1)],
+                [0.35, post[1] + side * rng.uniform(0.1, 0.3), 1.05 + rng.uniform(-0.2, 0.2)],
+                [0.7, 0.0, 1.05] + rng.uniform(-1, 1, 3) * (0.1, 0.3, 0.2),
+            ]
+        )
+        yaws = np.array([0.0, 0.0, *rng.uniform(-MOST_YAW, MOST_YAW, 2)])
+        # the held edge lies across the way; between the corners it is as long as at rest
+        half = SIDE / 2 * np.stack([-np.sin(yaws), np.cos(yaws), np.zeros(4)], axis=1)
+        clips = np.stack([middles + half, middles - half], axis=1)
+        self._place_post(env, post)
+        episode = self.episode
+        episode["places"][env] = clips[1:]
+        episode["next"][env] = 0
+        episode["episode_cost"][env] = 0
+        episode["way"][env] = np.linalg.norm(np.diff(clips, axis=0), axis=2).mean(axis=1).sum()
+        ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
+        ripple[[particle for clip in CLIPS for particle in clip]] = 0
+        x = middles[0] + hanging()
+        x[:, 0] += ripple
+        return x
+
+    def _place_post(self, env: int, post: NDArray) -> None:
+        self.posts[env] = _post(*post.tolist())
+        self.episode["post"][env] = post
+        self.simulation.set_collider(0, [self.posts[env]], np.array([env]))
+
+    def set_state(self, state: Any) -> None:
+        super().set_state(state)
+        for env, post in enumerate(self.episode["post"]):
+            self._place_post(env, post)
+
+    # --- what the agent sees --------------------------------------------------------------------------------------------
+
+    def _more_bounds(self) -> list[float]:
+        return [5 * FAR] * 6 + [FAR] * 6 + [1.0] + [FAR] * 2 + [20.0] * 3 + [20.0] * 4 + [1.0, 1.0]
+
+    def _observe_more(self) -> list[NDArray]:
+        episode, strain = self.episode, self._strain_max()
+        everyone, following = np.arange(self.num_envs), np.minimum(episode["next"] + 1, WAYPOINTS - 1)
+        clips = self.simulation.hand_positions
+        wind = self.episode["wind"]
+        now = np.minimum(episode["step"], wind.shape[1] - 1)
+        return [
+            ((episode["places"][everyone, episode["next"]] - clips) * (5 / SIDE)).reshape(self.num_envs, 6),
+            ((episode["places"][everyone, following] - clips) / SIDE).reshape(self.num_envs, 6),
+            (episode["next"] == WAYPOINTS - 1)[:, None],
+            (episode["post"] - clips.mean(axis=1)[:, :2]) / SIDE,
+            wind[everyone, now] if wind.shape[1] else np.zeros((self.num_envs, 3)),
+            (strain / self.threshold)[:, None],
+            (episode["strain_p95"] / self.threshold)[:, None],
+            episode["tension"] / WEIGHT,
+            np.full((self.num_envs, 1), self.threshold),
+            (1 - episode["step"] / self.acting_steps)[:, None],
+        ]
+
+    # --- the way --------------------------------------------------------------------------------------------------------
+
+    def _to_places(self, waypoint: NDArray) -> NDArray:
+        """Distance of each clip from its place at a way-point [m], (num_envs, 2)."""
+        places = self.episode["places"][np.arange(self.num_envs), waypoint]
+        return _length(places - self.simulation.hand_positions)
+
+    def _grip(self, moves: NDArray, acting: NDArray) -> None:
+        """Nothing is gripped; way-points that the clips have passed are ticked off, and the sheet is measured."""
+        episode = self.episode
+        passed = acting & (episode["next"] < WAYPOINTS - 1) & (self._to_places(episode["next"]).mean(axis=1) < PASSED)
+        episode["next"] += passed
+        self._measure()
+
+    def _measure(self) -> None:
+        simulation, episode = self.simulation, self.episode
+        view = simulation.view
+
+        def work(first: int, last: int) -> None:
+            stretch_quantile(first, last, view.x, view.springs, self._structural, 0.95, self._stretch)
+
+        _jit.run_spans(work, len(self._stretch), self.threads)
+        episode["strain_p95"] = simulation.layout.to_public(self._stretch).astype(np.float64) - 1
+        episode["tension"] = _length(simulation.pulls().astype(np.float64))
+        middle = episode["places"][np.arange(self.num_envs), episode["next"]].mean(axis=1)
+        self._origin = simulation.layout.to_blocks(middle, np.dtype(np.float32))
+
+    def _place_hands(self, envs: NDArray) -> None:
+        self._measure()
+
+    def _done(self) -> NDArray:
+        """Arrived: both clips are in their places at the goal."""
+        at_goal = self.episode["next"] == WAYPOINTS - 1
+        return at_goal & np.all(self._to_places(self.episode["next"]) < ARRIVED, axis=1)
+
+    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
+
+    def _strain_max(self) -> NDArray:
+        summary = self.simulation.layout.to_public(self._summary).T
+        with np.errstate(invalid="ignore"):
+            return np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf).astype(np.float64)
+
+    def _potential(self, summary: NDArray) -> NDArray:
+        """Share of the way that lies behind the clips."""
+        episode = self.episode
+        legs = _length(np.diff(episode["places"], axis=1)).mean(axis=2)
+        ahead = np.where(np.arange(WAYPOINTS - 1) >= episode["next"][:, None], legs, 0.0)
+        left = self._to_places(episode["next"]).mean(axis=1)
+        for leg in ahead.T:
+            left = left + leg
+        return np.clip(1 - left / episode["way"], 0, 1)
+
+    def _judgement(self) -> dict[str, NDArray]:
+        return {
+            "normalized_performance": np.zeros(self.num_envs),
+            "is_success": np.zeros(self.num_envs, bool),
+            "is_safe_success": np.zeros(self.num_envs, bool),
+        }
+
+    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
+        arrived = self._done()[envs]
+        return {
+            "normalized_performance": np.where(arrived, 1.0, self._potential(summary)[envs]),
+            "is_success": arrived,
+            "is_safe_success": arrived & (self.episode["episode_cost"][envs] == 0),
+        }
+
+    def _account(self, running: NDArray, strain: NDArray) -> dict[str, NDArray]:
+        cost = (running & (strain > self.threshold)).astype(np.float64)
+        self.episode["episode_cost"] += cost
+        return {
+            "cost": cost,
+            "episode_cost": self.episode["episode_cost"].copy(),
+            "strain_excess": np.maximum(strain - self.threshold, 0),
+            "strain_p95": self.episode["strain_p95"].copy(),
+            "tension_left": self.episode["tension"][:, 0].copy(),
+            "tension_right": self.episode["tension"][:, 1].copy(),
+        }
+
+    def _reward_terms(self, *args: Any) -> dict[str, NDArray]:
+        return super()._reward_terms(*args) | {"cost": -self.cost_penalty * args[-1]["cost"]}
+
+    # --- experts and picture --------------------------------------------------------------------------------------------
+
+    def expert_actions(self) -> NDArray:
+        """As a rigid pair, slowly: a bounded speed and a bounded change of it, the turn spread over each leg of the way."""
+        clips, episode = self.simulation.hand_positions.astype(np.float64), self.episode
+        view, public = self.simulation.view, self.simulation.layout.to_public
+        velocity = np.stack([public(view.v[:, clip[0]]) for clip in CLIPS], axis=1).astype(np.float64)
+        places = episode["places"][np.arange(self.num_envs), episode["next"]]
+        middle, moving = clips.mean(axis=1), velocity.mean(axis=1)
+        away = places.mean(axis=1) - middle
+        distance = _length(away)
+        slowing = np.where(episode["next"] == WAYPOINTS - 1, np.sqrt(CAREFUL_ACCELERATION * distance), CAREFUL_SPEED)
+        speed = np.minimum(CAREFUL_SPEED, slowing)
+        change = away * (speed / np.maximum(distance, 1e-9))[:, None] - moving
+        dt = self.physics.time_step
+        change *= np.minimum(1, CAREFUL_ACCELERATION * dt / np.maximum(_length(change), 1e-9))[:, None]
+        # the held edge turns on the way, and is always as long as at rest
+        yaw, wanted = (_yaw(pair[:, 0] - pair[:, 1]) for pair in (clips, places))
+        left = np.arctan2(np.sin(wanted - yaw), np.cos(wanted - yaw))
+        turn = yaw + left * np.minimum(1, dt / np.maximum(distance / CAREFUL_SPEED, 4 * dt))
+        half = SIDE / 2 * np.stack([np.cos(turn), np.sin(turn), np.zeros(self.num_envs)], axis=1)
+        there = middle + (moving + change) * dt
+        goal = np.stack([there + half, there - half], axis=1)
+        return ((goal - clips) / (dt * self.physics.hand_speed)).reshape(self.num_envs, 6)
+
+    def careless_actions(self) -> NDArray:
+        """Each clip straight to its place, as fast as it can."""
+        away = self.episode["places"][np.arange(self.num_envs), self.episode["next"]] - self.simulation.hand_positions
+        reach = self.physics.hand_speed * self.physics.time_step
+        return (away / np.maximum(_length(away), reach)[..., None]).reshape(self.num_envs, 6)
+
+    def solids(self, env: int) -> list[Solid]:
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        post = self.posts[env]
+        return [Solid(kind="capsule", center=post.center, radius=post.radius, height=post.height)]
+
+    def markers(self, env: int) -> list[Any]:
+        places, following = self.episode["places"][env], int(self.episode["next"][env])
+        colours = [WAYPOINT] * (WAYPOINTS - 1) + [GOAL]
+        ahead = [(x, colours[k]) for k in range(following, WAYPOINTS) for x in places[k]]
+        return [*super().markers(env), *ahead]
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera  # imported here: training draws nothing
+
+        return Camera(eye=(0.6, -2.6, 1.9), target=(0.0, 0.0, 0.8), vertical_fov=40.0)
+
+
+def checked_penalty(value: float) -> float:
+    if number("cost_penalty", value) < 0:
+        raise ValueError(f"cost_penalty={value!r}: must be zero or positive")
+    return float(value)
+
+
+def _post(x: float, y: float) -> Capsule:
+    # sunk, so that its lower end is flat where it stands
+    return Capsule(center=(x, y, POST_HEIGHT / 2 - POST_RADIUS), radius=POST_RADIUS, height=POST_HEIGHT, friction=FRICTION)
+
+
+def _length(vectors: NDArray) -> NDArray:
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
+
+
+def _yaw(vectors: NDArray) -> NDArray:
+    return np.arctan2(vectors[:, 1], vectors[:, 0])
+
+
+@cache
+def _hanging() -> NDArray:
+    rest = SHEET.rest_positions
+    return settled(StrainTask.physics, np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1), seconds=8)
+
+
+def hanging() -> NDArray:
+    """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3)."""
+    return _hanging().copy()
+
+
+class ClothStrainEnv(ClothEnv):
+    """TODO"""
+
+    task_class = StrainTask
+
+
+class ClothStrainVectorEnv(ClothVectorEnv):
+    """``ClothStrain-v0`` as a batch, see ``ClothStrainEnv``."""
+
+    task_class = StrainTask
+    task: StrainTask
+
+    @property
+    def cost_penalty(self) -> float:
+        """What a step beyond the threshold takes from the reward; may be set at any time, as a Lagrange multiplier is."""
+        return self.task.cost_penalty
+
+    @cost_penalty.setter
+    def cost_penalty(self, value: float) -> None:
+        self.task.cost_penalty = checked_penalty(value)
