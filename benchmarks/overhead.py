@@ -1,12 +1,14 @@
 """What everything that is not physics costs: observation, reward, judgement, resets and the Stable-Baselines3 adapter.
 
-    python benchmarks/overhead.py            # prints, and writes benchmarks/results/overhead.json
+    python benchmarks/overhead.py                    # prints, and writes benchmarks/results/overhead.json
+    python benchmarks/overhead.py ClothDrape-v0      # some environments only: prints
 
 One thread; random actions over whole episodes, resets included.  The time inside ``Simulation.step`` is taken off.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import time
 from pathlib import Path
@@ -16,10 +18,10 @@ import numpy as np
 
 from clothgym.adapters.sb3 import make_sb3_vec_env
 from clothgym.bench import machine
+from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
 
 RESULTS = Path(__file__).parent / "results" / "overhead.json"
-ENV = "ClothDrape-v0"
 
 
 class Stopwatch:
@@ -36,13 +38,13 @@ class Stopwatch:
         self.seconds += time.perf_counter() - begun
 
 
-def batch(num_envs: int, steps: int) -> tuple[float, float]:
+def batch(env_id: str, num_envs: int, steps: int) -> tuple[float, float]:
     """Microseconds per environment step: beside the physics, and of the physics."""
-    env = make_sb3_vec_env(ENV, num_envs, seed=0, threads=1)
+    env = make_sb3_vec_env(env_id, num_envs, seed=0, threads=1)
     rng = np.random.default_rng(0)
     env.reset()
-    # a release in a hundred, so that the episodes' ends spread over time
-    actions = rng.uniform(-1, 0.81, (steps, num_envs, 8)).astype(np.float32)
+    # where an action lets go, it does in a step of a hundred, so that the episodes' ends spread over time
+    actions = rng.uniform(-1, 0.81, (steps, num_envs, *env.action_space.shape)).astype(np.float32)
     for action in actions[:110]:
         env.step(action)
     watch = Stopwatch(env.env.task.simulation)
@@ -54,14 +56,14 @@ def batch(num_envs: int, steps: int) -> tuple[float, float]:
     return (total - watch.seconds) * per_step, watch.seconds * per_step
 
 
-def single(steps: int) -> tuple[float, float]:
+def single(env_id: str, steps: int) -> tuple[float, float]:
     """The same for ``gym.make``."""
-    env = gym.make(f"clothgym:{ENV}")
+    env = gym.make(f"clothgym:{env_id}")
     rng = np.random.default_rng(0)
     env.reset(seed=0)
-    env.step(np.zeros(8, np.float32))
+    env.step(np.zeros(env.action_space.shape, np.float32))
     watch = Stopwatch(env.unwrapped.task.simulation)
-    actions = rng.uniform(-1, 0.81, (steps, 8)).astype(np.float32)
+    actions = rng.uniform(-1, 0.81, (steps, *env.action_space.shape)).astype(np.float32)
     begun = time.perf_counter()
     for action in actions:
         if env.step(action)[2]:
@@ -71,13 +73,19 @@ def single(steps: int) -> tuple[float, float]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description="What everything that is not physics costs.")
+    parser.add_argument("ids", nargs="*", choices=[*ENVIRONMENTS, []], metavar="ID", help="environments; all by default")
+    chosen = parser.parse_args().ids
     rows = []
-    for envs, measure in ((1, lambda: single(1500)), (64, lambda: batch(64, 250)), (256, lambda: batch(256, 250))):
-        beside, physics = np.median([measure() for _ in range(3)], axis=0)
-        rows.append({"envs": envs, "beside physics [us]": round(float(beside), 2), "physics [us]": round(float(physics), 2)})
-        print(f"{envs:4d} environments: {beside:7.1f} us beside the physics, {physics:7.1f} us of physics, per environment step")
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"machine": machine(), "environment": ENV, "rows": rows}, indent=1) + "\n")
+    for env_id in chosen or ENVIRONMENTS:
+        for envs in (1, 64, 256):
+            measured = [single(env_id, 1500) if envs == 1 else batch(env_id, envs, 250) for _ in range(3)]
+            beside, physics = (round(float(value), 2) for value in np.median(measured, axis=0))
+            rows.append({"environment": env_id, "envs": envs, "beside physics [us]": beside, "physics [us]": physics})
+            print(f"{env_id}, {envs:4d}: {beside:7.1f} us beside the physics, {physics:7.1f} us of physics, per environment step")
+    if not chosen:
+        RESULTS.parent.mkdir(exist_ok=True)
+        RESULTS.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

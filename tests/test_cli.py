@@ -1,22 +1,40 @@
 """The command line."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
-from clothgym import bench
+from clothgym import INTEGRATORS, bench
 from clothgym.cli import main
+from clothgym.registration import ENVIRONMENTS
 
 
 def test_list_names_what_there_is(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
-    assert all(name in out for name in ("ClothDrape-v0", "semi_implicit_euler", "xpbd", "cotton"))
+    assert all(name in out for name in (*ENVIRONMENTS, *INTEGRATORS, "cotton"))
 
 
 def test_warmup_says_when_it_is_done(capsys):
     assert main(["warmup"]) == 0
     assert "all kernels are ready" in capsys.readouterr().out
+    # and a process that comes after it finds every kernel of every environment
+    done = subprocess.run([sys.executable, "-c", AN_EPISODE_OF_EACH], capture_output=True, text=True, timeout=300)
+    assert done.stdout.split() == list(ENVIRONMENTS) and not done.stderr, done.stderr
+
+
+AN_EPISODE_OF_EACH = """
+import gymnasium as gym
+from clothgym.registration import ENVIRONMENTS
+for env_id in ENVIRONMENTS:
+    env = gym.make_vec("clothgym:" + env_id, num_envs=2)
+    env.reset(seed=0)
+    while not env.step(env.action_space.sample())[2].any():
+        pass
+    print(env_id)
+"""
 
 
 def test_bench_writes_what_it_prints(tmp_path, capsys, monkeypatch):
@@ -27,6 +45,9 @@ def test_bench_writes_what_it_prints(tmp_path, capsys, monkeypatch):
     results = json.loads((tmp_path / "bench.json").read_text())
     out = capsys.readouterr().out
     assert results["machine"]["versions"]["clothgym"] and "ns/spring" in out
+    measured = {(row["environment"], row["envs"]) for row in results["environments"]}
+    assert measured == {(env_id, envs) for env_id in ENVIRONMENTS for envs in (1, 64, 256)}
+    assert sum("cold" in row["start"] for row in results["start"]) == len(ENVIRONMENTS)
     row = next(row for row in results["core"] if row["grid"] == "25x25" and row["envs"] == 64)
     assert row["frames/s"] == 128
     assert row["ns/spring"] == pytest.approx(0.5 * row["threads"] / (64 * row["substeps"] * 3502) * 1e9)

@@ -7,18 +7,21 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
 
 from clothgym.adapters.sb3 import make_sb3_vec_env
+from clothgym.registration import ENVIRONMENTS
 
-ID = "ClothDrape-v0"
+every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 
 
-def test_it_gives_what_the_native_batch_gives():
-    adapter = make_sb3_vec_env(ID, 3, seed=4)
-    native = gym.make_vec(f"clothgym:{ID}", num_envs=3, autoreset_mode="SameStep")
+@every_id
+def test_it_gives_what_the_native_batch_gives(env_id):
+    adapter = make_sb3_vec_env(env_id, 3, seed=4)
+    native = gym.make_vec(f"clothgym:{env_id}", num_envs=3, autoreset_mode="SameStep")
+    rng, task = np.random.default_rng(0), native.unwrapped.task
     observation, _ = native.reset(seed=4)
     assert np.array_equal(adapter.reset(), observation)
     ended = False
-    for _ in range(45):
-        actions = np.ones((3, 8), np.float32)
+    for _ in range(task.acting_steps + task.settling_steps + 2):
+        actions = rng.uniform(-1, 1, native.action_space.shape).astype(np.float32)
         observation, rewards, dones, infos = adapter.step(actions)
         expected, reward, terminated, truncated, info = native.step(actions)
         assert np.array_equal(observation, expected) and rewards.dtype == np.float32
@@ -29,29 +32,32 @@ def test_it_gives_what_the_native_batch_gives():
                 ended = True
                 assert np.array_equal(infos[i]["terminal_observation"], info["final_obs"][i])
                 assert infos[i]["TimeLimit.truncated"] is False
-                assert infos[i]["is_success"] == info["final_info"]["is_success"][i]
+                for key in (*task._judgement(), "strain_max", "failure"):
+                    assert infos[i][key] == info["final_info"][key][i], key
                 assert isinstance(infos[i]["reward_terms"]["progress"], float)
     assert ended
 
 
-def test_sb3_trains_on_it_and_logs_episodes():
-    env = VecMonitor(make_sb3_vec_env(ID, 8, seed=0))
+@every_id
+def test_sb3_trains_on_it_and_logs_episodes(env_id):
+    env = VecMonitor(make_sb3_vec_env(env_id, 8, seed=0))
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=128, n_epochs=1, seed=0, device="cpu")
     model.learn(8 * 64 * 2)
     assert len(model.ep_info_buffer) > 0
     assert all(np.isfinite(episode["r"]) for episode in model.ep_info_buffer)
 
 
-def test_attributes_methods_and_errors():
-    env = make_sb3_vec_env(ID, 2, seed=0, render_mode="rgb_array")
+@every_id
+def test_attributes_methods_and_errors(env_id):
+    env = make_sb3_vec_env(env_id, 2, seed=0, render_mode="rgb_array")
     env.reset()
     assert env.get_attr("num_envs") == [2, 2]
     assert env.get_attr("render_mode", indices=[1]) == ["rgb_array"]
     assert len(env.get_images()) == 2
-    assert env.env_method("expert_actions", indices=[0])[0].shape == (8,)
+    assert env.env_method("expert_actions", indices=[0])[0].shape == env.action_space.shape
     assert env.env_is_wrapped(gym.Wrapper) == [False, False]
     env.set_attr("render_mode", None)
     with pytest.raises(ValueError, match="whole batch"):
         env.set_attr("render_mode", None, indices=[0])
-    with pytest.raises(ValueError, match="ClothDrape-v0"):
+    with pytest.raises(ValueError, match=env_id):
         make_sb3_vec_env("CartPole-v1", 2)
