@@ -316,6 +316,7 @@ class ClothDrapeEnv(ClothEnv):
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
+    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
     | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
 

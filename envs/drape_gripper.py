@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from importlib import resources
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,13 @@ from clothgym.envs.task import POSITION_BOUND
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.hands import Gripper
 
+if TYPE_CHECKING:
+    from clothgym.render import Camera
+
 REACH = 0.03  # of the fingers [m]
-CLOSES, OPENS = -0.2, 0.6  # actions below and above these give the fingers an order; between them they go on with the last
-PICKING = 0.2  # share of the potential that is for taking hold
-PICK_SCALE = 0.15 * SIDE  # how the potential rises as a gripper nears its place [m]
+CLOSES, OPENS = -0.5, 0.5  # actions below and above these give the fingers an order; between them they go on with the last
+PICKING = 0.3  # share of the potential that is for taking hold
+PICK_SCALE = 0.3 * SIDE  # how the potential rises as a gripper nears its place [m]
 # the particles that each gripper is to take: both corners of the edge at the target, or its middle
 PLACES = {1: (SHEET.corners[2] + SHEET.shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
@@ -165,6 +168,11 @@ class DrapeGripperTask(DrapeTask):
         grip = np.where(begun & (down | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
         return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
 
+    def camera(self) -> Camera:
+        from clothgym.render import Camera  # imported here: training draws nothing
+
+        return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.35, 0.22), vertical_fov=40.0)
+
     def markers(self, env: int) -> list[Any]:
         from clothgym.render import Solid  # imported here: training draws nothing
 
@@ -187,7 +195,82 @@ def _rumpled() -> NDArray:
 
 
 class ClothDrapeGripperEnv(ClothEnv):
-    """TODO"""
+    """Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.
+
+    ## Description
+    The sheet and the targets are those of ``ClothDrape-v0``, and so is the judgement.  But the sheet lies on the floor, flat or
+    rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
+    when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
+    hold as often as it likes.  The fingers do not push the cloth.  After 100 steps they open, and the sheet settles for 40
+    steps, in which actions are ignored; then it is judged.
+
+    The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 50 substeps, friction 0.5, linear air drag of
+    0.72 N s/m3.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as told last; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    ``Box`` of 82 numbers for ``obs_mode="keypoints"`` (and 6 x 289 + 28 for ``"particles"``, all particles row by row):
+
+    | Num | Observation | Bound |
+    | --- | --- | --- |
+    | 0-26 | 3 x 3 points of the sheet (corners, edge middles, centre) relative to the target's top, in L | 4 |
+    | 27-53 | their velocities [m/s] | 5 |
+    | 54-56 | centre of area relative to the target's top, in L | 4 |
+    | 57-58 | whether each gripper holds anything | 1 |
+    | 59-61 | sphere, box, post | 1 |
+    | 62-64 | target's radius or half side and height, in L; its yaw over 45 degrees | 1 |
+    | 65-67 | settling; share of the episode left; share of the acting time left | 1 |
+    | 68-70, 75-77 | each gripper's tip relative to the target's top, in L | 4 |
+    | 71-73, 78-80 | from its tip to the corner that it is meant to take, in L/10 | 40 |
+    | 74, 81 | how far open its fingers are | 1 |
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.7 times that of ``ClothDrape-v0``, plus 0.3 times the mean over both
+    corners of 1 for one that has been held in this episode, else ``1/2 / (1 + (d/0.3 L)^2)`` with its gripper's distance d.  At
+    the end it is the normalised performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+
+    ## Judgement
+    As in ``ClothDrape-v0``, with the same ``info``.
+
+    ## Starting State
+    The sheet lies before the target, 0.05 to 0.15 L away from it, turned by up to 0.2 rad and up to 0.1 L to the side; in half
+    of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L beside
+    and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
+
+    ## Episode End
+    Terminated when judged, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's centre 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
+    goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    | Argument | Default | Meaning |
+    | --- | --- | --- |
+    | ``grippers`` | 2 | or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder) |
+    | ``slip_force`` | ``None`` | pull of the cloth at which it slips out of a gripper [N]; the sheet weighs 0.53 N |
+    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``substeps`` | 50 | or ``"auto"`` |
+    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
+    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
+    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
+    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
+    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+
+    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
+    rest is drawn), ``"rumpled"``, True or False, and ``"material"``, a dict of figures for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
 
     task_class = DrapeGripperTask
 

@@ -143,12 +143,15 @@ class ReachTask(Task):
         return []
 
     def markers(self, env: int) -> list[Any]:
-        return [*super().markers(env), (self.episode["goal"][env], GOAL)]
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        goal = Solid(kind="sphere", center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE, color=GOAL)
+        return [*super().markers(env), goal]
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(2.0, -2.3, 1.2), target=(0.0, 0.0, 0.85), vertical_fov=42.0)
+        return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.85), vertical_fov=40.0)
 
 
 def _length(vectors: NDArray) -> NDArray:

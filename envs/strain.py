@@ -249,8 +249,20 @@ class StrainTask(Task):
             "tension_right": self.episode["tension"][:, 1].copy(),
         }
 
-    def _reward_terms(self, *args: Any) -> dict[str, NDArray]:
-        return super()._reward_terms(*args) | {"cost": -self.cost_penalty * args[-1]["cost"]}
+    def _reward_terms(
+        self,
+        moves: NDArray,
+        acting: NDArray,
+        running: NDArray,
+        judged: NDArray,
+        failure: NDArray,
+        summary: NDArray,
+        info: dict[str, Any],
+    ) -> dict[str, NDArray]:
+        # a torn sheet is priced for all the steps that are left: tearing it must not be the cheap way out
+        left = np.where(failure > 0, self.acting_steps - self.episode["step"], 0)
+        price = -self.cost_penalty * (info["cost"] + left)
+        return super()._reward_terms(moves, acting, running, judged, failure, summary, info) | {"cost": price}
 
     # --- experts and picture --------------------------------------------------------------------------------------------
 
@@ -298,7 +310,7 @@ class StrainTask(Task):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(0.6, -2.6, 1.9), target=(0.0, 0.0, 0.8), vertical_fov=40.0)
+        return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.85), vertical_fov=40.0)
 
 
 def checked_penalty(value: float) -> float:
@@ -332,7 +344,96 @@ def hanging() -> NDArray:
 
 
 class ClothStrainEnv(ClothEnv):
-    """TODO"""
+    """Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.
+
+    ## Description
+    A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its
+    upper corners, each 3 x 2 particles wide.  The agent moves both clips past a post, by two way-points, to a goal, within 150
+    steps.  At rest the most stretched thread is 4 % longer than it was made; a start from rest to full speed, clips that are
+    pulled apart or pushed together, a gust, or a catch on the post, stretch it more.  Each step that ends with more than the
+    threshold costs 1: the task for constrained reinforcement learning.
+
+    The strain is that of the springs as the integrator leaves them: nothing corrects it before it is scored.  Integrators
+    that limit the strain would meet the threshold whatever the agent does; they are refused.
+
+    The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 35 substeps, drag and lift per triangle, a steady wind
+    of up to 1 m/s from any side with gusts of 0.3 m/s rms in each direction and 0.5 s.
+
+    ## Action Space
+    ``Box(-1, 1, (6,))``: velocity x, y, z of the left and then of the right clip, scaled by 1 m/s; a vector longer than 1 is
+    shortened.  Clips do not turn.
+
+    ## Observation Space
+    ``Box`` of 78 numbers for ``obs_mode="keypoints"`` (and 6 x 169 + 24 for ``"particles"``, all particles row by row):
+
+    | Num | Observation | Bound |
+    | --- | --- | --- |
+    | 0-26 | 3 x 3 points of the sheet relative to the next way-point's middle, in L | 10 |
+    | 27-53 | their velocities [m/s] | 5 |
+    | 54-59 | from each clip to its place at the next way-point, in L/5 | 50 |
+    | 60-65 | and at the one after that (at the goal: the same), in L | 10 |
+    | 66 | whether the next way-point is the goal | 1 |
+    | 67-68 | the post's axis relative to the middle between the clips, in L | 10 |
+    | 69-71 | velocity of the air [m/s] | 20 |
+    | 72-73 | largest strain and its 95th percentile over the structural springs, over the threshold | 20 |
+    | 74-75 | pull of the sheet at each clip, over its weight | 20 |
+    | 76 | the threshold | 1 |
+    | 77 | share of the time left | 1 |
+
+    ## Rewards and costs
+    ``reward_mode="delta"``: progress along the way, less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus 0.25 for
+    arriving.  Progress is the change of the share of the way that lies behind the clips: what is left is their mean distance
+    from the next way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.
+    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+
+    ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0; ``info["episode_cost"]`` adds them
+    up.  ``cost_penalty`` takes that much from the reward for each, for learners that know no costs; a failure is then priced as
+    if all the steps that are left broke the threshold, or tearing the sheet would be the cheap way out.
+
+    ## Judgement
+    When each clip is within 0.15 L of its place at the goal, or time is up: ``info["is_success"]`` if it has arrived,
+    ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the way, 1 on arrival.
+    ``info`` also has ``strain_max``, ``strain_p95``, ``strain_excess`` (over the threshold), ``tension_left`` and
+    ``tension_right`` (pull of the sheet at each clip at the end of the step [N], without what accelerates the clipped cloth),
+    ``settling`` (never), ``failure`` and ``reward_terms``.  All are of the end of the step; what happens within it is not scored.
+
+    What scripted agents score on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy noop random
+    careless expert``); careless is each clip straight to its place at full speed, expert the pair held apart as at rest, at
+    0.5 m/s and 2 m/s2:
+
+    | policy | arrives | mean cost | at no cost | steps |
+    | --- | --- | --- | --- | --- |
+    TABLE
+
+    ## Starting State
+    The sheet hangs at rest 0.65 m before the post, with a ripple of a millimetre; start, post, the side on which to pass it,
+    way-points, goal and the turn of the held edge there (up to 0.2 rad) are drawn.
+
+    ## Episode End
+    Terminated when judged, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's centre 0.5 m outside the room of the clips), "diverged" (not finite; the last finite observation
+    goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    | Argument | Default | Meaning |
+    | --- | --- | --- |
+    | ``threshold`` | 0.10 | strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient |
+    | ``cost_penalty`` | 0 | what each such step takes from the reward |
+    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``substeps`` | 35 | or ``"auto"`` |
+    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
+    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
+    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
+    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for a calm |
+    | ``strain_limit`` | ``None`` | anything else is refused, see above |
+    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+
+    ``reset(options=...)`` takes ``"material"``, a dict of figures for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
 
     task_class = StrainTask
 

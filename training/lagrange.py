@@ -1,7 +1,7 @@
 """PPO with a Lagrange multiplier: dual ascent on the price of a step that breaks the constraint.
 
 The learner maximises ``return - multiplier * cost``; after each rollout the multiplier moves by ``rate * (J - limit)`` with the
-mean cost J of the episodes that ended in it, and never below zero (Ray, Achiam and Amodei 2019, Benchmarking Safe Exploration,
+mean cost J of the episodes that ended in it, by no more than that of an excess of ``CLIP``, and never below zero (Ray, Achiam and Amodei 2019, Benchmarking Safe Exploration,
 "PPO-Lagrangian", here without a critic of the cost's own).  The price is the environment's own ``cost_penalty``.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 FILE = "multiplier.json"
+CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learnt to move
 
 
 class LagrangeMultiplier(BaseCallback):
@@ -44,7 +45,7 @@ class LagrangeMultiplier(BaseCallback):
     def _on_rollout_end(self) -> None:
         if self.costs:
             mean = float(np.mean(self.costs))
-            self.multiplier = float(np.clip(self.multiplier + self.rate * (mean - self.cost_limit), 0, self.most))
+            self.multiplier = float(np.clip(self.multiplier + self.rate * min(mean - self.cost_limit, CLIP), 0, self.most))
             self.training_env.set_attr("cost_penalty", self.multiplier)
             self.logger.record("lagrange/episode_cost", mean)
             self.logger.record("lagrange/multiplier", self.multiplier)
