@@ -2,8 +2,10 @@
 
     python benchmarks/rumpled_sheets.py            # writes envs/rumpled.npz, in a few seconds
 
-Sheets that lie flat are picked up at a random particle, carried some way and dropped, twice, and settle; the more rumpled half
-is kept, by mean height.  What is written is in tenths of a millimetre, relative to the middle of the sheet on the floor.
+Sheets that lie flat are picked up at a random particle, carried some way and dropped, twice, and settle.  Kept are the most
+rumpled ones, by mean height, of those whose two corners at the target can be taken: they lie half a side apart, and no cloth
+from elsewhere is within a gripper's reach of them.  What is written is in tenths of a millimetre, relative to the middle of the
+sheet on the floor.
 """
 
 from __future__ import annotations
@@ -11,11 +13,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym import Gripper, Plane, Simulation
 from clothgym.envs.drape import FRICTION, SHEET, SIDE, THICKNESS, DrapeTask
+from clothgym.envs.drape_gripper import REACH
 
-KEPT, COUNT, SEED = 64, 128, 0
+KEPT, COUNT, SEED = 64, 256, 0
+CORNERS = SHEET.corners[2:]
 BANK = Path(__file__).parent.parent / "envs" / "rumpled.npz"
 
 
@@ -30,6 +35,17 @@ def pick_and_drop(simulation: Simulation, rng: np.random.Generator) -> None:
             simulation.grippers.move((start + share * way)[:, None], np.full((COUNT, 1), opening))
             simulation.step()
     simulation.step(40)
+
+
+def graspable(x: NDArray) -> NDArray:
+    """Whether each sheet, (sheets, particles, 3), can be taken by its corners at the target."""
+    left, right = (x[:, corner] for corner in CORNERS)
+    free = np.linalg.norm(left - right, axis=1) > SIDE / 2
+    for corner in CORNERS:
+        along = np.linalg.norm(SHEET.rest_positions - SHEET.rest_positions[corner], axis=1)
+        elsewhere = x[:, along > 2 * REACH + 2 * max(SHEET.spacing)]
+        free &= np.linalg.norm(elsewhere - x[:, corner, None], axis=2).min(axis=1) > REACH
+    return free
 
 
 def main() -> None:
@@ -49,10 +65,14 @@ def main() -> None:
     for _ in range(2):
         pick_and_drop(simulation, rng)
     x = simulation.positions
+    x = x[graspable(x)]
+    print(f"{len(x)} of {COUNT} can be taken by their corners")
     x = x[np.argsort(-x[:, :, 2].mean(axis=1), kind="stable")[:KEPT]]
     x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
     heights = x[:, :, 2].mean(axis=1) * 1000
-    print(f"mean heights {heights.min():.1f} to {heights.max():.1f} mm, largest speed: {np.abs(simulation.velocities).max():.2f} m/s")
+    print(
+        f"mean heights {heights.min():.1f} to {heights.max():.1f} mm, largest speed: {np.abs(simulation.velocities).max():.2f} m/s"
+    )
     np.savez_compressed(BANK, positions=np.round(x * 1e4).astype(np.int16))
     print(f"{BANK}: {BANK.stat().st_size / 1024:.0f} KiB")
 

@@ -50,16 +50,18 @@ def _warm_up() -> None:
     from clothgym.registration import ENVIRONMENTS
 
     begun = time.perf_counter()
-    for env_id in ENVIRONMENTS:
-        for integrator in INTEGRATORS:
-            env = gym.make(env_id, integrator=integrator, render_mode="rgb_array")
-            env.reset(seed=0)
-            # to the judgement: it has kernels of its own
-            terminated = False
-            while not terminated:
-                _, _, terminated, _, _ = env.step(env.unwrapped.expert_action())  # type: ignore[attr-defined]
-            env.render()
-            env.close()
+    cases = [(env_id, {"integrator": integrator}) for env_id in ENVIRONMENTS for integrator in INTEGRATORS]
+    # wind and slipping have kernels of their own
+    cases += [("ClothReach-v0", {"wind": {"gust": 0.5}}), ("ClothDrapeGripper-v0", {"slip_force": 1.0})]
+    for env_id, kwargs in cases:
+        env = gym.make(env_id, render_mode="rgb_array", **kwargs)  # type: ignore[arg-type]
+        env.reset(seed=0)
+        # to the judgement: it has kernels too
+        terminated = False
+        while not terminated:
+            _, _, terminated, _, _ = env.step(env.unwrapped.expert_action())  # type: ignore[attr-defined]
+        env.render()
+        env.close()
     print(f"all kernels are ready ({time.perf_counter() - begun:.1f} s)")
 
 

@@ -146,7 +146,7 @@ class Hands:
         """Begin a control step of blocks ``first`` to ``last``."""
         steer_blocks(
             first, last, x, v, w, free_w, self.x, self.targets, self.opening, self.wanted, self.holder, self.limits,
-            len(self.anchors), x.dtype.type(self.time_step),
+            self.anchors, x.dtype.type(self.time_step),
         )  # fmt: skip
 
     def pulls(
@@ -248,14 +248,20 @@ def count_held(holder, anchors, out):
 def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
     """Begin a control step of one block: move fingers, take hold or let go, and set the velocity of what is held.
 
-    hand: moved on to where it is at the end of the step.  limits: (hands, 4).  anchors: how many of the hands have no fingers.
+    hand: moved on to where it is at the end of the step.  limits: (hands, 4).  anchors: where an anchor is, (anchors,) particles;
+    its position is taken from there, so that rounding in the substeps does not add up.
     """
     one = x.dtype.type(1)
     zero = x.dtype.type(0)
     lanes = x.shape[2]
     move = np.empty((3, lanes), x.dtype)
     for k in range(hand.shape[0]):
-        if k >= anchors:
+        if k < anchors.shape[0]:
+            p = anchors[k]
+            for c in range(3):
+                for l in range(lanes):
+                    hand[k, c, l] = x[p, c, l] if holder[p, l] == k else hand[k, c, l]
+        else:
             step = limits[k, FINGER_STEP]
             for l in range(lanes):
                 before = opening[k, l]

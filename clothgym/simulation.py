@@ -306,9 +306,11 @@ class Simulation:
             which = spread("anchors", indices("anchors", anchors, self.anchors.size, "this simulation's anchors"), env.shape)
         return (*self.layout.place(env), which)
 
-    def set_wind(self, wind: ArrayLike) -> None:
-        """Velocity of the air from now on [m/s], (num_envs, 3) or (3,)."""
-        self._fabric.wind[:] = self.layout.to_blocks(spread("wind", finite("wind", wind), (self.num_envs, 3)), self.dtype)
+    def set_wind(self, wind: ArrayLike, envs: ArrayLike | None = None) -> None:
+        """Velocity of the air from now on [m/s], (len(envs), 3) or (3,)."""
+        env = self._env_indices(envs)
+        block, lane = self.layout.place(env)
+        self._fabric.wind[block, :, lane] = spread("wind", finite("wind", wind), (len(env), 3))
 
     def reset(self, envs: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached, grippers

@@ -59,6 +59,7 @@ class DrapeTask(Task):
     acting_steps = 60
     settling_steps = 40
     hand_actions = 4
+    guide_reach: ClassVar[float] = GUIDE_REACH
     key_particles = key_particles(SHEET)
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
 
@@ -177,7 +178,7 @@ class DrapeTask(Task):
         view = self.simulation.view
 
         def work(first: int, last: int) -> None:
-            soft_coverage(first, last, view.x, self._guide, np.float32(GUIDE_REACH), self._guided)
+            soft_coverage(first, last, view.x, self._guide, np.float32(self.guide_reach), self._guided)
 
         _jit.run_spans(work, len(self._guided), self.threads)
         near = self.simulation.layout.to_public(self._guided)

@@ -77,7 +77,7 @@ class ReachTask(Task):
         start = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
-        x = start + hanging() + rng.normal(scale=1e-3, size=hanging().shape)
+        x = start + hanging() + rng.normal(scale=1e-4, size=hanging().shape)
         self._place_goal(env, goal)
         self.episode["distance"][env] = _length(x[FREE] - goal)
         return x
@@ -204,14 +204,15 @@ class ClothReachEnv(ClothEnv):
     ``reward_mode="sparse"``: the normalised performance, at the judgement.
 
     ## Judgement
-    ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: 0 for doing
-    nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
+    ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
+    doing nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
     ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``settling``, ``failure`` and ``reward_terms``.
     What belongs to the judgement is 0 until then.
 
     ## Starting State
     The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
-    x 0.3 m; the sheet hangs at rest, with a ripple of a millimetre.
+    x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a
+    millimetre.
 
     ## Episode End
     Terminated when judged, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice

@@ -213,6 +213,8 @@ class Task(ABC):
             figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
             self.simulation.set_parameters(envs, warn="material" in options, **figures)
         self.simulation.reset(envs, positions=starts)
+        if self.wind is not None:
+            self.simulation.set_wind(self.episode["wind"][envs, 0], envs)
         self._place_hands(envs)
         episode = self.episode
         episode["step"][envs] = 0
@@ -271,7 +273,8 @@ class Task(ABC):
         moves = actions.reshape(self.num_envs, self.num_hands, self.hand_actions)
         self._move_hands(moves, acting)
         if self.wind is not None:
-            simulation.set_wind(episode["wind"][np.arange(self.num_envs), episode["step"]])
+            now = np.minimum(episode["step"], episode["wind"].shape[1] - 1)  # those that are over wait at the end of theirs
+            simulation.set_wind(episode["wind"][np.arange(self.num_envs), now])
         simulation.step()
         episode["step"][running] += 1
         self._grip(moves, acting)

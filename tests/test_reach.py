@@ -194,7 +194,7 @@ def test_starts_and_goals_are_drawn_from_the_ranges_of_the_manual_page():
     assert np.abs(np.corrcoef(driven.T, goals.T)[:3, 3:]).max() < 0.2
     sheets = task.simulation.positions - task.simulation.positions[:, DRIVEN][:, None]
     ripple = (sheets - hanging()).std()
-    assert 0.5e-3 < ripple < 2e-3
+    assert 0.5e-4 < ripple < 2e-4
 
 
 def test_a_goal_is_obeyed_for_one_episode():

@@ -3,6 +3,7 @@
     python training/train.py --env ClothDrape-v0                    # runs/ClothDrape-v0_0
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
     python training/train.py --env ClothStrain-v0 --algo ppo_lagrange   # runs/ClothStrain-v0_ppo_lagrange_0
+    python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
 
 The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
@@ -27,6 +28,7 @@ import policies
 import torch
 import tyro
 import yaml
+from clone import clone, demonstrations
 from lagrange import LagrangeMultiplier
 from report import draw_learning_curve, film
 from stable_baselines3 import PPO
@@ -47,8 +49,8 @@ class Args:
     """Id of the environment."""
     seed: int = 0
     """Seed of the learner and of its environments."""
-    algo: Literal["ppo", "ppo_lagrange"] = "ppo"
-    """PPO, or PPO with a Lagrange multiplier on the episodes' cost."""
+    algo: Literal["ppo", "ppo_lagrange", "bc_ppo"] = "ppo"
+    """PPO; with a Lagrange multiplier on the episodes' cost; or after a clone of the scripted expert."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
     run: Path | None = None
@@ -100,7 +102,7 @@ class HeldOutEvaluation(BaseCallback):
     def _on_rollout_start(self) -> None:
         # OpenMP's idle workers spin: while the environments run, torch must not have any
         torch.set_num_threads(1)
-        if self.rollouts and self.rollouts % self.every == 0:
+        if self.rollouts % self.every == 0 and (self.rollouts or self.config["clone"]):
             self.evaluate()
         self.rollouts += 1
 
@@ -156,6 +158,7 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         "env": args.env,
         "algo": args.algo,
         "lagrange": hyperparameters.pop("lagrange", {}),
+        "clone": hyperparameters.pop("clone", {}),
         "env_kwargs": hyperparameters.pop("env_kwargs", {}),
         "num_envs": hyperparameters.pop("n_envs"),
         "timesteps": args.timesteps if args.timesteps is not None else int(hyperparameters["n_timesteps"]),
@@ -220,6 +223,8 @@ def train(args: Args) -> Path:
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
     per_rollout = config["num_envs"] * model.n_steps
     watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), args.eval_episodes)
+    if config["clone"] and done == 0:
+        watch.trained_before += learn_from_expert(model, config)
     callbacks: list[BaseCallback] = [watch]
     if config["algo"] == "ppo_lagrange":
         callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
@@ -237,6 +242,17 @@ def train(args: Args) -> Path:
     model.save(folder / "model.zip")
     finish(folder, config, seconds, args.final_episodes)
     return folder
+
+
+def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
+    """Clone the scripted expert into the policy; the time it took [s]."""
+    begun = time.perf_counter()
+    options = dict(config["clone"])
+    samples = demonstrations(model.env, options.pop("episodes"), options.pop("noise"), config["seed"])  # type: ignore[arg-type]
+    torch.set_num_threads(config["threads"])
+    error = clone(model, *samples, **options)
+    print(f"cloned the expert from {len(samples[0]):,} samples: mean squared error {error:.4f}")
+    return time.perf_counter() - begun
 
 
 def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:

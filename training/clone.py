@@ -1,0 +1,65 @@
+"""Behaviour cloning: teach a policy what the scripted expert does, before PPO, or instead of it.
+
+The expert is disturbed while it shows its way, each episode by a noise of its own strength, and what is learnt is what it would
+do undisturbed (Laskey et al. 2017, DART): so the learner also sees how to come back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv
+from tqdm import tqdm
+
+
+def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int) -> tuple[NDArray, NDArray]:
+    """Observations and the expert's actions, (samples, size) each, from some episodes of each environment of a batch.
+
+    noise: largest standard deviation of the disturbance; each environment draws its own anew for each of the rounds.
+    """
+    rng = np.random.default_rng(seed)
+    task = env.unwrapped.env.task  # type: ignore[attr-defined]
+    steps = task.acting_steps + task.settling_steps
+    observations, actions = [], []
+    seen: Any = env.reset()
+    for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False):
+        strength = noise * rng.uniform(size=(env.num_envs, 1))
+        for _ in range(steps):
+            wanted = np.clip(task.expert_actions(), -1, 1).astype(np.float32)
+            # what is done while the sheet settles does not matter, and would only blur what does
+            acting = task.episode["settling_since"] < 0
+            observations.append(seen[acting])
+            actions.append(wanted[acting])
+            disturbed = wanted + strength * rng.standard_normal(wanted.shape)
+            seen, *_ = env.step(np.clip(disturbed, -1, 1).astype(np.float32))
+    return np.concatenate(observations), np.concatenate(actions)
+
+
+def clone(model: PPO, observations: NDArray, actions: NDArray, epochs: int, batch_size: int, learning_rate: float) -> float:
+    """Fit the mean of the policy to the actions by least squares; the mean squared error over the last tenth of the fit."""
+    policy = model.policy
+    x, y = torch.as_tensor(observations), torch.as_tensor(actions)
+    fitted = [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()]
+    optimizer = torch.optim.Adam(fitted, learning_rate)
+    steps = max(1, epochs * len(x) // batch_size)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
+    errors = []
+    for batch in tqdm(_batches(len(x), batch_size, steps, model.seed or 0), total=steps, desc="cloning", leave=False):
+        error = torch.mean((policy.get_distribution(x[batch]).distribution.mean - y[batch]) ** 2)
+        optimizer.zero_grad()
+        error.backward()
+        optimizer.step()
+        schedule.step()
+        errors.append(error.item())
+    return float(np.mean(errors[-max(1, steps // 10) :]))
+
+
+def _batches(count: int, size: int, steps: int, seed: int) -> Iterator[torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    for _ in range(steps):
+        yield torch.randint(count, (size,), generator=generator)
