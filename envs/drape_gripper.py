@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 REACH = 0.03  # of the fingers [m]
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these give the fingers an order; between them they go on with the last
 PICKING = 0.3  # share of the potential that is for taking hold
-PICK_SCALE = 0.3 * SIDE  # how the potential rises as a gripper nears its place [m]
+PICK_SCALE = 0.15 * SIDE  # how the potential rises as a gripper nears its place [m]
 # the particles that each gripper is to take: both corners of the edge at the target, or its middle
 PLACES = {1: (SHEET.corners[2] + SHEET.shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
@@ -239,7 +239,7 @@ class ClothDrapeGripperEnv(ClothEnv):
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  On the way the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L in the place of its
     0.15 L), plus 0.3 times the mean over both
-    corners of 1 for one that is held, else ``1/2 / (1 + (d/0.3 L)^2)`` with its gripper's distance d.  At
+    corners of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At
     the end it is the normalised performance, at a failure 0.
     ``reward_mode="sparse"``: the normalised performance, at the judgement.
 

@@ -49,8 +49,8 @@ class Args:
     """Id of the environment."""
     seed: int = 0
     """Seed of the learner and of its environments."""
-    algo: Literal["ppo", "ppo_lagrange", "bc_ppo"] = "ppo"
-    """PPO; with a Lagrange multiplier on the episodes' cost; or after a clone of the scripted expert."""
+    algo: Literal["ppo", "ppo_penalty", "ppo_lagrange", "bc_ppo"] = "ppo"
+    """PPO; with a fixed price, or a Lagrange multiplier, on cost; or after a clone of the scripted expert."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
     run: Path | None = None
