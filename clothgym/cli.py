@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,11 +51,13 @@ def _warm_up() -> None:
     from clothgym.registration import ENVIRONMENTS
 
     begun = time.perf_counter()
-    cases = [(env_id, {"integrator": integrator}) for env_id in ENVIRONMENTS for integrator in INTEGRATORS]
+    cases: list[tuple[str, dict[str, Any]]] = [
+        (env_id, {"integrator": integrator}) for env_id in ENVIRONMENTS for integrator in INTEGRATORS
+    ]
     # wind and slipping have kernels of their own
     cases += [("ClothReach-v0", {"wind": {"gust": 0.5}}), ("ClothDrapeGripper-v0", {"slip_force": 1.0})]
     for env_id, kwargs in cases:
-        env = gym.make(env_id, render_mode="rgb_array", **kwargs)  # type: ignore[arg-type]
+        env = gym.make(env_id, render_mode="rgb_array", **kwargs)
         env.reset(seed=0)
         # to the judgement: it has kernels too
         terminated = False

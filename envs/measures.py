@@ -59,7 +59,7 @@ def summarize(first, last, x, v, share, springs, structural, out):
 
 @kernel
 def stretch_quantile(first, last, x, springs, structural, share, out):
-    """Quantile ``share`` of the structural springs' stretch, length over rest length, (blocks, lanes).
+    """Quantile ``share`` and largest of the structural springs' stretch, length over rest length, (blocks, 2, lanes).
 
     By bisection, from 1 to twice that, to 2^-20: the least stretch (at least 1) that no more than ``1 - share`` of the springs
     exceed.  No sorting: lanes stay side by side.
@@ -71,6 +71,8 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
     allowed = int((1 - share) * structural.shape[0])
     stretch = np.empty((structural.shape[0], lanes), x.dtype)
     for b in range(first, last):
+        most = out[b, 1]
+        most[:] = 0
         for k in range(structural.shape[0]):
             s = structural[k]
             xi, xj, own = x[b, ends[s, 0]], x[b, ends[s, 1]], stretch[k]
@@ -78,6 +80,7 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
             for l in range(lanes):
                 dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
                 own[l] = np.sqrt(dx * dx + dy * dy + dz * dz) * scale
+                most[l] = max(most[l], own[l])
         low = np.ones(lanes, x.dtype)
         step = half
         count = np.empty(lanes, np.int32)
@@ -90,7 +93,7 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
             for l in range(lanes):
                 low[l] = low[l] + step if count[l] > allowed else low[l]
             step *= half
-        out[b] = low
+        out[b, 0] = low
 
 
 @kernel

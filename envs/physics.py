@@ -76,7 +76,9 @@ def checked_wind(figures: Mapping[str, Any]) -> Wind:
 
 def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
-    figures = [ranges.get(name, (getattr(physics.material, name),) * 2) for name in FIGURES]
+    if not ranges:
+        return
+    figures = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in FIGURES]
     for corner in product(*figures):
         fabric = Material(**dict(zip(FIGURES, corner)))
         stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clothgym import _jit, integrators
 from clothgym.checks import number, positive
 from clothgym.collisions import Capsule
-from clothgym.envs.measures import FINITE, STRETCH2, key_particles, stretch_quantile
+from clothgym.envs.measures import key_particles, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.task import Task
@@ -90,12 +90,14 @@ class StrainTask(Task):
         super().__init__(num_envs, integrator=integrator, **kwargs)
         self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
         layout = self.simulation.layout
-        self._stretch = np.zeros((layout.blocks, layout.lanes), np.float32)
+        self._stretch = np.zeros((layout.blocks, 2, layout.lanes), np.float32)
         self.episode |= {
             "post": np.zeros((num_envs, 2)),
             "places": np.zeros((num_envs, WAYPOINTS, 2, 3)),  # where each clip is to be [m]
             "next": np.zeros(num_envs, np.int64),
-            "way": np.ones(num_envs),  # its length [m]
+            "after": np.zeros((num_envs, WAYPOINTS)),  # length of the way that is left at each way-point [m]
+            "way": np.ones(num_envs),  # its whole length [m]
+            "strain": np.zeros(num_envs),
             "strain_p95": np.zeros(num_envs),
             "tension": np.zeros((num_envs, 2)),
             "episode_cost": np.zeros(num_envs),
@@ -129,7 +131,9 @@ class StrainTask(Task):
         episode["places"][env] = clips[1:]
         episode["next"][env] = 0
         episode["episode_cost"][env] = 0
-        episode["way"][env] = np.linalg.norm(np.diff(clips, axis=0), axis=2).mean(axis=1).sum()
+        legs = np.linalg.norm(np.diff(clips, axis=0), axis=2).mean(axis=1)
+        episode["after"][env] = legs.sum() - np.cumsum(legs)
+        episode["way"][env] = legs.sum()
         ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
         ripple[[particle for clip in CLIPS for particle in clip]] = 0
         x = middles[0] + hanging()
@@ -152,7 +156,7 @@ class StrainTask(Task):
         return [5 * FAR] * 6 + [FAR] * 6 + [1.0] + [FAR] * 2 + [20.0] * 3 + [20.0] * 4 + [1.0, 1.0]
 
     def _observe_more(self) -> list[NDArray]:
-        episode, strain = self.episode, self._strain_max()
+        episode = self.episode
         everyone, following = np.arange(self.num_envs), np.minimum(episode["next"] + 1, WAYPOINTS - 1)
         clips = self.simulation.hand_positions
         wind = self.episode["wind"]
@@ -161,9 +165,9 @@ class StrainTask(Task):
             ((episode["places"][everyone, episode["next"]] - clips) * (5 / SIDE)).reshape(self.num_envs, 6),
             ((episode["places"][everyone, following] - clips) / SIDE).reshape(self.num_envs, 6),
             (episode["next"] == WAYPOINTS - 1)[:, None],
-            (episode["post"] - clips.mean(axis=1)[:, :2]) / SIDE,
+            (episode["post"] - _middle(clips)[:, :2]) / SIDE,
             wind[everyone, now] if wind.shape[1] else np.zeros((self.num_envs, 3)),
-            (strain / self.threshold)[:, None],
+            (episode["strain"] / self.threshold)[:, None],
             (episode["strain_p95"] / self.threshold)[:, None],
             episode["tension"] / WEIGHT,
             np.full((self.num_envs, 1), self.threshold),
@@ -180,7 +184,7 @@ class StrainTask(Task):
     def _grip(self, moves: NDArray, acting: NDArray) -> None:
         """Nothing is gripped; way-points that the clips have passed are ticked off, and the sheet is measured."""
         episode = self.episode
-        passed = acting & (episode["next"] < WAYPOINTS - 1) & (self._to_places(episode["next"]).mean(axis=1) < PASSED)
+        passed = acting & (episode["next"] < WAYPOINTS - 1) & (_middle(self._to_places(episode["next"])) < PASSED)
         episode["next"] += passed
         self._measure()
 
@@ -192,9 +196,10 @@ class StrainTask(Task):
             stretch_quantile(first, last, view.x, view.springs, self._structural, 0.95, self._stretch)
 
         _jit.run_spans(work, len(self._stretch), self.threads)
-        episode["strain_p95"] = simulation.layout.to_public(self._stretch).astype(np.float64) - 1
+        stretch = simulation.layout.to_public(self._stretch).astype(np.float64)
+        episode["strain_p95"], episode["strain"] = stretch[:, 0] - 1, stretch[:, 1] - 1
         episode["tension"] = _length(simulation.pulls().astype(np.float64))
-        middle = episode["places"][np.arange(self.num_envs), episode["next"]].mean(axis=1)
+        middle = _middle(episode["places"][np.arange(self.num_envs), episode["next"]])
         self._origin = simulation.layout.to_blocks(middle, np.dtype(np.float32))
 
     def _place_hands(self, envs: NDArray) -> None:
@@ -207,19 +212,10 @@ class StrainTask(Task):
 
     # --- how it is rewarded and judged ----------------------------------------------------------------------------------
 
-    def _strain_max(self) -> NDArray:
-        summary = self.simulation.layout.to_public(self._summary).T
-        with np.errstate(invalid="ignore"):
-            return np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf).astype(np.float64)
-
     def _potential(self, summary: NDArray) -> NDArray:
         """Share of the way that lies behind the clips."""
         episode = self.episode
-        legs = _length(np.diff(episode["places"], axis=1)).mean(axis=2)
-        ahead = np.where(np.arange(WAYPOINTS - 1) >= episode["next"][:, None], legs, 0.0)
-        left = self._to_places(episode["next"]).mean(axis=1)
-        for leg in ahead.T:
-            left = left + leg
+        left = _middle(self._to_places(episode["next"])) + episode["after"][np.arange(self.num_envs), episode["next"]]
         return np.clip(1 - left / episode["way"], 0, 1)
 
     def _judgement(self) -> dict[str, NDArray]:
@@ -272,8 +268,8 @@ class StrainTask(Task):
         view, public = self.simulation.view, self.simulation.layout.to_public
         velocity = np.stack([public(view.v[:, clip[0]]) for clip in CLIPS], axis=1).astype(np.float64)
         places = episode["places"][np.arange(self.num_envs), episode["next"]]
-        middle, moving = clips.mean(axis=1), velocity.mean(axis=1)
-        away = places.mean(axis=1) - middle
+        middle, moving = _middle(clips), _middle(velocity)
+        away = _middle(places) - middle
         distance = _length(away)
         slowing = np.where(episode["next"] == WAYPOINTS - 1, np.sqrt(CAREFUL_ACCELERATION * distance), CAREFUL_SPEED)
         speed = np.minimum(CAREFUL_SPEED, slowing)
@@ -326,6 +322,11 @@ def _post(x: float, y: float) -> Capsule:
 
 def _length(vectors: NDArray) -> NDArray:
     return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
+
+
+def _middle(pairs: NDArray) -> NDArray:
+    """Of what both clips have, (num_envs, 2, ...)."""
+    return (pairs[:, 0] + pairs[:, 1]) / 2
 
 
 def _yaw(vectors: NDArray) -> NDArray:

@@ -86,6 +86,7 @@ class ClothVectorEnv(VectorEnv):
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # those that ended in the last step begin anew in this one: their actions were ignored
             self.task.reset(np.flatnonzero(over))
+            info["_failure"] = info["_failure"] | over  # a reset says that there is none
         elif self.autoreset_mode == AutoresetMode.SAME_STEP:
             ended = outcome.terminated | outcome.truncated
             if ended.any():
