@@ -99,7 +99,9 @@ class ClothVectorEnv(VectorEnv):
         for env in np.flatnonzero(ended):
             final[env] = self.task.episode["observation"][env].copy()
         self.task.reset(np.flatnonzero(ended))
-        return _with_masks(_only(info, ~ended), ~ended) | {
+        running = _with_masks(_only(info, ~ended), ~ended)
+        running["_failure"] = np.ones(self.num_envs, bool)  # the reset of the others says that there is none
+        return running | {
             "final_info": _with_masks(_only(info, ended), ended),
             "_final_info": ended.copy(),
             "final_obs": final,
