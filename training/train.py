@@ -63,8 +63,8 @@ class Args:
     """Held-out episodes of each evaluation on the way."""
     final_episodes: int = 500
     """Held-out episodes of the final evaluation."""
-    threads: int = 2
-    """Threads of torch while it learns; while the environments run it has one, and they have all processors."""
+    threads: int = 1
+    """Threads of torch while it learns; two gain little on nets as small as these, and wait for each other on a busy machine."""
 
     def __post_init__(self) -> None:
         self.env = self.env.removeprefix("clothgym:")
