@@ -86,6 +86,8 @@ class StrainTask(Task):
                 "empty; take an integrator without one"
             )
         self.threshold = positive("threshold", threshold)
+        if threshold > 1:
+            raise ValueError(f"threshold={threshold!r}: must be at most 1, at which the sheet tears; usual are 0.05 to 0.2")
         self.cost_penalty = checked_penalty(cost_penalty)
         super().__init__(num_envs, integrator=integrator, **kwargs)
         self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
@@ -362,7 +364,7 @@ class ClothStrainEnv(ClothEnv):
 
     ## Action Space
     ``Box(-1, 1, (6,))``: velocity x, y, z of the left and then of the right clip, scaled by 1 m/s; a vector longer than 1 is
-    shortened.  Clips do not turn.
+    shortened.  Clips do not turn.  Solids do not stop them: a clip that is driven through the post tears the sheet.
 
     ## Observation Space
     ``Box`` of 78 numbers for ``obs_mode="keypoints"`` (and 6 x 169 + 24 for ``"particles"``, all particles row by row):

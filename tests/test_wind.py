@@ -326,7 +326,6 @@ def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
 
 @every_id
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
-@pytest.mark.xfail(raises=IndexError, strict=True, reason="the wind's series is read at the step after its last")
 def test_a_batch_with_wind_goes_on_after_an_episode_s_end(env_id, mode):
     env = make_vec(env_id, 2, autoreset_mode=mode, wind={"gust": 0.1})
     env.reset(seed=0)
