@@ -48,3 +48,8 @@ def within_ball(vectors: NDArray) -> NDArray:
     """Vectors in the cube [-1, 1]^3 shortened to length 1 where they are longer: the speed limit holds in every direction."""
     squares = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1.0))[..., None]
+
+
+def length(vectors: NDArray) -> NDArray:
+    """Euclidean length of vectors, (..., 3): written out, so that its bits do not depend on how many there are."""
+    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import vector
+from clothgym.envs.episode import length
 from clothgym.envs.measures import key_particles
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
@@ -79,7 +80,7 @@ class ReachTask(Task):
         goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
         x = start + hanging() + rng.normal(scale=1e-4, size=hanging().shape)
         self._place_goal(env, goal)
-        self.episode["distance"][env] = _length(x[FREE] - goal)
+        self.episode["distance"][env] = length(x[FREE] - goal)
         return x
 
     def _place_goal(self, env: int, goal: NDArray) -> None:
@@ -112,11 +113,11 @@ class ReachTask(Task):
 
     def _nearer(self, away: NDArray) -> NDArray:
         """How much of the way is done, in [0, 1]."""
-        return np.clip(1 - _length(away) / self.episode["distance"], 0, 1)
+        return np.clip(1 - length(away) / self.episode["distance"], 0, 1)
 
     def _potential(self, summary: NDArray) -> NDArray:
         away, velocity = self._corner()
-        close = 1 / (1 + (_length(away) / (CLOSE_SCALE * SIDE)) ** 2)
+        close = 1 / (1 + (length(away) / (CLOSE_SCALE * SIDE)) ** 2)
         return (self._nearer(away) + close * _calm(velocity)) / 2
 
     def _judgement(self) -> dict[str, NDArray]:
@@ -125,7 +126,7 @@ class ReachTask(Task):
 
     def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
         away, velocity = self._corner()
-        distance, speed = _length(away)[envs] / SIDE, _length(velocity)[envs] / SIDE
+        distance, speed = length(away)[envs] / SIDE, length(velocity)[envs] / SIDE
         return {
             "normalized_performance": (self._nearer(away) * _calm(velocity))[envs],
             "goal_distance": distance,
@@ -154,13 +155,9 @@ class ReachTask(Task):
         return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.85), vertical_fov=40.0)
 
 
-def _length(vectors: NDArray) -> NDArray:
-    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
-
-
 def _calm(velocity: NDArray) -> NDArray:
     """1 at rest, 1/2 at CALM_SCALE."""
-    return 1 / (1 + (_length(velocity) / (CALM_SCALE * SIDE)) ** 2)
+    return 1 / (1 + (length(velocity) / (CALM_SCALE * SIDE)) ** 2)
 
 
 @cache

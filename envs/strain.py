@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clothgym import _jit, integrators
 from clothgym.checks import number, positive
 from clothgym.collisions import Capsule
+from clothgym.envs.episode import length
 from clothgym.envs.measures import key_particles, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
@@ -181,7 +182,7 @@ class StrainTask(Task):
     def _to_places(self, waypoint: NDArray) -> NDArray:
         """Distance of each clip from its place at a way-point [m], (num_envs, 2)."""
         places = self.episode["places"][np.arange(self.num_envs), waypoint]
-        return _length(places - self.simulation.hand_positions)
+        return length(places - self.simulation.hand_positions)
 
     def _grip(self, moves: NDArray, acting: NDArray) -> None:
         """Nothing is gripped; way-points that the clips have passed are ticked off, and the sheet is measured."""
@@ -200,7 +201,7 @@ class StrainTask(Task):
         _jit.run_spans(work, len(self._stretch), self.threads)
         stretch = simulation.layout.to_public(self._stretch).astype(np.float64)
         episode["strain_p95"], episode["strain"] = stretch[:, 0] - 1, stretch[:, 1] - 1
-        episode["tension"] = _length(simulation.pulls().astype(np.float64))
+        episode["tension"] = length(simulation.pulls().astype(np.float64))
         middle = _middle(episode["places"][np.arange(self.num_envs), episode["next"]])
         self._origin = simulation.layout.to_blocks(middle, np.dtype(np.float32))
 
@@ -272,12 +273,12 @@ class StrainTask(Task):
         places = episode["places"][np.arange(self.num_envs), episode["next"]]
         middle, moving = _middle(clips), _middle(velocity)
         away = _middle(places) - middle
-        distance = _length(away)
+        distance = length(away)
         slowing = np.where(episode["next"] == WAYPOINTS - 1, np.sqrt(CAREFUL_ACCELERATION * distance), CAREFUL_SPEED)
         speed = np.minimum(CAREFUL_SPEED, slowing)
         change = away * (speed / np.maximum(distance, 1e-9))[:, None] - moving
         dt = self.physics.time_step
-        change *= np.minimum(1, CAREFUL_ACCELERATION * dt / np.maximum(_length(change), 1e-9))[:, None]
+        change *= np.minimum(1, CAREFUL_ACCELERATION * dt / np.maximum(length(change), 1e-9))[:, None]
         # the held edge turns on the way, and is always as long as at rest
         yaw, wanted = (_yaw(pair[:, 0] - pair[:, 1]) for pair in (clips, places))
         left = np.arctan2(np.sin(wanted - yaw), np.cos(wanted - yaw))
@@ -291,7 +292,7 @@ class StrainTask(Task):
         """Each clip straight to its place, as fast as it can."""
         away = self.episode["places"][np.arange(self.num_envs), self.episode["next"]] - self.simulation.hand_positions
         reach = self.physics.hand_speed * self.physics.time_step
-        return (away / np.maximum(_length(away), reach)[..., None]).reshape(self.num_envs, 6)
+        return (away / np.maximum(length(away), reach)[..., None]).reshape(self.num_envs, 6)
 
     def solids(self, env: int) -> list[Solid]:
         from clothgym.render import Solid  # imported here: training draws nothing
@@ -322,10 +323,6 @@ def _post(x: float, y: float) -> Capsule:
     return Capsule(center=(x, y, POST_HEIGHT / 2 - POST_RADIUS), radius=POST_RADIUS, height=POST_HEIGHT, friction=FRICTION)
 
 
-def _length(vectors: NDArray) -> NDArray:
-    return np.sqrt(vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2)
-
-
 def _middle(pairs: NDArray) -> NDArray:
     """Of what both clips have, (num_envs, 2, ...)."""
     return (pairs[:, 0] + pairs[:, 1]) / 2
@@ -336,14 +333,10 @@ def _yaw(vectors: NDArray) -> NDArray:
 
 
 @cache
-def _hanging() -> NDArray:
-    rest = SHEET.rest_positions
-    return settled(StrainTask.physics, np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1), seconds=8)
-
-
 def hanging() -> NDArray:
     """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3)."""
-    return _hanging().copy()
+    rest = SHEET.rest_positions
+    return settled(StrainTask.physics, np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1), seconds=8)
 
 
 class ClothStrainEnv(ClothEnv):
