@@ -1,0 +1,97 @@
+"""What does not pay: ways to score without doing the task, in each environment.
+
+    python benchmarks/cheats.py            # prints, and writes benchmarks/results/cheats.json; about two minutes
+
+never: do nothing.  hold: the scripted expert, but it never lets go.  apart: pull the hands apart as fast as they go.  away: push
+the sheet out of the arena.  shake: full speed to and fro, to pump a reward for change.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.bench import machine
+from clothgym.registration import ENVIRONMENTS
+
+RESULTS = Path(__file__).parent / "results" / "cheats.json"
+EPISODES, SEED = 100, 1_000_000
+
+
+def moves(env: Any, velocity: NDArray) -> NDArray:
+    """An action that moves each hand at a velocity, (hands, 3), and keeps hold."""
+    task = env.unwrapped.task
+    each = np.full((env.num_envs, task.num_hands, task.hand_actions), -1.0)
+    each[:, :, :3] = velocity
+    return each.reshape(env.num_envs, -1)
+
+
+def never(env: Any, step: int) -> NDArray:
+    return np.zeros(env.action_space.shape)
+
+
+def hold(env: Any, step: int) -> NDArray:
+    task = env.unwrapped.task
+    actions = task.expert_actions().reshape(env.num_envs, task.num_hands, task.hand_actions).copy()
+    if task.hand_actions == 4:
+        # a gripper must open first to take anything
+        ever_held = task.episode.get("picked", np.ones((env.num_envs, task.num_hands), bool))
+        actions[:, :, 3] = np.where(ever_held, -1.0, actions[:, :, 3])
+    return actions.reshape(env.num_envs, -1)
+
+
+def apart(env: Any, step: int) -> NDArray:
+    task = env.unwrapped.task
+    hands = task.simulation.hand_positions
+    away = hands - hands.mean(axis=1, keepdims=True) if task.num_hands > 1 else hands
+    return moves(env, away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-9))
+
+
+def away(env: Any, step: int) -> NDArray:
+    return moves(env, np.array([0.0, -1.0, 0.0]))
+
+
+def shake(env: Any, step: int) -> NDArray:
+    return moves(env, np.array([0.0, 0.0, 1.0 if step % 10 < 5 else -1.0]))
+
+
+CHEATS: tuple[Callable[[Any, int], NDArray], ...] = (never, hold, apart, away, shake)
+
+
+def score(env_id: str, cheat: Callable[[Any, int], NDArray]) -> dict[str, Any]:
+    env = gym.make_vec(f"clothgym:{env_id}", num_envs=EPISODES, autoreset_mode="Disabled")
+    env.reset(seed=SEED)
+    running, total, step, last = np.ones(EPISODES, bool), np.zeros(EPISODES), 0, {}
+    while running.any():
+        _, reward, terminated, _, info = env.step(np.clip(cheat(env, step), -1, 1))
+        total += reward * running
+        for key in ("is_success", "normalized_performance", "failure", "episode_cost"):
+            if key in info:
+                last[key] = np.where(running, info[key], last.get(key, info[key]))
+        running &= ~terminated
+        step += 1
+    row = {"environment": env_id, "cheat": cheat.__name__}
+    row |= {"success": float(last["is_success"].mean()), "performance": float(last["normalized_performance"].mean())}
+    row |= {"return": float(total.mean()), "failed": float((last["failure"] != "").mean())}
+    if "episode_cost" in last:
+        row["cost"] = float(last["episode_cost"].mean())
+    return row
+
+
+def main() -> None:
+    rows = []
+    for env_id in ENVIRONMENTS:
+        for cheat in CHEATS:
+            rows.append(score(env_id, cheat))
+            print("  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in rows[-1].items()))
+    RESULTS.write_text(json.dumps({"machine": machine(), "episodes": EPISODES, "seed": SEED, "rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
