@@ -248,20 +248,10 @@ class StrainTask(Task):
             "tension_right": self.episode["tension"][:, 1].copy(),
         }
 
-    def _reward_terms(
-        self,
-        moves: NDArray,
-        acting: NDArray,
-        running: NDArray,
-        judged: NDArray,
-        failure: NDArray,
-        summary: NDArray,
-        info: dict[str, Any],
-    ) -> dict[str, NDArray]:
+    def _prices(self, failure: NDArray, info: dict[str, Any]) -> dict[str, NDArray]:
         # a torn sheet is priced for all the steps that are left: tearing it must not be the cheap way out
         left = np.where(failure > 0, self.acting_steps - self.episode["step"], 0)
-        price = -self.cost_penalty * (info["cost"] + left)
-        return super()._reward_terms(moves, acting, running, judged, failure, summary, info) | {"cost": price}
+        return {"cost": -self.cost_penalty * (info["cost"] + left)}
 
     # --- experts and picture --------------------------------------------------------------------------------------------
 
@@ -301,9 +291,13 @@ class StrainTask(Task):
         return [Solid(kind="capsule", center=post.center, radius=post.radius, height=post.height)]
 
     def markers(self, env: int) -> list[Any]:
-        places, following = self.episode["places"][env], int(self.episode["next"][env])
-        colours = [WAYPOINT] * (WAYPOINTS - 1) + [GOAL]
-        ahead = [(x, colours[k]) for k in range(following, WAYPOINTS) for x in places[k]]
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        ahead = [
+            Solid(kind="sphere", center=tuple(x.tolist()), radius=0.02, color=GOAL if k == WAYPOINTS - 1 else WAYPOINT)
+            for k in range(int(self.episode["next"][env]), WAYPOINTS)
+            for x in self.episode["places"][env, k]
+        ]
         return [*super().markers(env), *ahead]
 
     def camera(self) -> Camera:

@@ -160,6 +160,10 @@ class Task(ABC):
         """What else ``info`` tells of a step, (num_envs,) each; strain: the largest of the structural springs', (num_envs,)."""
         return {}
 
+    def _prices(self, failure: NDArray, info: dict[str, Any]) -> dict[str, NDArray]:
+        """Reward terms of the task's own, (num_envs,) each; failure: index into FAILURES."""
+        return {}
+
     def _done(self) -> NDArray:
         """Whether each environment's agent is done before its time is up, (num_envs,)."""
         return np.zeros(self.num_envs, bool)
@@ -292,7 +296,7 @@ class Task(ABC):
         info: dict[str, Any] = {"strain_max": strain} | self._account(running, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
-        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info)
+        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info) | self._prices(failure, info)
         reward = np.zeros(self.num_envs)
         for term in terms.values():
             reward += term

@@ -20,17 +20,26 @@ INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
 
 
 def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references: dict[str, float]) -> None:
-    """Held-out success and performance over training time, with the references as level lines."""
+    """Held-out success and performance over training time, with the references as level lines; below it the cost, if any."""
     minutes = [line["training_seconds"] / 60 for line in lines]
-    figure, axes = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
+    costly = "cost" in lines[0]
+    figure, panels = plt.subplots(
+        1 + costly, 1, figsize=(6.4, 5.4 if costly else 3.8), layout="constrained", sharex=True, squeeze=False
+    )
+    axes = panels[0, 0]
     axes.plot(minutes, [line["success_rate"] for line in lines], color=ACCENT, marker="o", ms=3, label="success rate")
     axes.plot(minutes, [line["normalized_performance"] for line in lines], color=INK, lw=1, label="normalized performance")
     for name, level in references.items():
         axes.axhline(level, color=QUIET, lw=0.8, ls="--")
         axes.annotate(name, (1.0, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=QUIET, fontsize=8)
-    axes.set(xlabel="training time [minutes]", ylabel="held-out episodes", ylim=(-0.02, 1.02), title=folder.name)
+    axes.set(ylabel="held-out episodes", ylim=(-0.02, 1.02), title=folder.name)
     axes.legend(frameon=False, loc="center right")
-    axes.spines[["top", "right"]].set_visible(False)
+    if costly:
+        panels[1, 0].plot(minutes, [line["cost"] for line in lines], color=ACCENT, marker="o", ms=3)
+        panels[1, 0].set(ylabel="mean cost of an episode", yscale="symlog", ylim=(0, None))
+    panels[-1, 0].set(xlabel="training time [minutes]")
+    for panel in panels[:, 0]:
+        panel.spines[["top", "right"]].set_visible(False)
     figure.savefig(folder / "learning_curve.png", dpi=150)
     plt.close(figure)
 
