@@ -393,7 +393,10 @@ class ClothStrainEnv(ClothEnv):
 
     | policy | arrives | mean cost | at no cost | steps |
     | --- | --- | --- | --- | --- |
-    TABLE
+    | nothing | 0.000 | 0.00 | | 150 |
+    | random | 0.000 | 40.8 | | 41, then it tears |
+    | careless | 1.000 | 9.38 | 0.000 | 46 |
+    | expert | 1.000 | 0.14 | 0.956 | 97 |
 
     ## Starting State
     The sheet hangs at rest 0.65 m before the post, with a ripple of a millimetre; start, post, the side on which to pass it,
