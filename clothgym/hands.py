@@ -95,7 +95,7 @@ class Hands:
         blocks = self.layout.to_blocks
         self.x, self.targets = blocks(x, dtype), blocks(targets, dtype)
         self.opening, self.wanted = blocks(opening, dtype), blocks(wanted, dtype)
-        self.holder = blocks(holder, np.dtype(np.int8))
+        self.holder = blocks(holder, np.dtype(np.int16))
         self.limits = self.limits.astype(dtype)
 
     def begin(self, block: NDArray, lane: NDArray, particles: NDArray) -> None:

@@ -41,7 +41,7 @@ def advance(first, last, x, v, w, springs, surface, fabric, kinds, colliders, h,
                 push[:] = 0
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(  # noqa: F821 - the integrator's, bound by specialize
-                x[b], v[b], w[b], springs, stiffness[b], damping_time[b], drag_rate[b], gravity[b], wind[b], push, h, work
+                x[b], v[b], w[b], springs, stiffness[b], damping_time[b], drag_rate[b], gravity[b], push, h, work
             )
             resolve(x[b], v[b], w[b], kinds, colliders[b], h, contact)
 

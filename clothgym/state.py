@@ -41,7 +41,7 @@ class Fabric(NamedTuple):
     """Parameters that may differ by lane.
 
     stiffness: spring constants by kind [N/m], (block, kinds, lane).  damping_time [s], (block, lane).
-    drag_rate: linear air drag per mass [1/s], (block, lane).  resistance: half the air's density times the coefficients
+    drag_rate: linear drag per mass [1/s], (block, lane).  resistance: half the air's density times the coefficients
     of drag and skin friction [kg/m^3], (block, 2, lane).  gravity [m/s^2] and wind [m/s], (block, 3, lane).
     """
 
@@ -170,7 +170,7 @@ def at_rest(
         velocities=np.zeros((num_envs, mesh.num_particles, 3)),
         free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
         anchors=each(anchors),
-        holder=np.full((num_envs, mesh.num_particles), -1, np.int8),
+        holder=np.full((num_envs, mesh.num_particles), -1, np.int16),
         hand_positions=np.zeros((num_envs, hands, 3)),
         hand_targets=np.zeros((num_envs, hands, 3)),
         openings=np.zeros((num_envs, hands)),

@@ -40,7 +40,7 @@ def draw_strips() -> None:
         "drape.png": [strip("ClothDrape-v0", (0, 22, 34), 7, target) for target in targets],
         "gripper.png": [
             strip("ClothDrapeGripper-v0", (0, 12, 28, 42), 9, {"rumpled": False}),
-            strip("ClothDrapeGripper-v0", (0, 12, 28, 42), 4, {"rumpled": True}),
+            strip("ClothDrapeGripper-v0", (0, 14, 30, 46), 9, {"rumpled": True}),
         ],
         "strain.png": [
             strip("ClothStrain-v0", (0, 30, 50, 75), 7),

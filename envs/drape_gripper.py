@@ -41,7 +41,7 @@ class DrapeGripperTask(DrapeTask):
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
 
     def __init__(self, num_envs: int, grippers: int = 2, slip_force: float | None = None, **kwargs: Any) -> None:
-        if grippers not in PLACES:
+        if isinstance(grippers, bool) or not isinstance(grippers, (int, np.integer)) or grippers not in PLACES:
             raise ValueError(f"grippers={grippers!r}: must be 1 or 2")
         hand = Gripper(speed=2 * DrapeTask.physics.hand_speed, reach=REACH, slip_force=slip_force)
         self.physics = replace(DrapeTask.physics, anchors=(), grippers=(hand,) * grippers)  # type: ignore[misc]
@@ -205,8 +205,9 @@ class ClothDrapeGripperEnv(ClothEnv):
     The sheet and the targets are those of ``ClothDrape-v0``, and so is the judgement.  But the sheet lies on the floor, flat or
     rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
     when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
-    hold as often as it likes.  The fingers do not push the cloth.  After 100 steps they open, and the sheet settles for 40
-    steps, in which actions are ignored; then it is judged.
+    hold as often as it likes.  The fingers do not push the cloth, and solids do not stop a gripper.  After 100 steps they open,
+    and the sheet settles for 40 steps, in which actions are ignored; then it is judged.  To hold it in the right place until
+    then is as good as to let go.
 
     The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 50 substeps, friction 0.5, linear air drag of
     0.72 N s/m3.
@@ -260,7 +261,7 @@ class ClothDrapeGripperEnv(ClothEnv):
     | Argument | Default | Meaning |
     | --- | --- | --- |
     | ``grippers`` | 2 | or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder) |
-    | ``slip_force`` | ``None`` | pull of the cloth at which it slips out of a gripper [N]; the sheet weighs 0.53 N |
+    | ``slip_force`` | ``None`` | pull at which the cloth slips out of a gripper [N]; it weighs 0.53 N |
     | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
     | ``substeps`` | 50 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |

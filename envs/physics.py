@@ -51,7 +51,12 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
     for name, bounds in ranges.items():
         if name not in FIGURES:
             raise ValueError(f"randomize: no material figure {name!r} (there are: {', '.join(FIGURES)})")
-        if np.shape(bounds) != (2,) or not np.all(np.isfinite(bounds)) or bounds[0] > bounds[1]:
+        if (
+            np.shape(bounds) != (2,)
+            or np.asarray(bounds).dtype.kind not in "iuf"
+            or not np.all(np.isfinite(bounds))
+            or bounds[0] > bounds[1]
+        ):
             raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
         for bound in bounds:
             Material(**{name: float(bound)})  # type: ignore[arg-type]

@@ -28,6 +28,7 @@ DRIVEN, FREE = SHEET.corners[2], SHEET.corners[1]  # opposite corners: the sheet
 
 NEAR_ENOUGH, CALM_ENOUGH = 0.05, 0.1  # in sides, and sides a second
 CALM_SCALE = 0.2  # sides a second: performance is halved at this speed
+NEAREST = 0.2  # in sides: the way to a goal that is nearer than this counts as so long
 CLOSE_SCALE = 0.15  # in sides: how the potential rises near the goal
 LOW, HIGH = np.array([-0.8, -0.8, 0.9]), np.array([0.8, 0.8, 1.7])  # room of the driven corner [m]
 GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that room [m]
@@ -80,7 +81,7 @@ class ReachTask(Task):
         goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
         x = start + hanging() + rng.normal(scale=1e-4, size=hanging().shape)
         self._place_goal(env, goal)
-        self.episode["distance"][env] = length(x[FREE] - goal)
+        self.episode["distance"][env] = max(length(x[FREE] - goal), NEAREST * SIDE)
         return x
 
     def _place_goal(self, env: int, goal: NDArray) -> None:
@@ -195,9 +196,9 @@ class ClothReachEnv(ClothEnv):
 
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  With the free corner's distance d to the goal, d0 at the start, and its speed v, the potential on the
-    way is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``; at the end it is the normalised
-    performance, at a failure 0.
+    0.25 for a success.  With the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the
+    potential on the way is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``; at the end it is
+    the normalised performance, at a failure 0.
     ``reward_mode="sparse"``: the normalised performance, at the judgement.
 
     ## Judgement

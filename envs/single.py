@@ -38,6 +38,8 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         return self.task.episode["observation"][0].copy(), {"failure": ""}
 
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
         outcome = self.task.step(np.asarray(action)[None])
         observation = self.task.episode["observation"][0].copy()
         return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), bool(outcome.truncated[0]), pick(outcome.info, 0)

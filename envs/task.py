@@ -18,6 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit
+from clothgym.checks import number
 from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, within_ball
 from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, see_points, summarize
 from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, checked_wind, most_demanding
@@ -32,6 +33,7 @@ REWARD_MODES = ("delta", "sparse")
 FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
+MOST_STRAIN = 1e3  # what is told of a sheet that has diverged
 HELD = (250, 200, 60)  # colour of the anchors' markers
 POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
 
@@ -156,7 +158,7 @@ class Task(ABC):
     def _grip(self, moves: NDArray, acting: NDArray) -> None:  # noqa: B027 - some only move
         """Do what an action says beside where to move, after the step; all must have let go where the time for acting is up."""
 
-    def _account(self, running: NDArray, strain: NDArray) -> dict[str, NDArray]:
+    def _account(self, running: NDArray, failure: NDArray, strain: NDArray) -> dict[str, NDArray]:
         """What else ``info`` tells of a step, (num_envs,) each; strain: the largest of the structural springs', (num_envs,)."""
         return {}
 
@@ -196,7 +198,7 @@ class Task(ABC):
 
     def reset(self, envs: NDArray, seeds: Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> None:
         """Begin new episodes; a seed of None goes on with the environment's generator."""
-        options = options or {}
+        options = {} if options is None else options
         self._check_options(options)
         if not len(envs):
             return
@@ -234,15 +236,18 @@ class Task(ABC):
 
     def _check_options(self, options: Mapping[str, Any]) -> None:
         """Refuse options that no episode can have, before anything is changed."""
+        if not isinstance(options, Mapping):
+            raise ValueError(f"reset options={options!r}: must be a dict with any of {', '.join(self.reset_options)}")
         unknown = set(options) - set(self.reset_options)
         if unknown:
             raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
         material = options.get("material", {})
         if not isinstance(material, Mapping):
             raise ValueError(f"reset option material={material!r}: must be a dict of figures")
-        for name in material:
+        for name, value in material.items():
             if name not in FIGURES:
                 raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
+            number(f"reset option material: {name}", value)
         check_springs_exist(self.physics, self.randomize | {name: (value, value) for name, value in material.items()})
 
     def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
@@ -257,7 +262,10 @@ class Task(ABC):
         Raises:
             ValueError: a wrong shape or a value that is not finite; nothing has moved then.
         """
-        array = np.asarray(actions, dtype=np.float64)
+        try:
+            array = np.asarray(actions, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"action {actions!r}: must be an array of numbers") from None
         shape = (self.num_envs, *self.single_action_space.shape)
         if array.shape != shape:
             raise ValueError(f"action has shape {array.shape}: must be {shape}")
@@ -292,8 +300,8 @@ class Task(ABC):
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
         with np.errstate(invalid="ignore"):
-            strain = np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, np.inf)
-        info: dict[str, Any] = {"strain_max": strain} | self._account(running, strain) | self._judgement()
+            strain = np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, MOST_STRAIN)
+        info: dict[str, Any] = {"strain_max": strain} | self._account(running, failure, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
         terms = self._reward_terms(moves, acting, running, judged, failure, summary, info) | self._prices(failure, info)

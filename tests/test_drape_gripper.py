@@ -62,7 +62,7 @@ def potential(env, places=CORNERS):
     drape = (near + 1 / (1 + (off / 0.2) ** 2)) / 2
     away = np.linalg.norm(x[places] - tips(env)[0], axis=1)
     held = env.get_state().simulation.holder[0, places] >= 0
-    return 0.7 * drape + 0.3 * np.mean(np.where(held, 1, 0.5 / (1 + (away / (0.3 * SIDE)) ** 2)))
+    return 0.7 * drape + 0.3 * np.mean(np.where(held, 1, 0.5 / (1 + (away / (0.15 * SIDE)) ** 2)))
 
 
 def judgement(env, index=0):

@@ -108,8 +108,7 @@ def test_a_flat_sheet_s_force_is_spread_by_the_area_that_particles_stand_for(mes
 
 def test_there_is_no_force_in_the_wind_s_own_frame():
     wind = np.array([1.5, -0.5, 0.3])
-    for figures in ({}, {"air_drag": 0.7}):
-        assert np.abs(air(SHEET, tilted(0.7), wind, wind, **figures)).max() < 1e-9
+    assert np.abs(air(SHEET, tilted(0.7), wind, wind)).max() < 1e-9
     # and only the difference of velocities counts
     moving = air(SHEET, tilted(0.7), wind + (1, 0, 2), wind)
     assert moving == pytest.approx(air(SHEET, tilted(0.7), 0.0, (-1, 0, -2)), rel=1e-5, abs=1e-9)
@@ -120,14 +119,13 @@ def test_drag_grows_with_the_square_and_the_linear_drag_with_the_speed():
         return air(SHEET, SHEET.rest_positions, 0.0, (0, 0, speed), **kwargs).sum(axis=0)[2]
 
     assert lift_off(2.0) == pytest.approx(4 * lift_off(1.0), rel=1e-6)
-    linear = {"air_density": 0.0, "air_drag": 0.5}
-    assert lift_off(1.0, **linear) == pytest.approx(0.5 * AREA, rel=1e-4)
-    assert lift_off(2.0, **linear) == pytest.approx(2 * lift_off(1.0, **linear), rel=1e-6)
-    assert lift_off(2.0, air_drag=0.5) == pytest.approx(lift_off(2.0) + lift_off(2.0, **linear), rel=1e-4)
     assert lift_off(2.0, air_density=0.0) == 0
-    # edge on the linear drag is the same: it asks for no normal
-    edge = air(SHEET, SHEET.rest_positions, 0.0, (2.0, 0, 0), **linear).sum(axis=0)
-    assert edge == pytest.approx([0.5 * AREA * 2, 0, 0], rel=1e-4, abs=1e-9)
+    # the linear drag is against still air, and asks for no normal
+    linear = {"air_density": 0.0, "air_drag": 0.5}
+    assert lift_off(2.0, **linear) == 0
+    for velocity in ((0, 0, -1.0), (0, 0, -2.0), (-2.0, 0, 0)):
+        slowed = air(SHEET, SHEET.rest_positions, velocity, (0, 0, 0), **linear).sum(axis=0)
+        assert slowed == pytest.approx(-0.5 * AREA * np.array(velocity), rel=1e-4, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -145,13 +143,14 @@ def test_a_flat_sheet_falls_at_the_terminal_velocity(name, density):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_free_sheet_drifts_with_the_wind(name):
-    """Without weight, linear and quadratic drag bring it to the wind's own velocity."""
-    wind = np.array([1.0, -0.5, 0.0])
+    """Without weight, face on: v = w - w/(1 + k w t), k = rho C_D/(2 density)."""
+    density, w = 0.05, 1.5
     s = Simulation(
-        grid(5, 5, 0.3, 0.3), Material(density=0.05, air_drag=0.5), integrator=name, gravity=(0, 0, 0), wind=wind, time_step=1 / 60
+        grid(5, 5, 0.3, 0.3), Material(density=density), integrator=name, gravity=(0, 0, 0), wind=(0, 0, w), time_step=1 / 60
     )
-    s.step(120)
-    assert s.velocities[0] == pytest.approx(np.tile(wind, (25, 1)), abs=1e-2)
+    s.step(30)
+    expected = w - w / (1 + RHO * CD / (2 * density) * w * 0.5)
+    assert s.velocities[0, :, 2] == pytest.approx(np.full(25, expected), rel=0.02)
 
 
 def test_wind_differs_by_environment_and_is_part_of_the_state(tmp_path):
@@ -281,7 +280,10 @@ def test_wind_blows_in_every_environment(env_id):
     assert not still[:, :, :3].any()
     assert moved[:, :, :3] == pytest.approx(np.broadcast_to([0, 3, 0], (8, 2, 3)), abs=1e-6)
     drift = windy.get_state().simulation.positions - calm.get_state().simulation.positions
-    assert np.all(drift[:, :, 1].mean(axis=1) > 0.01)
+    # a sheet that lies on the floor stays there: skin friction is less than the floor's
+    lies = start[:, :, 2].max() < 0.1
+    along = drift[:, :, 1].mean(axis=1)
+    assert np.all(np.abs(along) < 1e-3) if lies else np.all(along > 2e-3)
     # with the keyword there is air about; without it, as the id says
     assert calm.unwrapped.task.simulation.air_density == RHO
     assert own.unwrapped.task.simulation.air_density == own.unwrapped.task.physics.air_density

@@ -143,8 +143,9 @@ def main(args: Args) -> None:
     kwargs: dict[str, Any] = {}
     for name in args.policy:
         kwargs |= policies.env_kwargs(name)
-    for name in args.policy:
-        policy = policies.named(name, args.env, args.seed)
+    # a name that is none is told before anything runs
+    chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
+    for name, policy in chosen.items():
         episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
         scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
     print(f"{args.env}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")

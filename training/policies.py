@@ -34,8 +34,6 @@ def expert(env: Any, observations: NDArray) -> NDArray:
 
 
 def careless(env: Any, observations: NDArray) -> NDArray:
-    if not hasattr(env.unwrapped.task, "careless_actions"):
-        raise ValueError("careless: only ClothStrain-v0 has a careless expert")
     return env.unwrapped.task.careless_actions().astype(np.float32)
 
 
@@ -53,6 +51,8 @@ def named(name: str, env_id: str, seed: int) -> Policy:
     Raises:
         FileNotFoundError, ValueError: no such policy, or a checkpoint of another environment or version.
     """
+    if name == "careless" and env_id != "ClothStrain-v0":
+        raise ValueError(f"careless: only ClothStrain-v0 has a careless expert, not {env_id}")
     if name in SCRIPTED:
         return SCRIPTED[name]
     if name == "random":
@@ -69,7 +69,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     folder = folder.parent if folder.name == CHECKPOINT else folder
     if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():
         raise FileNotFoundError(
-            f"{str(folder)!r} is neither noop, random, expert nor a run's folder: it lacks {CONFIG} or {CHECKPOINT}. "
+            f"{str(folder)!r} is neither noop, random, expert, careless nor a run's folder: it lacks {CONFIG} or {CHECKPOINT}. "
             "Train one with: python training/train.py --env ClothDrape-v0"
         )
     config = json.loads((folder / CONFIG).read_text())

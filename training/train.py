@@ -202,7 +202,10 @@ def _linear(text: str) -> Any:
 
 
 def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
-    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit."""
+    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit, and where
+    costs have a price the return tells."""
+    if config["env_kwargs"].get("cost_penalty"):
+        return line["return"]
     limit = config["lagrange"].get("cost_limit", math.inf)
     return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
 

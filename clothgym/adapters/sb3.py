@@ -1,7 +1,7 @@
 """Stable-Baselines3's VecEnv over the native batch.
 
-SB3 takes no Gymnasium ``VectorEnv``; this is the thin coat it needs.  Infos are built for the environments that ended and for
-no others: filling a dictionary an environment and step would cost more than the physics of a small sheet.
+SB3 takes no Gymnasium ``VectorEnv``; this is the thin coat it needs.  Infos are built for the environments that ended and, but
+for a task's cost, for no others: filling a dictionary an environment and step would cost more than the physics of a small sheet.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ class ClothSB3VecEnv(VecEnv):
     def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
         observation, reward, terminated, truncated, info = self.env.step(self._actions)  # type: ignore[arg-type]
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        # a constrained learner needs each step's cost
+        infos: list[dict[str, Any]] = [{"cost": float(c)} for c in info["cost"]] if "cost" in info else [{} for _ in done]
         if done.any():
             final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
             final["reward_terms"] = {k: v for k, v in final["reward_terms"].items() if not k.startswith("_")}

@@ -2,7 +2,7 @@
 
 To add one: write a file whose last function is its whole substep, a kernel with the signature
 
-    substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, push, h, work)
+    substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push, h, work)
 
 on one block of lanes, and describe it by an ``Integrator``.  The substep advances positions ``x`` [m] and velocities ``v``
 [m/s], (particles, 3, lanes), by ``h`` [s].  ``w``: inverse masses [1/kg], (particles, lanes); a particle with ``w = 0`` is
@@ -57,8 +57,8 @@ class Integrator:
 
 
 @kernel
-def advance_velocities(v, w, f, gravity, wind, drag_rate, h, row):
-    """Add ``h (f w + gravity)``, then linear air drag, implicitly: ``v <- wind + (v - wind)/(1 + h drag_rate)``.
+def advance_velocities(v, w, f, gravity, drag_rate, h, row):
+    """Add ``h (f w + gravity)``, then linear drag, implicitly: ``v <- v/(1 + h drag_rate)``.
 
     Held particles keep their velocity.  f [N], (particles, 3, lanes).  row: scratch, (1, lanes).
     """
@@ -69,9 +69,9 @@ def advance_velocities(v, w, f, gravity, wind, drag_rate, h, row):
     for p in range(v.shape[0]):
         wp = w[p]
         for c in range(3):
-            vc, fc, gc, ac = v[p, c], f[p, c], gravity[c], wind[c]
+            vc, fc, gc = v[p, c], f[p, c], gravity[c]
             for l in range(v.shape[2]):
-                free = ac[l] + (vc[l] + h * (fc[l] * wp[l] + gc[l]) - ac[l]) * keep[l]
+                free = (vc[l] + h * (fc[l] * wp[l] + gc[l])) * keep[l]
                 vc[l] = free if wp[l] > 0 else vc[l]
 
 

@@ -34,12 +34,12 @@ def surely_allowed(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inv
 
 
 @kernel
-def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, push, h, work):
+def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push, h, work):
     f = work[:-1]
     row = work[-1]
     f[:] = push
     add_spring_forces(x, v, f, springs, stiffness, damping_time, row)
-    advance_velocities(v, w, f, gravity, wind, drag_rate, h, row)
+    advance_velocities(v, w, f, gravity, drag_rate, h, row)
     advance_positions(x, v, h)
 
 

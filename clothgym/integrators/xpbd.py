@@ -115,7 +115,7 @@ def _project_undamped_springs_of_one(x, w, springs, compliance):
 
 
 @kernel
-def predict(x, v, w, start, gravity, wind, push, drag_rate, h, row):
+def predict(x, v, w, start, gravity, push, drag_rate, h, row):
     """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity."""
     one = x.dtype.type(1)
     keep = row[0]
@@ -124,9 +124,9 @@ def predict(x, v, w, start, gravity, wind, push, drag_rate, h, row):
     for p in range(x.shape[0]):
         wp = w[p]
         for c in range(3):
-            xc, vc, sc, fc, gc, ac = x[p, c], v[p, c], start[p, c], push[p, c], gravity[c], wind[c]
+            xc, vc, sc, fc, gc = x[p, c], v[p, c], start[p, c], push[p, c], gravity[c]
             for l in range(x.shape[2]):
-                free = ac[l] + (vc[l] + h * (fc[l] * wp[l] + gc[l]) - ac[l]) * keep[l]
+                free = (vc[l] + h * (fc[l] * wp[l] + gc[l])) * keep[l]
                 vc[l] = free if wp[l] > 0 else vc[l]
                 sc[l] = xc[l]
                 xc[l] += h * vc[l]
@@ -150,11 +150,11 @@ def take_velocities(x, v, w, start, h):
 
 
 @kernel
-def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, wind, push, h, work):
+def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push, h, work):
     one = x.dtype.type(1)
     lanes = x.shape[2]
     start = work[:-1]
-    predict(x, v, w, start, gravity, wind, push, drag_rate, h, work[-1])
+    predict(x, v, w, start, gravity, push, drag_rate, h, work[-1])
     compliance = np.empty_like(stiffness)
     for kind in range(stiffness.shape[0]):
         for l in range(lanes):
