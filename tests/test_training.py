@@ -109,7 +109,7 @@ def test_the_learnt_policy_is_evaluated_beside_the_references(trained):
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--policy", "nowhere"), "neither noop, random, expert nor a run"),
+        (("--policy", "nowhere"), "neither noop, random, expert, careless nor a run"),
         (("--episodes", "0"), "must be at least 1"),
         (("--policy", "careless", "--episodes", "2"), "careless: only ClothStrain-v0 has a careless expert"),
     ],
