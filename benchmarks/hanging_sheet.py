@@ -96,7 +96,7 @@ def rms(a: NDArray, b: NDArray) -> float:
 
 def simulation(method: str, damping_time: float, substeps: int, air_drag: float = 0.0, **kwargs: Any) -> Simulation:
     material = replace(COTTON, damping_time=damping_time, air_drag=air_drag)
-    defaults: dict[str, Any] = {"anchors": SHEET.corners[2:], "threads": 1, "time_step": FRAME}
+    defaults: dict[str, Any] = {"anchors": SHEET.corners[2:], "threads": 1, "time_step": FRAME, "air_density": 0.0}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # settings beyond a method's bound are part of the plot
         return Simulation(SHEET, material, integrator=method, substeps=substeps, **defaults | kwargs)
@@ -201,7 +201,7 @@ def drape_end(substeps: int, dtype: str) -> NDArray:
     """The task's sheet, flat and held at two corners, after half a second of its own control steps [m], (particles, 3)."""
     p = DrapeTask.physics
     s = Simulation(
-        p.mesh, p.material, 1, EULER, time_step=p.time_step, substeps=substeps, anchors=p.anchors, dtype=dtype, threads=1
+        p.mesh, p.material, 1, EULER, p.time_step, substeps, air_density=p.air_density, anchors=p.anchors, dtype=dtype, threads=1
     )
     s.step(round(0.5 / p.time_step))
     return s.positions[0]

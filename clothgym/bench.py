@@ -64,7 +64,7 @@ def seconds_per_call(call: Callable[[], object], budget: float = 0.5) -> float:
 
 
 def core_rows(quick: bool) -> Iterator[Row]:
-    """A sheet of a metre, hanging from two corners at 60 Hz, with automatic substeps."""
+    """A sheet of a metre, hanging from two corners in air at 60 Hz, with automatic substeps."""
     sides = (17, 25) if quick else (13, 17, 25, 35, 50)
     batches = (1, 64) if quick else (1, 16, 64, 256)
     for integrator in INTEGRATORS:
