@@ -78,7 +78,8 @@ def read_config(folder: Path) -> dict[str, Any]:
             f"{str(folder)!r} was trained with clothgym {config.get('clothgym')}, this is {clothgym.__version__}: "
             "its scores would not be comparable; train anew, or install that version"
         )
-    return config
+    # runs from before there was a choice of learners were PPO's
+    return {"algo": "ppo", "lagrange": {}, "clone": {}} | config
 
 
 def learnt(folder: Path, env_id: str) -> Policy:
