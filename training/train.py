@@ -4,7 +4,7 @@
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
     python training/train.py --env ClothStrain-v0 --algo ppo_lagrange   # runs/ClothStrain-v0_ppo_lagrange_0
     python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
-    python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption
+    python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored anew
 
 The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
 (Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), evaluation.json (the final
@@ -231,18 +231,18 @@ def train(args: Args) -> Path:
     callbacks: list[BaseCallback] = [watch]
     if config["algo"] == "ppo_lagrange":
         callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
-    try:
-        if config["timesteps"] > done:
+    seconds = watch.trained_before
+    if config["timesteps"] > done:
+        try:
             # learn() counts its steps on top of those done when the counter is not reset
-            model.learn(
-                config["timesteps"] - done, callback=callbacks, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo"
-            )
-    except KeyboardInterrupt:
-        policies.save_checkpoint(folder, model)
-        raise SystemExit(f"interrupted: go on with  python training/train.py --resume {folder}") from None
-    seconds = watch.training_seconds
-    watch.evaluate()
-    model.save(folder / "model.zip")
+            left = config["timesteps"] - done
+            model.learn(left, callback=callbacks, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo")
+        except KeyboardInterrupt:
+            policies.save_checkpoint(folder, model)
+            raise SystemExit(f"interrupted: go on with  python training/train.py --resume {folder}") from None
+        seconds = watch.training_seconds
+        watch.evaluate()
+        model.save(folder / "model.zip")
     finish(folder, config, seconds, args.final_episodes)
     return folder
 
