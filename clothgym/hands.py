@@ -72,6 +72,7 @@ class Hands:
         anchor_speed: float,
         grippers: Sequence[Gripper],
         time_step: float,
+        dtype: np.dtype,
     ) -> None:
         self.layout, self.grippers, self.time_step = layout, tuple(grippers), time_step
         self.members = np.concatenate([np.zeros(0, np.int64), *patches])
@@ -86,17 +87,16 @@ class Hands:
         for g in self.grippers:
             slip = np.inf if g.slip_force is None else g.slip_force**2
             rows.append((g.speed, time_step / g.closing_time, g.reach**2, slip))
-        self.limits = np.array(rows).reshape(-1, 4)
+        self.limits = np.array(rows, dtype).reshape(-1, 4)
         self.can_slip = bool(np.isfinite(self.limits[:, SLIP2]).any())
         self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
 
-    def restore(self, x: NDArray, targets: NDArray, opening: NDArray, wanted: NDArray, holder: NDArray, dtype: np.dtype) -> None:
+    def restore(self, x: NDArray, targets: NDArray, opening: NDArray, wanted: NDArray, holder: NDArray) -> None:
         """Take over public arrays, (num_envs, ...)."""
-        blocks = self.layout.to_blocks
+        blocks, dtype = self.layout.to_blocks, self.limits.dtype
         self.x, self.targets = blocks(x, dtype), blocks(targets, dtype)
         self.opening, self.wanted = blocks(opening, dtype), blocks(wanted, dtype)
         self.holder = blocks(holder, np.dtype(np.int16))
-        self.limits = self.limits.astype(dtype)
 
     def begin(self, block: NDArray, lane: NDArray, particles: NDArray) -> None:
         """Put hands back: anchors hold their particles where these are, grippers are open and at home.
@@ -188,6 +188,11 @@ class Grippers:
     def openings(self) -> NDArray:
         """How far the fingers are open, from 0 to 1, (num_envs, grippers); a fresh copy."""
         return self._hands.layout.to_public(self._hands.opening)[:, self._first :]
+
+    @property
+    def wanted(self) -> NDArray:
+        """How far the fingers were told to open, from 0 to 1, (num_envs, grippers); a fresh copy."""
+        return self._hands.layout.to_public(self._hands.wanted)[:, self._first :]
 
     @property
     def holder(self) -> NDArray:

@@ -126,7 +126,7 @@ class Simulation:
         self.threads = threads if threads is not None else _jit.default_threads()
         self.layout = Layout.choose(int(num_envs), self.threads)
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
-        self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step)
+        self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
         self.colliders = tuple(colliders)
@@ -414,7 +414,7 @@ class Simulation:
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
-        self._hands.restore(state.hand_positions, state.hand_targets, state.openings, state.wanted_openings, state.holder, dtype)
+        self._hands.restore(state.hand_positions, state.hand_targets, state.openings, state.wanted_openings, state.holder)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
         self._colliders = blocks(state.colliders, dtype)

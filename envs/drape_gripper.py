@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.drape import EXPERT_SPEED, SHEET, SIDE, THICKNESS, DrapeTask
+from clothgym.envs.episode import length
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.task import POSITION_BOUND
 from clothgym.envs.vector import ClothVectorEnv
@@ -47,12 +48,8 @@ class DrapeGripperTask(DrapeTask):
         self.physics = replace(DrapeTask.physics, anchors=(), grippers=(hand,) * grippers)  # type: ignore[misc]
         self.places = np.array(PLACES[grippers])
         super().__init__(num_envs, **kwargs)
-        self.episode |= {
-            "wanted": np.ones((num_envs, grippers)),  # opening that the fingers were told
-            "picked": np.zeros((num_envs, grippers), bool),  # whether each place has ever been held
-            "holding": np.zeros((num_envs, grippers), bool),
-            "homes": np.zeros((num_envs, grippers, 3)),
-        }
+        self.episode["picked"] = np.zeros((num_envs, grippers), bool)  # whether each place has ever been held
+        self._homes = np.zeros((num_envs, grippers, 3))  # where the grippers begin, between _begin and _place_hands
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -75,27 +72,23 @@ class DrapeGripperTask(DrapeTask):
         x[:, 2] += np.abs(rng.normal(scale=1e-4, size=len(x)))
         count = len(self.places)
         away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
-        self.episode["homes"][env] = x[self.places] + SIDE * away
-        self.episode["wanted"][env] = 1
+        self._homes[env] = x[self.places] + SIDE * away
         self.episode["picked"][env] = False
-        self.episode["holding"][env] = False
         return x
 
     def _place_hands(self, envs: NDArray) -> None:
-        self.simulation.grippers.place(self.episode["homes"][envs], envs)
+        self.simulation.grippers.place(self._homes[envs], envs)
 
     # --- gripping -------------------------------------------------------------------------------------------------------
 
     def _order(self, targets: NDArray, moves: NDArray, acting: NDArray) -> None:
         """Fingers do what the action says last, and open when time is up."""
         order = moves[:, :, 3]
-        told = np.where(order < CLOSES, 0.0, np.where(order > OPENS, 1.0, self.episode["wanted"]))
-        self.episode["wanted"] = np.where(acting[:, None], told, 1.0)
-        self.simulation.grippers.move(targets, self.episode["wanted"])
+        told = np.where(order < CLOSES, 0.0, np.where(order > OPENS, 1.0, self.simulation.grippers.wanted))
+        self.simulation.grippers.move(targets, np.where(acting[:, None], told, 1.0))
 
     def _grip(self, moves: NDArray, acting: NDArray) -> None:
-        """See who holds what."""
-        self.episode["holding"] = self.simulation.grippers.held > 0
+        """Remember what has been taken."""
         self.episode["picked"] |= self._taken()
 
     def _done(self) -> NDArray:
@@ -105,7 +98,7 @@ class DrapeGripperTask(DrapeTask):
     # --- what the agent sees --------------------------------------------------------------------------------------------
 
     def _holds(self) -> NDArray:
-        return self.episode["holding"]
+        return self.simulation.grippers.held > 0
 
     def _more_bounds(self) -> list[float]:
         return [*super()._more_bounds(), *([POSITION_BOUND] * 3 + [10 * POSITION_BOUND] * 3 + [1.0]) * self.num_hands]
@@ -125,8 +118,8 @@ class DrapeGripperTask(DrapeTask):
     # --- how it is rewarded ---------------------------------------------------------------------------------------------
 
     def _potential(self, summary: NDArray) -> NDArray:
-        away = self._to_places(self.simulation.grippers.positions).astype(np.float64)
-        near = 1 / (1 + (away[..., 0] ** 2 + away[..., 1] ** 2 + away[..., 2] ** 2) / PICK_SCALE**2)
+        away = length(self._to_places(self.simulation.grippers.positions).astype(np.float64))
+        near = 1 / (1 + (away / PICK_SCALE) ** 2)
         taken = np.where(self._taken(), 1.0, near / 2)
         share = taken[:, 0] if self.num_hands == 1 else (taken[:, 0] + taken[:, 1]) / 2
         return PICKING * share + (1 - PICKING) * super()._potential(summary)
@@ -138,7 +131,7 @@ class DrapeGripperTask(DrapeTask):
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """To the corners, close, up, over the target and a quarter of a side beyond it, down, open, and away.
+        """To the corners, close, up, over the target and a third of a side beyond it, down, open, and away.
 
         Without memory: where the hands are, and what they hold, says which part of the way they are on.
         """
@@ -166,9 +159,8 @@ class DrapeGripperTask(DrapeTask):
         move = np.where(ready[..., None], carry, np.where((begun & ~ready)[..., None], (0.0, 0.0, 0.1), to_place / 2))
         move = np.where((own & ~ready)[..., None], 0.0, move)
         move /= self.physics.time_step * self.physics.hand_speed
-        length = np.sqrt(move[..., 0] ** 2 + move[..., 1] ** 2 + move[..., 2] ** 2)
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[..., None]
-        near = to_place[..., 0] ** 2 + to_place[..., 1] ** 2 + to_place[..., 2] ** 2 < (REACH / 2) ** 2
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
+        near = length(to_place) < REACH / 2
         grip = np.where(begun & (down | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
         return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
 
@@ -183,7 +175,7 @@ class DrapeGripperTask(DrapeTask):
         solids = []
         for hand in range(self.num_hands):
             x, y, z = self.simulation.grippers.positions[env, hand].tolist()
-            opening = 0.0 if self.episode["holding"][env, hand] else float(self.simulation.grippers.openings[env, hand])
+            opening = 0.0 if self._holds()[env, hand] else float(self.simulation.grippers.openings[env, hand])
             half = 0.006 + opening * self.physics.grippers[hand].span / 2
             for finger in (x - half, x + half):
                 solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))

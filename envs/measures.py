@@ -15,6 +15,7 @@ from clothgym.mesh import ClothMesh
 # columns of ``summarize``'s output
 CENTROID, SPEED2, STRETCH2, FINITE = 0, 3, 4, 5
 SUMMARY = 6
+MOST_STRAIN = 1e3  # what is told of a sheet that has diverged
 
 
 @kernel
@@ -57,9 +58,14 @@ def summarize(first, last, x, v, share, springs, structural, out):
             total[FINITE, l] = one if sane else zero
 
 
+def largest_strain(summary: NDArray) -> NDArray:
+    """Of the structural springs, from ``summarize``'s output as (SUMMARY, num_envs); MOST_STRAIN for a sheet that is not sane."""
+    return np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, MOST_STRAIN)
+
+
 @kernel
 def stretch_quantile(first, last, x, springs, structural, share, out):
-    """Quantile ``share`` and largest of the structural springs' stretch, length over rest length, (blocks, 2, lanes).
+    """Quantile ``share`` of the structural springs' stretch, length over rest length, (blocks, lanes).
 
     By bisection, from 1 to twice that, to 2^-20: the least stretch (at least 1) that no more than ``1 - share`` of the springs
     exceed.  No sorting: lanes stay side by side.
@@ -71,8 +77,6 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
     allowed = int((1 - share) * structural.shape[0])
     stretch = np.empty((structural.shape[0], lanes), x.dtype)
     for b in range(first, last):
-        most = out[b, 1]
-        most[:] = 0
         for k in range(structural.shape[0]):
             s = structural[k]
             xi, xj, own = x[b, ends[s, 0]], x[b, ends[s, 1]], stretch[k]
@@ -80,7 +84,6 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
             for l in range(lanes):
                 dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
                 own[l] = np.sqrt(dx * dx + dy * dy + dz * dz) * scale
-                most[l] = max(most[l], own[l])
         low = np.ones(lanes, x.dtype)
         step = half
         count = np.empty(lanes, np.int32)
@@ -93,7 +96,7 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
             for l in range(lanes):
                 low[l] = low[l] + step if count[l] > allowed else low[l]
             step *= half
-        out[b, 0] = low
+        out[b] = low
 
 
 @kernel

@@ -15,10 +15,10 @@ from clothgym.collisions import Capsule
 from clothgym.envs import carriers
 from clothgym.envs.carriers import middle
 from clothgym.envs.episode import length
-from clothgym.envs.measures import key_particles, stretch_quantile
+from clothgym.envs.measures import MOST_STRAIN, key_particles, largest_strain, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
-from clothgym.envs.task import MOST_STRAIN, Task
+from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
@@ -92,16 +92,15 @@ class StrainTask(Task):
         super().__init__(num_envs, integrator=integrator, **kwargs)
         self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
         layout = self.simulation.layout
-        self._stretch = np.zeros((layout.blocks, 2, layout.lanes), np.float32)
+        # measured anew in each step: not part of the state
+        self._stretch = np.zeros((layout.blocks, layout.lanes), np.float32)
+        self._strain_p95, self._tension = np.zeros(num_envs), np.zeros((num_envs, 2))
         self.episode |= {
             "post": np.zeros((num_envs, 2)),
             "places": np.zeros((num_envs, WAYPOINTS, 2, 3)),  # where each clip is to be [m]
             "next": np.zeros(num_envs, np.int64),
             "after": np.zeros((num_envs, WAYPOINTS)),  # length of the way that is left at each way-point [m]
             "way": np.ones(num_envs),  # its whole length [m]
-            "strain": np.zeros(num_envs),
-            "strain_p95": np.zeros(num_envs),
-            "tension": np.zeros((num_envs, 2)),
             "episode_cost": np.zeros(num_envs),
         }
 
@@ -169,9 +168,9 @@ class StrainTask(Task):
             (episode["next"] == WAYPOINTS - 1)[:, None],
             (episode["post"] - middle(clips)[:, :2]) / SIDE,
             wind[everyone, now] if wind.shape[1] else np.zeros((self.num_envs, 3)),
-            (episode["strain"] / self.threshold)[:, None],
-            (episode["strain_p95"] / self.threshold)[:, None],
-            episode["tension"] / WEIGHT,
+            (largest_strain(self.simulation.layout.to_public(self._summary).T) / self.threshold)[:, None],
+            (self._strain_p95 / self.threshold)[:, None],
+            self._tension / WEIGHT,
             np.full((self.num_envs, 1), self.threshold),
             (1 - episode["step"] / self.acting_steps)[:, None],
         ]
@@ -191,7 +190,7 @@ class StrainTask(Task):
         self._measure()
 
     def _measure(self) -> None:
-        simulation, episode = self.simulation, self.episode
+        simulation = self.simulation
         view = simulation.view
 
         def work(first: int, last: int) -> None:
@@ -199,9 +198,8 @@ class StrainTask(Task):
 
         _jit.run_spans(work, len(self._stretch), self.threads)
         stretch = simulation.layout.to_public(self._stretch).astype(np.float64)
-        sane = stretch[:, 1] < MOST_STRAIN
-        episode["strain_p95"], episode["strain"] = np.where(sane, stretch.T - 1, MOST_STRAIN)
-        episode["tension"] = length(np.nan_to_num(simulation.pulls().astype(np.float64), posinf=0.0, neginf=0.0))
+        self._strain_p95 = stretch - 1
+        self._tension = length(np.nan_to_num(simulation.pulls().astype(np.float64), posinf=0.0, neginf=0.0))
         _, places = self._clips_and_places()
         self._origin = simulation.layout.to_blocks(middle(places), np.dtype(np.float32))
 
@@ -238,22 +236,22 @@ class StrainTask(Task):
 
     def _account(self, running: NDArray, failure: NDArray, strain: NDArray) -> dict[str, NDArray]:
         cost = (running & (strain > self.threshold)).astype(np.float64)
-        self.episode["episode_cost"] += cost + self._left(running, failure)
+        self.episode["episode_cost"] += cost + self._left(failure)
         return {
             "cost": cost,
             "episode_cost": self.episode["episode_cost"].copy(),
             "strain_excess": np.maximum(strain - self.threshold, 0),
-            "strain_p95": self.episode["strain_p95"].copy(),
-            "tension_left": self.episode["tension"][:, 0].copy(),
-            "tension_right": self.episode["tension"][:, 1].copy(),
+            "strain_p95": np.where(strain < MOST_STRAIN, self._strain_p95, MOST_STRAIN),
+            "tension_left": self._tension[:, 0].copy(),
+            "tension_right": self._tension[:, 1].copy(),
         }
 
-    def _left(self, running: NDArray, failure: NDArray) -> NDArray:
+    def _left(self, failure: NDArray) -> NDArray:
         # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
-        return np.where(running & (failure > 0), self.acting_steps - self.episode["step"], 0)
+        return np.where(failure > 0, self.acting_steps - self.episode["step"], 0)
 
     def _prices(self, failure: NDArray, info: dict[str, Any]) -> dict[str, NDArray]:
-        return {"cost": -self.cost_penalty * (info["cost"] + self._left(np.ones(self.num_envs, bool), failure))}
+        return {"cost": -self.cost_penalty * (info["cost"] + self._left(failure))}
 
     # --- experts and picture --------------------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym import _jit
 from clothgym.checks import number
 from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, within_ball
-from clothgym.envs.measures import FINITE, STRETCH2, SUMMARY, see_points, summarize
+from clothgym.envs.measures import SUMMARY, largest_strain, see_points, summarize
 from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, checked_wind, most_demanding
 from clothgym.mesh import SHEAR
 from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
@@ -33,7 +33,6 @@ REWARD_MODES = ("delta", "sparse")
 FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
-MOST_STRAIN = 1e3  # what is told of a sheet that has diverged
 HELD = (250, 200, 60)  # colour of the anchors' markers
 POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
 
@@ -299,8 +298,7 @@ class Task(ABC):
         failure[~running] = 0
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
-        with np.errstate(invalid="ignore"):
-            strain = np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, MOST_STRAIN)
+        strain = largest_strain(summary)
         info: dict[str, Any] = {"strain_max": strain} | self._account(running, failure, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
