@@ -23,7 +23,7 @@ from clothgym import grid
 from clothgym.bench import machine
 from clothgym.forces import add_spring_forces
 from clothgym.mesh import NUM_KINDS, ClothMesh
-from clothgym.state import spring_arrays
+from clothgym.state import element_arrays
 
 RESULT = Path(__file__).parent / "results" / "spring_order.json"
 SIDES = (17, 25)
@@ -37,7 +37,7 @@ def force_pass(mesh: ClothMesh, lanes: int, by_particle: bool) -> Callable[[], N
     ripple = np.random.default_rng(0).normal(scale=1e-3, size=(mesh.num_particles, 3, lanes))
     x = (mesh.rest_positions[:, :, None] + ripple).astype(f4)
     v, f = np.zeros_like(x), np.zeros_like(x)
-    springs = spring_arrays(mesh, f4, by_particle)
+    springs = element_arrays(mesh, f4, hinged=False, by_particle=by_particle).springs
     # so soft that the sum of all calls stays small
     stiffness, damping_time = np.full((NUM_KINDS, lanes), 1e-6, f4), np.full(lanes, 1e-4, f4)
     row = np.zeros((3, lanes), f4)

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from clothgym.mesh import grid as grid
     from clothgym.simulation import Simulation as Simulation
     from clothgym.state import State as State
+    from clothgym.triangles import disc as disc
+    from clothgym.triangles import load_mesh as load_mesh
+    from clothgym.triangles import triangle_mesh as triangle_mesh
     from clothgym.wind import Wind as Wind
 
 __version__ = "0.1.0"
@@ -38,7 +41,10 @@ _HOMES = {
     "Sphere": "clothgym.collisions",
     "State": "clothgym.state",
     "Wind": "clothgym.wind",
+    "disc": "clothgym.triangles",
     "grid": "clothgym.mesh",
+    "load_mesh": "clothgym.triangles",
+    "triangle_mesh": "clothgym.triangles",
 }
 
 

@@ -26,11 +26,30 @@ def positive(name: str, value: Any) -> float:
     return float(value)
 
 
+def not_negative(name: str, value: Any) -> float:
+    """A finite number, zero or above."""
+    if number(name, value) < 0:
+        raise ValueError(f"{name}={value!r}: must be zero or positive")
+    return float(value)
+
+
 def count(name: str, value: Any, what: str = "") -> int:
     """An integer of at least 1."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise ValueError(f"{name}={value!r}: must be {what}an integer of at least 1")
     return int(value)
+
+
+def members(name: str, value: Any, kind: type, what: str) -> None:
+    """A sequence of instances of a class."""
+    if isinstance(value, kind) or not all(isinstance(one, kind) for one in value):
+        raise ValueError(f"{name}={value!r}: must be a sequence of {what}")
+
+
+def one_of(name: str, value: Any, *known: str) -> None:
+    """One of a few words."""
+    if value not in known:
+        raise ValueError(f"{name}={value!r}: must be {' or '.join(map(repr, known))}")
 
 
 def finite(name: str, value: ArrayLike) -> NDArray:

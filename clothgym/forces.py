@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.mesh import ClothMesh
-from clothgym.state import State
+from clothgym.bending import Bending
+from clothgym.mesh import SHEAR, ClothMesh
+from clothgym.state import Elements, State
 
 POWER_STEPS = 16
 
@@ -84,6 +85,71 @@ def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
 
 
 @kernel
+def add_spring_products(x, p, y, springs, stiffness, along, across, row):
+    """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (particles, 3, lanes).
+
+    With n the direction, ``k (along n n^T + across max(1 - r/d, 0) (I - n n^T))`` a spring: what a compressed one would push aside
+    is left out, so that the matrix has no negative eigenvalue (Choi and Ko 2002).  stiffness: k [N/m], (kinds, lanes); along,
+    across: (lanes,); row: scratch, (3, lanes).
+    """
+    if x.shape[2] == 1:
+        _add_spring_products_of_one(x[:, :, 0], p[:, :, 0], y[:, :, 0], springs, stiffness[:, 0], along[0], across[0])
+        return
+    ends, rest_length, kind, weight = springs
+    one, zero = x.dtype.type(1), x.dtype.type(0)
+    lanes = x.shape[2]
+    flat = y.reshape((x.shape[0], 3 * lanes))
+    product = row.reshape(3 * lanes)
+    for s in range(ends.shape[0]):
+        i = ends[s, 0]
+        j = ends[s, 1]
+        xi, xj, pi, pj, yi, yj = x[i], x[j], p[i], p[j], flat[i], flat[j]
+        k = stiffness[kind[s]]
+        share = weight[s]
+        r = rest_length[s]
+        for l in range(lanes):
+            dx = xj[0, l] - xi[0, l]
+            dy = xj[1, l] - xi[1, l]
+            dz = xj[2, l] - xi[2, l]
+            ux = pj[0, l] - pi[0, l]
+            uy = pj[1, l] - pi[1, l]
+            uz = pj[2, l] - pi[2, l]
+            q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+            aside = share * k[l] * across[l] * max(one - r * q, zero)
+            g = (share * k[l] * along[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+            row[0, l] = g * dx + aside * ux
+            row[1, l] = g * dy + aside * uy
+            row[2, l] = g * dz + aside * uz
+        for e in range(3 * lanes):
+            yi[e] -= product[e]
+        for e in range(3 * lanes):
+            yj[e] += product[e]
+
+
+@kernel
+def _add_spring_products_of_one(x, p, y, springs, stiffness, along, across):
+    """The same arithmetic on a single environment, (particles, 3)."""
+    ends, rest_length, kind, weight = springs
+    one, zero = x.dtype.type(1), x.dtype.type(0)
+    for s in range(ends.shape[0]):
+        i = ends[s, 0]
+        j = ends[s, 1]
+        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+        ux, uy, uz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+        k = weight[s] * stiffness[kind[s]]
+        aside = k * across * max(one - rest_length[s] * q, zero)
+        g = (k * along - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+        tx, ty, tz = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
+        y[i, 0] -= tx
+        y[i, 1] -= ty
+        y[i, 2] -= tz
+        y[j, 0] += tx
+        y[j, 1] += ty
+        y[j, 2] += tz
+
+
+@kernel
 def add_air_forces(x, v, f, surface, resistance, wind, row):
     """Add the air's force on each triangle to ``f`` [N], (particles, 3, lanes).
 
@@ -128,55 +194,103 @@ def add_air_forces(x, v, f, surface, resistance, wind, row):
                 fp[e] += share * force[e]
 
 
-def largest_frequency(mesh: ClothMesh, stiffness: NDArray, inverse_mass: NDArray) -> float:
+class Oscillators(NamedTuple):
+    """What decides on one environment's largest substep, in float64.
+
+    positions: at rest [m], (particles, 3).  stiffness: of springs by kind [N/m], (kinds,).  rigidity: of hinges [N m].
+    damping_time [s].  inverse_mass [1/kg], (particles,).
+    """
+
+    positions: NDArray
+    elements: Elements
+    stiffness: NDArray
+    rigidity: float
+    damping_time: float
+    inverse_mass: NDArray
+
+
+def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
+    """Particles, (rows, m), and vectors V, (rows, m, 3): a small displacement u stores ``sum (sum_m V_m . u_m)^2 / 2``."""
+    springs, bends = o.elements
+    i, j = springs.particles.T
+    n = (o.positions[j] - o.positions[i]) / springs.rest_length[:, None]
+    pull = np.sqrt(springs.weight * o.stiffness[springs.kind])[:, None] * n
+    rows = [(springs.particles, np.stack([-pull, pull], axis=1))]
+    if not len(bends.particles):
+        return rows
+    curves = np.sqrt(o.rigidity) * bends.curves
+    if not bends.rest_angle.any():
+        rows += [(bends.particles, curves[:, :, None] * axis) for axis in np.eye(3)]
+        return rows
+    # a hinge that is bent at rest: the corners move along their triangles' normals, the ends share both
+    xi, xj, xk, xl = (o.positions[bends.particles[:, m]] for m in range(4))
+    e = xj - xi
+    normals = [np.cross(e, xk - xi), np.cross(xl - xi, e)]
+    normal_k, normal_l = (n / np.linalg.norm(n, axis=1, keepdims=True) for n in normals)
+    foot_k, foot_l = (np.sum((q - xi) * e, axis=1) / np.sum(e * e, axis=1) for q in (xk, xl))
+    at_k, at_l = curves[:, 2, None] * normal_k, curves[:, 3, None] * normal_l
+    near = (foot_k - 1)[:, None] * at_k + (foot_l - 1)[:, None] * at_l
+    far = -foot_k[:, None] * at_k - foot_l[:, None] * at_l
+    return [*rows, (bends.particles, np.stack([near, far, at_k, at_l], axis=1))]
+
+
+def largest_frequency(o: Oscillators) -> float:
     """Largest angular frequency of the sheet at rest [rad/s]: the root of the largest eigenvalue of M^-1 K.
 
-    K is assembled from all springs, ``k n n^T`` each.  One spring's ``sqrt(k/m)`` is not enough: the neighbours add up.
-    stiffness: by kind [N/m], (kinds,).  inverse_mass [1/kg], (particles,).
+    K is assembled from all elements.  One spring's ``sqrt(k/m)`` is not enough: the neighbours add up.
     """
-    from scipy.sparse import coo_matrix, csr_matrix  # imported here: it would double the time of a warm start
+    from scipy.sparse import coo_matrix, csr_matrix, vstack  # imported here: it would double the time of a warm start
     from scipy.sparse.linalg import eigsh
 
-    springs = mesh.springs
-    i, j = springs.particles.T
-    rows = np.arange(len(i))
-    n = (mesh.rest_positions[j] - mesh.rest_positions[i]) / springs.rest_length[:, None]
-    root = np.sqrt(springs.weight * stiffness[springs.kind])[:, None] * n
-    # M^-1/2 K M^-1/2 = B^T B, one row of B a spring
-    scale = np.sqrt(inverse_mass)
-    values = np.concatenate([(root * scale[j, None]).T.ravel(), (-root * scale[i, None]).T.ravel()])
-    columns = np.concatenate([*(3 * j + c for c in range(3)), *(3 * i + c for c in range(3))])
-    b = csr_matrix(coo_matrix((values, (np.tile(rows, 6), columns)), shape=(len(i), 3 * len(scale))))
+    # M^-1/2 K M^-1/2 = B^T B
+    scale, parts = np.sqrt(o.inverse_mass), []
+    for particles, vectors in _energy_rows(o):
+        values = vectors * scale[particles][:, :, None]
+        columns = 3 * particles[:, :, None] + np.arange(3)
+        rows = np.broadcast_to(np.arange(len(particles))[:, None, None], values.shape)
+        shape = (len(particles), 3 * len(scale))
+        parts.append(csr_matrix(coo_matrix((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)))
+    b = vstack(parts, format="csr")
     gram = b.T @ b
     # a fixed start vector: the same bound in every process
     start = np.random.default_rng(0).normal(size=gram.shape[0])
     return float(np.sqrt(eigsh(gram, k=1, which="LM", v0=start, tol=1e-4, return_eigenvectors=False)[0]))
 
 
-def frequency_bound(mesh: ClothMesh, stiffness: NDArray, inverse_mass: NDArray) -> float:
+def frequency_bound(o: Oscillators) -> float:
     """An upper bound on ``largest_frequency`` [rad/s], some tenth above it, in a fraction of the time and without scipy.
 
     With A the magnitudes of M^-1 K, no eigenvalue exceeds the largest ``(A y)/y`` for any positive y (Collatz and Wielandt);
-    a few steps of the power method make y a good one.  Arguments as there.
+    a few steps of the power method make y a good one.
     """
-    springs = mesh.springs
-    i, j = springs.particles.T
-    n = (mesh.rest_positions[j] - mesh.rest_positions[i]) / springs.rest_length[:, None]
-    blocks = (springs.weight * stiffness[springs.kind])[:, None, None] * n[:, :, None] * n[:, None, :]
-    own = np.zeros((mesh.num_particles, 3, 3))
-    for end in (i, j):
-        np.add.at(own, end, blocks)
-    own, blocks = np.abs(own), np.abs(blocks)
-    y = np.ones((mesh.num_particles, 3))
+    families = _energy_rows(o)
+    own = np.zeros((len(o.positions), 3, 3))
+    for particles, vectors in families:
+        for m in range(particles.shape[1]):
+            np.add.at(own, particles[:, m], vectors[:, m, :, None] * vectors[:, m, None, :])
+    own = np.abs(own)
+    y = np.ones((len(o.positions), 3))
     bound = np.inf
     for _ in range(POWER_STEPS):
         z = np.einsum("pab,pb->pa", own, y)
-        for end, other in ((i, j), (j, i)):
-            np.add.at(z, end, np.einsum("sab,sb->sa", blocks, y[other]))
-        z = z * inverse_mass[:, None] + 1e-9 * y  # stays positive in directions that no spring has
+        for particles, vectors in families:
+            sizes = np.abs(vectors)
+            parts = np.sum(sizes * y[particles], axis=2)
+            others = parts.sum(axis=1, keepdims=True) - parts
+            for m in range(particles.shape[1]):
+                np.add.at(z, particles[:, m], sizes[:, m] * others[:, m, None])
+        z = z * o.inverse_mass[:, None] + 1e-9 * y  # stays positive in directions that nothing resists
         bound = min(bound, float(np.max(z / y)))
         y = z / z.max()
     return float(np.sqrt(bound))
+
+
+def structural_strain(mesh: ClothMesh, x: NDArray) -> NDArray:
+    """Length over rest length, minus one, of threads or edges, (num_envs, those); x [m], (num_envs, particles, 3)."""
+    springs = mesh.springs
+    structural = springs.kind < SHEAR
+    ends = x[:, springs.particles[structural]]
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / springs.rest_length[structural].astype(x.dtype) - 1
 
 
 class Energy(NamedTuple):
@@ -191,9 +305,9 @@ class Energy(NamedTuple):
         return self.kinetic + self.elastic + self.gravity
 
 
-def energy(mesh: ClothMesh, state: State) -> Energy:
+def energy(elements: Elements, bending: Bending, state: State) -> Energy:
     """Kinetic, elastic and gravitational energy of each environment, in float64."""
-    springs = mesh.springs
+    springs = elements.springs
     x, v = state.positions.astype(np.float64), state.velocities.astype(np.float64)
     mass = 1 / state.free_inverse_mass.astype(np.float64)
     ends = x[:, springs.particles]
@@ -201,6 +315,6 @@ def energy(mesh: ClothMesh, state: State) -> Energy:
     k = springs.weight * state.stiffness.astype(np.float64)[:, springs.kind]
     return Energy(
         kinetic=np.sum(mass * np.sum(v**2, axis=2), axis=1) / 2,
-        elastic=np.sum(k * stretch**2, axis=1) / 2,
+        elastic=np.sum(k * stretch**2, axis=1) / 2 + bending.energy(elements.bends, x, state.rigidity.astype(np.float64)),
         gravity=-np.einsum("ep,epc,ec->e", mass, x, state.gravity.astype(np.float64)),
     )

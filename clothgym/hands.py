@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import kernel, specialize
+from clothgym.bending import BEND_SCRATCH, Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.forces import add_air_forces, add_spring_forces
-from clothgym.state import Fabric, Layout, SpringArrays, SurfaceArrays
+from clothgym.state import Elements, Fabric, Layout, SurfaceArrays
 
 # columns of what a kernel must know of each hand
 SPEED, FINGER_STEP, REACH2, SLIP2 = 0, 1, 2, 3
@@ -156,13 +159,14 @@ class Hands:
         x: NDArray,
         v: NDArray,
         free_w: NDArray,
-        springs: SpringArrays,
+        elements: Elements,
+        bending: Bending,
         surface: SurfaceArrays,
         fabric: Fabric,
         out: NDArray,
     ) -> None:
         """Force of the cloth on each hand [N], into (blocks, hands, 3, lanes)."""
-        add_pulls(first, last, x, v, free_w, springs, surface, fabric, self.holder, out)
+        _pulls_with(bending)(first, last, x, v, free_w, elements, surface, fabric, self.holder, out)
 
     def slip(self, pull: NDArray, w: NDArray, free_w: NDArray) -> None:
         """Let go of what pulls harder than its gripper can hold."""
@@ -305,15 +309,15 @@ def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, h
         steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
 
 
-@kernel
-def add_pulls(first, last, x, v, free_w, springs, surface, fabric, holder, out):
-    """Force of the cloth on each hand [N], (blocks, hands, 3, lanes): springs, weight and air of the particles that it holds."""
-    stiffness, damping_time, _, resistance, gravity, wind = fabric
+def add_pulls(first, last, x, v, free_w, elements, surface, fabric, holder, out):
+    """Force of the cloth on each hand [N], (blocks, hands, 3, lanes): elements, weight and air of the particles that it holds."""
+    stiffness, rigidity, damping_time, _, resistance, gravity, wind = fabric
     for b in range(first, last):
         f = np.zeros(x.shape[1:], x.dtype)
-        row = np.empty((3, x.shape[3]), x.dtype)
-        add_spring_forces(x[b], v[b], f, springs, stiffness[b], damping_time[b], row)
-        add_air_forces(x[b], v[b], f, surface, resistance[b], wind[b], row)
+        scratch = np.empty((BEND_SCRATCH, 3, x.shape[3]), x.dtype)
+        add_spring_forces(x[b], v[b], f, elements.springs, stiffness[b], damping_time[b], scratch[0])
+        add_bend_forces(x[b], v[b], f, elements.bends, rigidity[b], damping_time[b], scratch)
+        add_air_forces(x[b], v[b], f, surface, resistance[b], wind[b], scratch[0])
         out[b] = 0
         for p in range(x.shape[1]):
             for l in range(x.shape[3]):
@@ -321,6 +325,11 @@ def add_pulls(first, last, x, v, free_w, springs, surface, fabric, holder, out):
                 if k >= 0:
                     for c in range(3):
                         out[b, k, c, l] += f[p, c, l] + gravity[b, c, l] / free_w[b, p, l]
+
+
+@cache
+def _pulls_with(bending: Bending) -> Any:
+    return specialize(add_pulls, f"add_pulls_{bending.name}", add_bend_forces=bending.kernels["add_bend_forces"])
 
 
 @kernel

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import number
-from clothgym.mesh import BEND_X, BEND_Y, NUM_KINDS, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
+from clothgym.mesh import BEND_X, BEND_Y, EDGE, NUM_KINDS, OPPOSITE, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,9 @@ class Material:
         density: mass per area [kg/m^2].
         stretch_stiffness: Young's modulus times thickness [N/m].
         shear_stiffness: shear modulus times thickness [N/m].
-        bend_rigidity: plate rigidity B [N m].  Skip-one springs have no rigidity in the flat state; theirs is chosen to
-            store the energy B kappa^2 / 2 per area when the radius of curvature is two grid spacings.
+        bend_rigidity: plate rigidity B [N m]: a cylinder of curvature kappa stores B kappa^2 / 2 per area.  Skip-one springs
+            (``bending="springs"``) have no rigidity in the flat state; they store that where the radius of curvature is two
+            grid spacings.
         damping_time: Kelvin-Voigt retardation time [s]: each spring's damper is this time its stiffness.
         drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_air_forces``; 1.2 is a square plate's.
         skin_friction: its coefficient edge on to the wind, by the area of one side.
@@ -84,9 +85,12 @@ PRESETS: dict[str, Material] = {
 
 
 def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: NDArray) -> NDArray[np.float64]:
-    """Spring constants by kind [N/m], (kinds, ...), that give a rectangular grid the fabric's moduli.
+    """Spring constants by kind [N/m], (kinds, ...), that give a sheet the fabric's moduli.
 
-    On cells a x b with diagonals d, springs k_x, k_y, k_d (both diagonals) and skip-one k_b make a sheet with
+    A triangle mesh has one kind of edge: with the weights of Van Gelder it takes Young's modulus; its Poisson ratio is 1/3, and
+    its shear modulus follows from these, whatever the fabric's is (see ``triangles.triangle_mesh``).
+
+    On a grid of cells a x b with diagonals d, springs k_x, k_y, k_d (both diagonals) and skip-one k_b make a sheet with
     ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)``, ``C12 = C66 = 2 k_d a b/d^2`` and Young's modulus
     ``C11 - C12^2/C11`` (small strains; checked against a stretched and a sheared sheet in the tests).  Poisson's ratio
     ``C12/C11`` falls out.  All arguments have the same shape ``(...)`` [N/m, N/m, N m].
@@ -94,10 +98,13 @@ def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: ND
     Raises:
         ValueError: no spring network has these moduli (shear too stiff for the stretch, or cells too oblong).
     """
-    a, b = mesh.spacing
     stretch, shear, bend = (np.asarray(q, np.float64) for q in (stretch, shear, bend))
-    d2 = a * a + b * b
     k = np.zeros((NUM_KINDS, *stretch.shape))
+    if mesh.shape is None:
+        k[EDGE], k[OPPOSITE] = stretch, 1024 * bend
+        return k
+    a, b = mesh.spacing
+    d2 = a * a + b * b
     k[SHEAR] = shear * d2 / (2 * a * b)
     c11 = (stretch + np.sqrt(stretch**2 + 4 * shear**2)) / 2
     for structural, skip, along, across in ((STRUCTURAL_X, BEND_X, a, b), (STRUCTURAL_Y, BEND_Y, b, a)):

@@ -13,16 +13,18 @@ from clothgym.checks import positive
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
 
-# spring kinds: each has a stiffness of its own (see material.spring_stiffness)
-STRUCTURAL_X, STRUCTURAL_Y, SHEAR, BEND_X, BEND_Y = range(5)
-NUM_KINDS = 5
+# spring kinds: each has a stiffness of its own (see material.spring_stiffness).  Those before SHEAR are the threads, or the
+# edges of a triangle mesh; those after it resist bending
+STRUCTURAL_X, STRUCTURAL_Y, EDGE, SHEAR, BEND_X, BEND_Y, OPPOSITE = range(7)
+NUM_KINDS = 7
 
 
 class Springs(NamedTuple):
     """Springs sorted by colour: no two of one colour share a particle.
 
     particles: ends, (springs, 2).  rest_length: [m], (springs,).  kind: index of the stiffness, (springs,).
-    weight: share of that stiffness, (springs,); a border spring stands for half a strip of cloth.
+    weight: share of that stiffness, (springs,): half for a spring on a grid's border, which stands for half a strip of cloth;
+    1/m^2 for OPPOSITE, whose stiffness is in N m.
     """
 
     particles: Int
@@ -31,39 +33,69 @@ class Springs(NamedTuple):
     weight: Real
 
 
-@dataclass(frozen=True, eq=False)
-class ClothMesh:
-    """A rectangular sheet at rest in the plane z = 0, centred on the origin.
+class Hinges(NamedTuple):
+    """The inner edges, across which two triangles bend; sorted by colour.
 
-    Attributes:
-        shape: particles along y and x (rows, columns).
-        size: width along x and height along y [m].
-        rest_positions: particles at rest [m], (particles, 3); row r, column c is particle ``r * columns + c``.
-        springs: structural, shear and skip-one springs.
-        triangles: particle indices, (triangles, 3), counter-clockwise seen from +z.
-        area: share of the sheet's area that each particle stands for [m^2], (particles,).
+    particles: both ends of the edge, then the opposite corners of its triangles, (hinges, 4).
+    weight: bending moment of a hinge over rigidity times angle, (hinges,): e/h, with e the edge's length and h the spacing of
+    the hinge lines.
+    rest_angle: [rad], (hinges,), zero where the sheet is flat at rest.
+    slopes: of the angle with respect to the particles' displacement along the normal, at rest [1/m], (hinges, 4).
     """
 
-    shape: tuple[int, int]
+    particles: Int
+    weight: Real
+    rest_angle: Real
+    slopes: Real
+
+
+@dataclass(frozen=True, eq=False)
+class ClothMesh:
+    """A sheet at rest: a grid in the plane z = 0 centred on the origin, or any mesh of triangles.
+
+    Attributes:
+        size: width along x and height along y [m].
+        rest_positions: particles at rest [m], (particles, 3); in a grid row r, column c is particle ``r * columns + c``.
+        springs: structural and shear springs, or edges; and those that resist bending.
+        triangles: particle indices, (triangles, 3); a grid's are counter-clockwise seen from +z.
+        area: share of the sheet's area that each particle stands for [m^2], (particles,).
+        hinges: inner edges.
+        shape: of a grid, particles along y and x (rows, columns); None for other meshes.
+    """
+
     size: tuple[float, float]
     rest_positions: Real
     springs: Springs
     triangles: Int
     area: Real
+    hinges: Hinges
+    shape: tuple[int, int] | None = None
 
     @property
     def num_particles(self) -> int:
         return len(self.rest_positions)
 
     @property
+    def grid_shape(self) -> tuple[int, int]:
+        """``shape`` of a grid.
+
+        Raises:
+            ValueError: the mesh is no grid.
+        """
+        if self.shape is None:
+            raise ValueError("this mesh is no grid: it has no rows, columns or corners; make one with clothgym.grid")
+        return self.shape
+
+    @property
     def spacing(self) -> tuple[float, float]:
-        """Rest distance of neighbours along x and y [m]."""
-        return self.size[0] / (self.shape[1] - 1), self.size[1] / (self.shape[0] - 1)
+        """Rest distance of a grid's neighbours along x and y [m]."""
+        rows, columns = self.grid_shape
+        return self.size[0] / (columns - 1), self.size[1] / (rows - 1)
 
     @property
     def corners(self) -> tuple[int, int, int, int]:
-        """Particles at (-x, -y), (+x, -y), (-x, +y), (+x, +y)."""
-        rows, columns = self.shape
+        """A grid's particles at (-x, -y), (+x, -y), (-x, +y), (+x, +y)."""
+        rows, columns = self.grid_shape
         return 0, columns - 1, (rows - 1) * columns, rows * columns - 1
 
 
@@ -101,14 +133,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     ends = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for _, a, b, _ in families])
     kind = np.concatenate([np.full(a.size, k) for k, a, _, _ in families])
     weight = np.concatenate([w.ravel() for *_, w in families])
-    order = np.argsort(_greedy_colours(ends, rows * cols), kind="stable")
-    ends = ends[order]
-    springs = Springs(
-        particles=_frozen(ends.astype(np.int32)),
-        rest_length=_frozen(np.linalg.norm(positions[ends[:, 0]] - positions[ends[:, 1]], axis=1)),
-        kind=_frozen(kind[order].astype(np.int32)),
-        weight=_frozen(weight[order]),
-    )
+    springs = coloured_springs(positions, ends, kind, weight)
 
     # the diagonal alternates from cell to cell, so that the surface has no preferred direction
     a, b, c, d = (q.ravel() for q in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
@@ -117,23 +142,87 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     second = np.where(even, np.stack([a, d, c], 1), np.stack([b, d, c], 1))
     triangles = np.stack([first, second], axis=1).reshape(-1, 3).astype(np.int32)
     area = (dx * dy * np.outer(across_y, across_x)).ravel()
-    return ClothMesh((rows, cols), (float(width), float(height)), _frozen(positions), springs, _frozen(triangles), _frozen(area))
+
+    hinges = coloured_hinges(positions, triangles)
+    # e/h is right for the lines of the grid.  A diagonal alone resists the twist of its cell, whose energy per area
+    # B (d2u/dxdy)^2 asks for half of what e/h gives on square cells: then a bend costs the same in any direction
+    diagonal = np.ptp(hinges.particles[:, :2] % cols, axis=1) * np.ptp(hinges.particles[:, :2] // cols, axis=1) > 0
+    weights = np.where(diagonal, 2 * dx * dy / (dx * dx + dy * dy), hinges.weight)
+    hinges = hinges._replace(weight=frozen(weights))
+    return ClothMesh(
+        (float(width), float(height)), frozen(positions), springs, frozen(triangles), frozen(area), hinges, (rows, cols)
+    )
 
 
-def _greedy_colours(ends: NDArray[np.int64], particles: int) -> NDArray[np.int64]:
-    """Smallest colour that neither end of a spring has yet, spring by spring."""
+def coloured_springs(positions: Real, ends: NDArray, kind: NDArray, weight: NDArray) -> Springs:
+    """Springs between those ends, sorted by colour, as long as they are."""
+    order = np.argsort(_greedy_colours(ends, len(positions)), kind="stable")
+    ends = ends[order]
+    return Springs(
+        particles=frozen(ends.astype(np.int32)),
+        rest_length=frozen(np.linalg.norm(positions[ends[:, 0]] - positions[ends[:, 1]], axis=1)),
+        kind=frozen(kind[order].astype(np.int32)),
+        weight=frozen(weight[order].astype(np.float64)),
+    )
+
+
+def inner_edges(triangles: NDArray) -> NDArray[np.int64]:
+    """Ends and opposite corners of the edges that two triangles share, (edges, 4): triangle (i, j, k) has i to j, and
+    (j, i, l) has j to i."""
+    triangles = triangles.astype(np.int64)
+    directed = np.concatenate([triangles[:, [0, 1, 2]], triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]])
+    size = triangles.max(initial=0) + 1
+    forward, backward = directed[:, 0] * size + directed[:, 1], directed[:, 1] * size + directed[:, 0]
+    order = np.argsort(forward)
+    place = np.minimum(np.searchsorted(forward[order], backward), len(directed) - 1)
+    partner = order[place]
+    both = (forward[partner] == backward) & (directed[:, 0] < directed[:, 1])
+    return np.concatenate([directed[both], directed[partner[both], 2:]], axis=1)
+
+
+def coloured_hinges(positions: Real, triangles: NDArray) -> Hinges:
+    """The inner edges of triangles, sorted by colour.
+
+    The weight is ``e/h`` with h the mean height of both triangles over the edge, ``e^2/(A_0 + A_1)``: exact for a cylinder on
+    equilateral triangles (Seung and Nelson 1988, eq. 13, ``kappa = sqrt(3)/2 kappa~``).
+    """
+    if not len(triangles):
+        none = np.zeros(0)
+        return Hinges(np.zeros((0, 4), np.int32), none, none, np.zeros((0, 4)))
+    particles = inner_edges(triangles)
+    particles = particles[np.argsort(_greedy_colours(particles, len(positions)), kind="stable")]
+    xi, xj, xk, xl = (positions[particles[:, c]] for c in range(4))
+    e, a, b = xj - xi, xk - xi, xl - xi
+    length = np.linalg.norm(e, axis=1)
+    one, two = np.cross(e, a), np.cross(b, e)  # normals times twice the areas
+    one_size, two_size = np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1)
+    angle = np.arctan2(-length * np.sum(one * b, axis=1), np.sum(one * two, axis=1))
+    # a corner at height h over the edge tilts its triangle by 1/h; the foot of the height divides that between the ends
+    tilt_k, tilt_l = -length / one_size, -length / two_size
+    foot_k, foot_l = np.sum(a * e, axis=1) / length**2, np.sum(b * e, axis=1) / length**2
+    slopes = np.stack([-(1 - foot_k) * tilt_k - (1 - foot_l) * tilt_l, -foot_k * tilt_k - foot_l * tilt_l, tilt_k, tilt_l], axis=1)
+    return Hinges(
+        particles=frozen(particles.astype(np.int32)),
+        weight=frozen(length**2 / ((one_size + two_size) / 2)),
+        rest_angle=frozen(np.where(np.abs(angle) < 1e-9, 0.0, angle)),
+        slopes=frozen(slopes),
+    )
+
+
+def _greedy_colours(members: NDArray[np.int64], particles: int) -> NDArray[np.int64]:
+    """Smallest colour that no particle of an element has yet, element by element; members: (elements, particles of each)."""
     taken: list[set[int]] = [set() for _ in range(particles)]
-    colours = np.empty(len(ends), np.int64)
-    for spring, (a, b) in enumerate(ends.tolist()):
+    colours = np.empty(len(members), np.int64)
+    for element, own in enumerate(members.tolist()):
         colour = 0
-        while colour in taken[a] or colour in taken[b]:
+        while any(colour in taken[p] for p in own):
             colour += 1
-        taken[a].add(colour)
-        taken[b].add(colour)
-        colours[spring] = colour
+        for p in own:
+            taken[p].add(colour)
+        colours[element] = colour
     return colours
 
 
-def _frozen(array: NDArray) -> NDArray:
+def frozen(array: NDArray) -> NDArray:
     array.flags.writeable = False
     return array

@@ -53,15 +53,18 @@ def changed(
     return parameters, fields
 
 
-def fabric_rows(mesh: ClothMesh, parameters: NDArray, air_density: float) -> dict[str, NDArray[np.float64]]:
+def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density: float) -> dict[str, NDArray[np.float64]]:
     """What becomes of figures, (envs, figures), on a mesh: rows of ``state.Fabric`` without the fields, (envs, ...).
+
+    hinged: whether hinges resist bending, and no springs.
 
     Raises:
         ValueError: no spring network on this mesh has these moduli.
     """
     density, stretch, shear, bend, damping_time, drag_coefficient, skin_friction, air_drag = parameters.T
     return {
-        "stiffness": spring_stiffness(mesh, stretch, shear, bend).T,
+        "stiffness": spring_stiffness(mesh, stretch, shear, 0 * bend if hinged else bend).T,
+        "rigidity": bend if hinged else 0 * bend,
         "damping_time": damping_time,
         "drag_rate": air_drag / density,
         "resistance": np.stack([drag_coefficient, skin_friction], axis=1) * air_density / 2,

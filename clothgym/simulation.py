@@ -5,58 +5,61 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit, integrators
+from clothgym import _jit, guards, integrators
 from clothgym._jit import specialize
-from clothgym.checks import count, finite, indices, number, positive, spread, vector
-from clothgym.collisions import ROWS, Collider, Contacts, resolve, signed_distances
-from clothgym.forces import Energy, add_air_forces, energy
+from clothgym.bending import Bending, model_of
+from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, spread, vector
+from clothgym.collisions import ROWS, Collider, Contacts, check_replacement, contacts, resolve
+from clothgym.forces import Energy, Oscillators, add_air_forces, energy, structural_strain
+from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
+from clothgym.integrators.base import Preparation
+from clothgym.limiting import Limiting, limit_strain, no_limit
 from clothgym.material import Material
-from clothgym.mesh import SHEAR, ClothMesh
+from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
-from clothgym.state import Fabric, Layout, SpringArrays, State, at_rest, spring_arrays, surface_arrays
+from clothgym.state import Elastic, Fabric, Layout, State, View, at_rest, element_arrays, surface_arrays
 
 GRAVITY = 9.81
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
 
 
-def advance(first, last, x, v, w, springs, surface, fabric, kinds, colliders, h, substeps, air_every):
+def advance(
+    first, last, x, v, w, elements, surface, fabric, kinds, colliders, h, substeps, air_every, options, plan, rows, limit, limited,
+    diverged,
+):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
-    stiffness, damping_time, drag_rate, resistance, gravity, wind = fabric
+    stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
     for b in range(first, last):
-        work = np.empty((x.shape[1] + 1, 3, x.shape[3]), x.dtype)
+        work = np.empty((rows, 3, x.shape[3]), x.dtype)
         push = np.zeros(x.shape[1:], x.dtype)
         contact = np.empty((4, x.shape[3]), x.dtype)
+        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
+        limited[b] = 0
         for step in range(substeps):
             if air_every > 0 and step % air_every == 0:
                 push[:] = 0
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
-            substep(  # noqa: F821 - the integrator's, bound by specialize
-                x[b], v[b], w[b], springs, stiffness[b], damping_time[b], drag_rate[b], gravity[b], push, h, work
-            )
+            substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
+            restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
             resolve(x[b], v[b], w[b], kinds, colliders[b], h, contact)
+        mark_diverged(x[b], v[b], diverged[b])
 
 
 @cache
-def _compiled(integrator: Integrator) -> Any:
-    return specialize(advance, f"advance_{integrator.name}", substep=integrator.substep)
-
-
-class View(NamedTuple):
-    """The live memory of a simulation, for kernels that read it: see ``state`` for its layout."""
-
-    x: NDArray
-    v: NDArray
-    springs: SpringArrays
+def _compiled(substep: Any, name: str, model: Bending, limits: bool) -> Any:
+    """The main loop around an integrator's substep, in which the model's kernels bend."""
+    bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", **model.kernels)
+    restrain = limit_strain if limits else no_limit
+    return specialize(advance, f"advance_{name}_{model.name}_{limits}", substep=bound, restrain=restrain)
 
 
 class Simulation:
@@ -66,17 +69,19 @@ class Simulation:
         mesh: the sheet, for instance ``grid(17, 17, 0.6, 0.6)``; it starts at its rest positions, at rest.
         material: the fabric; ``set_parameters`` changes it by environment.
         num_envs: environments in the batch.
-        integrator: a name of ``INTEGRATORS`` or an ``Integrator``.
+        integrator: a name of ``INTEGRATORS``, one with options, ``{"name": "xpbd", "iterations": 4}``, or an ``Integrator``.
         time_step: control step [s].
         substeps: substeps of a control step; "auto" takes them from the integrator's bound for this mesh and material.
         gravity: [m/s^2], (3,).
         wind: velocity of the air [m/s], (3,); ``set_wind`` changes it.
         air_density: [kg/m^3]; 0 takes drag and lift away.
         colliders: solids, the same for all environments until ``set_collider``.
-        anchors: particles that can be held, or patches of them, the first of which is where the anchor is; all are attached at
-            first and stay where they are until ``move_anchors``.
+        anchors: particles that can be held, or patches of them, the first of which is where the anchor is; attached at first.
         anchor_speed: largest speed of an anchor [m/s].
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
+        bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.
+        strain_limit: largest strain of threads and diagonals, see ``limiting``; None for none.
+        on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
         dtype: "float32", or "float64" for reference runs.
         threads: threads to use; all processors by default.  The outcome does not depend on it.
 
@@ -89,7 +94,7 @@ class Simulation:
         mesh: ClothMesh,
         material: Material | None = None,
         num_envs: int = 1,
-        integrator: str | Integrator = "semi_implicit_euler",
+        integrator: str | Mapping[str, Any] | Integrator = "semi_implicit_euler",
         time_step: float = 1 / 60,
         substeps: int | Literal["auto"] = "auto",
         gravity: ArrayLike = (0.0, 0.0, -GRAVITY),
@@ -99,31 +104,31 @@ class Simulation:
         anchors: Sequence[int | Sequence[int]] = (),
         anchor_speed: float = 10.0,
         grippers: Sequence[Gripper] = (),
+        bending: str = "springs",
+        strain_limit: float | None = None,
+        on_divergence: Literal["warn", "raise", "ignore"] = "warn",
         dtype: str = "float32",
         threads: int | None = None,
     ) -> None:
         if not isinstance(mesh, ClothMesh):
             raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
-        if material is not None and not isinstance(material, Material):
+        if not isinstance(material, Material | None):
             raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
-        if isinstance(colliders, Collider) or not all(isinstance(c, Collider) for c in colliders):
-            raise ValueError(f"colliders={colliders!r}: must be a sequence of Plane, Sphere, Capsule or Box")
-        if isinstance(grippers, Gripper) or not all(isinstance(g, Gripper) for g in grippers):
-            raise ValueError(f"grippers={grippers!r}: must be a sequence of Gripper")
+        members("colliders", colliders, Collider, "Plane, Sphere, Capsule or Box")
+        members("grippers", grippers, Gripper, "Gripper")
         count("num_envs", num_envs)
-        if number("air_density", air_density) < 0:
-            raise ValueError(f"air_density={air_density!r}: must be zero or positive")
-        if dtype not in ("float32", "float64"):
-            raise ValueError(f"dtype={dtype!r}: must be 'float32' or 'float64'")
-        if threads is not None:
-            count("threads", threads)
+        one_of("dtype", dtype, "float32", "float64")
+        one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
+        self.threads = count("threads", threads) if threads is not None else _jit.default_threads()
+        self.strain_limit = positive("strain_limit", strain_limit) if strain_limit is not None else None
+        self.on_divergence = on_divergence
+        self.bending = model_of(bending, mesh)
         self.mesh = mesh
         self.material = material if material is not None else Material.preset("cotton")
         self.integrator = integrators.get(integrator)
         self.time_step = positive("time_step", time_step)
-        self.air_density = float(air_density)
+        self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
-        self.threads = threads if threads is not None else _jit.default_threads()
         self.layout = Layout.choose(int(num_envs), self.threads)
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
@@ -131,9 +136,13 @@ class Simulation:
         self.grippers = Grippers(self._hands)
         self.colliders = tuple(colliders)
         self._kinds = np.array([c.kind for c in self.colliders], np.int64)
-        self._springs = spring_arrays(mesh, self.dtype, self.integrator.springs_by_particle)
+        self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
+        self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
         self._surface = surface_arrays(mesh, self.dtype)
-        self._advance = _compiled(self.integrator)
+        self._advance = _compiled(self.integrator.substep, self.integrator.name, self.bending, strain_limit is not None)
+        self._parameters: NDArray
+        self._plan: tuple[NDArray, ...] = ()
+        self._planned_substeps = 0
 
         self.set_state(
             at_rest(
@@ -149,7 +158,11 @@ class Simulation:
         )
         self._apply_parameters(np.arange(self.num_envs))
         self.reset()
-        self.substeps = self._choose_substeps(substeps)
+        if substeps == "auto":
+            self.substeps = guards.automatic_substeps(self.integrator, self._oscillators(0), self.time_step)
+        else:
+            self.substeps = count("substeps", substeps, "'auto' or ")
+            self._warn_if_beyond_bound(np.arange(1))
 
     # --- time -----------------------------------------------------------------------------------------------------------
 
@@ -157,13 +170,16 @@ class Simulation:
         """Advance all environments by ``n`` control steps; hands move towards their targets at a bounded speed."""
         count("n", n)
         h = self.dtype.type(self.time_step / self.substeps)
+        self._prepare()
+        rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
+        options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
-                first, last, self._x, self._v, self._w, self._springs, self._surface, self._fabric, self._kinds, self._colliders,
-                h, self.substeps, air_every,
+                first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric, self._kinds, self._colliders,
+                h, self.substeps, air_every, options, self._plan, rows, limit, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
@@ -171,40 +187,29 @@ class Simulation:
             if self._hands.can_slip:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
             self._steps += 1
+            if self._diverged.any() and self.on_divergence != "ignore":
+                new, self._reported = self.diverged & ~self._reported, self.diverged
+                guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
 
-    def _choose_substeps(self, substeps: int | str) -> int:
-        if substeps == "auto":
-            return self.integrator.automatic_substeps(self.time_step, self.largest_substep()[0])
-        self.substeps = count("substeps", substeps, "'auto' or ")
-        self._warn_if_beyond_bound(np.arange(1))
-        return self.substeps
+    def _prepare(self) -> None:
+        """Make the integrator's plan anew if the figures or the substeps have changed."""
+        if self.integrator.prepare is not None and self._planned_substeps != self.substeps:
+            holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._hands.members
+            plan = self.integrator.prepare(Preparation(self._oscillators(0), self.time_step / self.substeps, holdable))
+            self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
+            self._planned_substeps = self.substeps
 
     def largest_substep(self, env: int = 0) -> tuple[float, str]:
-        """Largest substep [s] that the integrator should be used with in that environment, and why."""
-        return self.integrator.largest_substep(*self._oscillators(env))
+        """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""
+        return self.integrator.largest_substep(self._oscillators(env))
 
-    def _oscillators(self, env: int) -> tuple[ClothMesh, NDArray, float, NDArray]:
-        """What decides on an environment's substep: mesh, spring constants, damping time and inverse masses."""
-        block, lane = divmod(env, self.layout.lanes)
-        stiffness = self._fabric.stiffness[block, :, lane].astype(np.float64)
-        damping_time = float(self._fabric.damping_time[block, lane])
-        return self.mesh, stiffness, damping_time, self._free_w[block, :, lane].astype(np.float64)
+    def _oscillators(self, env: int) -> Oscillators:
+        """What decides on an environment's substep."""
+        place = divmod(env, self.layout.lanes)
+        return guards.oscillators(self.mesh, self._exact_elements, self._fabric, self._free_w, *place)
 
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
-        h = self.time_step / self.substeps
-        for env in envs.tolist():
-            # the sharp bound needs an eigenvalue: only for those that a quick one does not clear
-            if h <= self.integrator.surely_allowed(*self._oscillators(env)):
-                continue
-            largest, why = self.largest_substep(env)
-            if h > largest:
-                need = self.integrator.automatic_substeps(self.time_step, largest)
-                warnings.warn(
-                    f"{self.substeps} substeps of {h:.3g} s are too few for {self.integrator.name}: its bound here is "
-                    f"{largest:.3g} s, {why}. Use substeps={need} or substeps='auto'.",
-                    stacklevel=4,
-                )
-                return
+        guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
 
     # --- what can be seen -----------------------------------------------------------------------------------------------
 
@@ -225,12 +230,22 @@ class Simulation:
     @property
     def view(self) -> View:
         """Positions, velocities and springs as the kernels see them; not a copy, and not to be written to."""
-        return View(self._x, self._v, self._springs)
+        return View(self._x, self._v, self._elements.springs)
 
     @property
     def parameters(self) -> NDArray:
         """Material figures of each environment, in the order of ``parameters.FIGURES``, (num_envs, figures); a fresh copy."""
         return self._parameters.copy()
+
+    @property
+    def diverged(self) -> NDArray:
+        """Environments in which something was not finite, or faster than cloth can be, since their reset, (num_envs,)."""
+        return self.layout.to_public(self._diverged)
+
+    @property
+    def limiting(self) -> Limiting | None:
+        """What strain limiting did in the last control step; None without a ``strain_limit``."""
+        return None if self.strain_limit is None else Limiting(*self.layout.to_public(self._limited).T)
 
     @property
     def attached(self) -> NDArray:
@@ -251,31 +266,24 @@ class Simulation:
         out = np.empty_like(self._hands.x)
 
         def work(first: int, last: int) -> None:
-            self._hands.pulls(first, last, self._x, self._v, self._free_w, self._springs, self._surface, self._fabric, out)
+            self._hands.pulls(
+                first, last, self._x, self._v, self._free_w, self._elements, self.bending, self._surface, self._fabric, out
+            )
 
         _jit.run_spans(work, self.layout.blocks, self.threads)
         return out
 
     def strain(self) -> NDArray:
-        """Stretch over rest length, minus one, of the structural springs, (num_envs, structural springs)."""
-        springs, x = self.mesh.springs, self.positions
-        structural = springs.kind < SHEAR
-        ends = x[:, springs.particles[structural]]
-        return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / springs.rest_length[structural].astype(self.dtype) - 1
+        """Stretch over rest length, minus one, of the structural springs (threads or edges), (num_envs, those springs)."""
+        return structural_strain(self.mesh, self.positions)
 
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy [J], in float64."""
-        return energy(self.mesh, self.get_state())
+        return energy(self._exact_elements, self.bending, self.get_state())
 
     def contacts(self) -> Contacts:
         """Signed distance of each particle to the nearest collider; negative would be inside."""
-        if not self.colliders:
-            shape = (self.num_envs, self.mesh.num_particles)
-            return Contacts(np.full(shape, np.inf, self.dtype), np.full(shape, -1))
-        out = np.empty((self.layout.blocks, len(self.colliders), self.mesh.num_particles, self.layout.lanes), self.dtype)
-        signed_distances(0, self.layout.blocks, self._x, self._kinds, self._colliders, out)
-        distances = self.layout.to_public(out)
-        return Contacts(distances.min(axis=1), distances.argmin(axis=1))
+        return contacts(self.layout, self._x, self._kinds, self._colliders)
 
     # --- what can be done -----------------------------------------------------------------------------------------------
 
@@ -331,6 +339,8 @@ class Simulation:
         self._colliders[block, :, :, lane] = self._collider_homes[block, :, :, lane]
         self._hands.begin(block, lane, self._x[block, :, :, lane])
         self._steps[env] = 0
+        self._diverged[block, lane] = False
+        self._reported[env] = False
         self._apply_masses(block, lane)
 
     def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **figures: ArrayLike) -> None:
@@ -343,28 +353,23 @@ class Simulation:
         """
         env = self._env_indices(envs)
         block, lane = self.layout.place(env)
-        parameters, fields = changed(self.material, self._parameters[env], figures)
-        fabric_rows(self.mesh, parameters, self.air_density)
-        self._parameters[env] = parameters
+        after = self._parameters.copy()
+        after[env], fields = changed(self.material, after[env], figures)
+        fabric_rows(self.mesh, after[env], self.bending.hinged, self.air_density)
+        guards.refuse_figures(self.integrator, self._parameters, after)
+        self._parameters = after
         for name, value in fields.items():
             getattr(self._fabric, name)[block, :, lane] = value
         if len(fields) < len(figures):
             self._apply_parameters(env)
             if warn:
-                _, first = np.unique(parameters, axis=0, return_index=True)
+                _, first = np.unique(after[env], axis=0, return_index=True)
                 self._warn_if_beyond_bound(env[first])
 
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
         """Put other solids of the same family (a plane, or any other) in place of collider ``index``, one an environment."""
         env = self._env_indices(envs)
-        if not 0 <= index < len(self.colliders):
-            raise ValueError(f"index={index!r}: this simulation has {len(self.colliders)} colliders")
-        if isinstance(colliders, Collider) or len(colliders) != len(env):
-            raise ValueError(f"colliders={colliders!r}: give a sequence of {len(env)}, one for each environment")
-        for collider in colliders:
-            if collider.kind != self._kinds[index]:
-                here, there = type(self.colliders[index]).__name__, type(collider).__name__
-                raise ValueError(f"collider {index} is a {here}: a {there} cannot take its place")
+        check_replacement(self.colliders, index, colliders, len(env))
         block, lane = self.layout.place(env)
         self._colliders[block, index, :, lane] = self._collider_homes[block, index, :, lane] = np.array(
             [c.rows() for c in colliders]
@@ -398,18 +403,9 @@ class Simulation:
         Raises:
             ValueError: the state does not fit; nothing is changed then.
         """
-        if state.positions.shape != (self.num_envs, self.mesh.num_particles, 3):
-            raise ValueError(
-                f"the state holds positions of shape {state.positions.shape}, this simulation (num_envs, particles, 3) = "
-                f"{(self.num_envs, self.mesh.num_particles, 3)}"
-            )
-        if not np.array_equal(state.anchors, np.tile(self._hands.members, (self.num_envs, 1))):
-            raise ValueError(f"the state has anchors {state.anchors[0].tolist()}, this simulation {self._hands.members.tolist()}")
-        if state.hand_positions.shape[1] != self._hands.count:
-            here = f"{self.anchors.size} anchors and {len(self.grippers)} grippers"
-            raise ValueError(f"the state has {state.hand_positions.shape[1]} hands, this simulation {here}")
-        if state.colliders.shape[1] != len(self.colliders):
-            raise ValueError(f"the state has {state.colliders.shape[1]} colliders, this simulation {len(self.colliders)}")
+        state.check_fits(
+            self.num_envs, self.mesh.num_particles, self._hands.members, len(self.anchors), len(self.grippers), len(self.colliders)
+        )
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
@@ -421,6 +417,10 @@ class Simulation:
         self._collider_homes = blocks(state.collider_homes, dtype)
         self._steps = np.array(state.steps, np.int64)
         self._w = self._free_w.copy()
+        self._planned_substeps = 0
+        self._limited = np.zeros((self.layout.blocks, 3, self.layout.lanes), dtype)
+        self._diverged = np.zeros((self.layout.blocks, self.layout.lanes), bool)
+        self._reported: NDArray = np.zeros(self.num_envs, bool)
         self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
@@ -428,7 +428,8 @@ class Simulation:
     def _apply_parameters(self, env: NDArray) -> None:
         """Write spring constants, dampers, drag and masses of environments from their material figures."""
         block, lane = self.layout.place(env)
-        for name, rows in fabric_rows(self.mesh, self._parameters[env], self.air_density).items():
+        self._planned_substeps = 0
+        for name, rows in fabric_rows(self.mesh, self._parameters[env], self.bending.hinged, self.air_density).items():
             array = getattr(self._fabric, name)
             array[(block, slice(None), lane) if rows.ndim == 2 else (block, lane)] = rows
         self._free_w[block, :, lane] = inverse_masses(self.mesh, self._parameters[env])

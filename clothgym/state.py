@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.mesh import NUM_KINDS, ClothMesh
+from clothgym.mesh import NUM_KINDS, SHEAR, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
@@ -30,6 +30,33 @@ class SpringArrays(NamedTuple):
     weight: NDArray
 
 
+class BendArrays(NamedTuple):
+    """The mesh's hinges in the kernel's dtype, shared by all lanes (see ``mesh.Hinges``); none where skip springs bend instead.
+
+    curves: coefficients q, (hinges, 4), with which the quadratic model's energy is ``B/2 |sum_i q_i x_i|^2``.
+    """
+
+    particles: NDArray
+    weight: NDArray
+    rest_angle: NDArray
+    curves: NDArray
+
+
+class Elements(NamedTuple):
+    """All that holds a sheet together."""
+
+    springs: SpringArrays
+    bends: BendArrays
+
+
+class Elastic(NamedTuple):
+    """What the elements' forces scale with, by lane; a part of ``Fabric``."""
+
+    stiffness: NDArray
+    rigidity: NDArray
+    damping_time: NDArray
+
+
 class SurfaceArrays(NamedTuple):
     """The mesh's triangles, (triangles, 3), and the shares of each that its corners stand for, (triangles, 3)."""
 
@@ -40,17 +67,27 @@ class SurfaceArrays(NamedTuple):
 class Fabric(NamedTuple):
     """Parameters that may differ by lane.
 
-    stiffness: spring constants by kind [N/m], (block, kinds, lane).  damping_time [s], (block, lane).
+    stiffness: spring constants by kind [N/m], (block, kinds, lane).  rigidity: of the hinges [N m], (block, lane).
+    damping_time [s], (block, lane).
     drag_rate: linear drag per mass [1/s], (block, lane).  resistance: half the air's density times the coefficients
     of drag and skin friction [kg/m^3], (block, 2, lane).  gravity [m/s^2] and wind [m/s], (block, 3, lane).
     """
 
     stiffness: NDArray
+    rigidity: NDArray
     damping_time: NDArray
     drag_rate: NDArray
     resistance: NDArray
     gravity: NDArray
     wind: NDArray
+
+
+class View(NamedTuple):
+    """The live memory of a simulation, for kernels that read it: see the module for its layout."""
+
+    x: NDArray
+    v: NDArray
+    springs: SpringArrays
 
 
 class Layout(NamedTuple):
@@ -101,7 +138,7 @@ class State:
         holder: which hand holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
         hand_positions, hand_targets: where each hand is and is going [m], (num_envs, hands, 3).
         openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, hands).
-        stiffness, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
+        stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
@@ -118,6 +155,7 @@ class State:
     openings: NDArray
     wanted_openings: NDArray
     stiffness: NDArray
+    rigidity: NDArray
     damping_time: NDArray
     drag_rate: NDArray
     resistance: NDArray
@@ -131,6 +169,23 @@ class State:
     def save(self, path: str | Path) -> None:
         """Write as ``npz`` without pickle."""
         np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+
+    def check_fits(self, num_envs: int, particles: int, held: NDArray, anchors: int, grippers: int, colliders: int) -> None:
+        """Refuse to go on in a simulation of another size; held: its anchored particles.
+
+        Raises:
+            ValueError: what differs.
+        """
+        if self.positions.shape != (num_envs, particles, 3):
+            here = f"this simulation (num_envs, particles, 3) = {(num_envs, particles, 3)}"
+            raise ValueError(f"the state holds positions of shape {self.positions.shape}, {here}")
+        if not np.array_equal(self.anchors, np.tile(held, (num_envs, 1))):
+            raise ValueError(f"the state has anchors {self.anchors[0].tolist()}, this simulation {held.tolist()}")
+        if self.hand_positions.shape[1] != anchors + grippers:
+            here = f"{anchors} anchors and {grippers} grippers"
+            raise ValueError(f"the state has {self.hand_positions.shape[1]} hands, this simulation {here}")
+        if self.colliders.shape[1] != colliders:
+            raise ValueError(f"the state has {self.colliders.shape[1]} colliders, this simulation {colliders}")
 
     @staticmethod
     def load(path: str | Path) -> State:
@@ -176,6 +231,7 @@ def at_rest(
         openings=np.zeros((num_envs, hands)),
         wanted_openings=np.zeros((num_envs, hands)),
         stiffness=np.zeros((num_envs, NUM_KINDS)),
+        rigidity=np.zeros(num_envs),
         damping_time=np.zeros(num_envs),
         drag_rate=np.zeros(num_envs),
         resistance=np.zeros((num_envs, 2)),
@@ -188,15 +244,22 @@ def at_rest(
     )
 
 
-def spring_arrays(mesh: ClothMesh, dtype: np.dtype, by_particle: bool) -> SpringArrays:
-    """The mesh's springs as a kernel of this dtype wants them: sorted by colour, or by particle if ``by_particle``.
+def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, by_particle: bool) -> Elements:
+    """The mesh's elements as a kernel of this dtype wants them: those that bend are hinges, or springs if not ``hinged``.
 
-    Where the order does not matter to the method, that by particle is a fifth faster on wide blocks: a particle's rows are
-    still in the first cache when its next spring comes.  Gauss-Seidel keeps the colours, which have no preferred direction.
+    Springs are sorted by colour, or by particle if ``by_particle``: where the order does not matter to the method, the latter is a
+    fifth faster on wide blocks, as a particle's rows are still in the first cache when its next spring comes.  Gauss-Seidel keeps
+    the colours, which have no preferred direction.
     """
-    s = mesh.springs
+    s, h = mesh.springs, mesh.hinges
     order = np.lexsort((s.particles.max(axis=1), s.particles.min(axis=1))) if by_particle else np.arange(len(s.kind))
-    return SpringArrays(s.particles[order], s.rest_length[order].astype(dtype), s.kind[order], s.weight[order].astype(dtype))
+    if hinged:
+        order = order[s.kind[order] <= SHEAR]
+    springs = SpringArrays(s.particles[order], s.rest_length[order].astype(dtype), s.kind[order], s.weight[order].astype(dtype))
+    used = slice(None) if hinged else slice(0)
+    curves = np.sqrt(h.weight)[used, None] * h.slopes[used]
+    bends = BendArrays(h.particles[used], h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype), curves.astype(dtype))
+    return Elements(springs, bends)
 
 
 def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:

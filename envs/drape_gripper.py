@@ -26,7 +26,7 @@ CLOSES, OPENS = -0.5, 0.5  # actions below and above these give the fingers an o
 PICKING = 0.3  # share of the potential that is for taking hold
 PICK_SCALE = 0.15 * SIDE  # how the potential rises as a gripper nears its place [m]
 # the particles that each gripper is to take: both corners of the edge at the target, or its middle
-PLACES = {1: (SHEET.corners[2] + SHEET.shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
+PLACES = {1: (SHEET.corners[2] + SHEET.grid_shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far

@@ -118,8 +118,8 @@ def see_points(first, last, x, v, particles, origin, scale, out):
 
 def key_particles(mesh: ClothMesh) -> NDArray:
     """Corners, middles of the edges, centre of a grid: particles of a 3 x 3 subgrid, row by row, (9,)."""
-    rows, columns = (np.array([0, n // 2, n - 1]) for n in mesh.shape)
-    return (rows[:, None] * mesh.shape[1] + columns[None, :]).ravel()
+    rows, columns = (np.array([0, n // 2, n - 1]) for n in mesh.grid_shape)
+    return (rows[:, None] * mesh.grid_shape[1] + columns[None, :]).ravel()
 
 
 @kernel

@@ -98,6 +98,7 @@ class Task(ABC):
             anchor_speed=2 * physics.hand_speed,
             grippers=physics.grippers,
             threads=threads,
+            on_divergence="ignore",  # a step's outcome says so
         )
         self.num_envs = num_envs
         self.threads = self.simulation.threads

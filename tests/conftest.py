@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clothgym import Material, Simulation
-from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs
+from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
 
 
 def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
@@ -13,7 +13,9 @@ def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
     ends = np.stack([np.arange(particles - 1), np.arange(1, particles)], axis=1).astype(np.int32)
     ends = np.concatenate([ends[::2], ends[1::2]])
     springs = Springs(ends, np.full(len(ends), spacing), np.full(len(ends), STRUCTURAL_X, np.int32), np.ones(len(ends)))
-    return ClothMesh((2, particles), (1.0, 1.0), positions, springs, np.zeros((0, 3), np.int32), np.ones(particles))
+    triangles = np.zeros((0, 3), np.int32)
+    hinges = coloured_hinges(positions, triangles)
+    return ClothMesh((1.0, 1.0), positions, springs, triangles, np.ones(particles), hinges, (2, particles))
 
 
 @pytest.fixture

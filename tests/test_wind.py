@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym import INTEGRATORS, Material, Simulation, State, Wind, grid
-from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs
+from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
 from clothgym.registration import ENVIRONMENTS
 
 NAMES = list(INTEGRATORS)
@@ -53,7 +53,8 @@ def one_triangle():
     ends = np.array([[0, 1]], np.int32)
     length = np.linalg.norm(positions[1] - positions[0], keepdims=True)
     springs = Springs(ends, length, np.array([STRUCTURAL_X], np.int32), np.ones(1))
-    return ClothMesh((2, 2), (1.0, 1.0), positions, springs, np.array([[0, 1, 2]], np.int32), np.full(3, 0.003))
+    triangles = np.array([[0, 1, 2]], np.int32)
+    return ClothMesh((1.0, 1.0), positions, springs, triangles, np.full(3, 0.003), coloured_hinges(positions, triangles))
 
 
 # --- the force ------------------------------------------------------------------------------------------------------------

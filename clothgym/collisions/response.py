@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.collisions.shapes import AXES, FRICTION, HALF, PLANE, POINT, RADIUS, REACH2, VELOCITY
+from clothgym.state import Layout
 
 
 @kernel
@@ -148,3 +149,14 @@ class Contacts(NamedTuple):
 
     distance: NDArray
     collider: NDArray
+
+
+def contacts(layout: Layout, x: NDArray, kinds: NDArray, colliders: NDArray) -> Contacts:
+    """Those of a batch; x and colliders in blocks."""
+    if not len(kinds):
+        shape = (layout.num_envs, x.shape[1])
+        return Contacts(np.full(shape, np.inf, x.dtype), np.full(shape, -1))
+    out = np.empty((layout.blocks, len(kinds), x.shape[1], layout.lanes), x.dtype)
+    signed_distances(0, layout.blocks, x, kinds, colliders, out)
+    distances = layout.to_public(out)
+    return Contacts(distances.min(axis=1), distances.argmin(axis=1))

@@ -7,6 +7,7 @@ batch may have another shape in the same slot.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -155,3 +156,19 @@ class Box(Collider):
         rows[AXES : AXES + 9] = (c, s, 0, -s, c, 0, 0, 0, 1)
         rows[HALF : HALF + 3] = self.half_sides
         rows[RADIUS] = self.thickness
+
+
+def check_replacement(colliders: Sequence[Collider], index: int, others: Sequence[Collider], envs: int) -> None:
+    """Refuse solids, one an environment, that cannot take the place of collider ``index``.
+
+    Raises:
+        ValueError: there is no such collider, the number is wrong, or they are of another family.
+    """
+    if not 0 <= index < len(colliders):
+        raise ValueError(f"index={index!r}: this simulation has {len(colliders)} colliders")
+    if isinstance(others, Collider) or len(others) != envs:
+        raise ValueError(f"colliders={others!r}: give a sequence of {envs}, one for each environment")
+    for other in others:
+        if other.kind != colliders[index].kind:
+            here, there = type(colliders[index]).__name__, type(other).__name__
+            raise ValueError(f"collider {index} is a {here}: a {there} cannot take its place")

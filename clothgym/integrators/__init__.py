@@ -3,22 +3,48 @@
 from __future__ import annotations
 
 import difflib
+import warnings
+from collections.abc import Mapping
+from typing import Any
 
-from clothgym.integrators import semi_implicit_euler, xpbd
 from clothgym.integrators.base import Integrator
+from clothgym.integrators.explicit_euler import EXPLICIT_EULER
+from clothgym.integrators.implicit_euler import IMPLICIT_EULER
+from clothgym.integrators.pbd import PBD
+from clothgym.integrators.projective_dynamics import PROJECTIVE_DYNAMICS
+from clothgym.integrators.rk4 import RK4
+from clothgym.integrators.semi_implicit_euler import SEMI_IMPLICIT_EULER
+from clothgym.integrators.verlet import VERLET
+from clothgym.integrators.xpbd import XPBD
 
-INTEGRATORS: dict[str, Integrator] = {method.name: method for method in (semi_implicit_euler.SEMI_IMPLICIT_EULER, xpbd.XPBD)}
+INTEGRATORS: dict[str, Integrator] = {
+    method.name: method
+    for method in (EXPLICIT_EULER, SEMI_IMPLICIT_EULER, VERLET, RK4, IMPLICIT_EULER, PROJECTIVE_DYNAMICS, PBD, XPBD)
+}
 
 
-def get(integrator: str | Integrator) -> Integrator:
-    """The integrator of that name, or the object itself.
+def get(integrator: str | Mapping[str, Any] | Integrator) -> Integrator:
+    """The integrator of that name, with options as ``{"name": "xpbd", "iterations": 4}``, or the object itself.
+
+    An option of another integrator is left out with a warning: it means nothing to this one.
 
     Raises:
-        ValueError: no such name; the message lists the right ones.
+        ValueError: no such name or option; the message lists the right ones.
     """
     if isinstance(integrator, Integrator):
         return integrator
-    if integrator not in INTEGRATORS:
+    if isinstance(integrator, Mapping):
+        options = {key: value for key, value in integrator.items() if key != "name"}
+        if "name" not in integrator:
+            raise ValueError(f"integrator={dict(integrator)!r}: must have a 'name', one of {', '.join(INTEGRATORS)}")
+        method = get(integrator["name"])
+        for name in set(options) - set(method.options):
+            others = [other.name for other in INTEGRATORS.values() if name in other.options]
+            if others:
+                warnings.warn(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is left out", stacklevel=3)
+                del options[name]
+        return method.with_options(**options)
+    if not isinstance(integrator, str) or integrator not in INTEGRATORS:
         near = difflib.get_close_matches(str(integrator), INTEGRATORS, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"no integrator {integrator!r}{hint} (there are: {', '.join(INTEGRATORS)})")

@@ -9,37 +9,36 @@ Damping along springs enters as an explicit force.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.forces import add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import Integrator, advance_positions, advance_velocities
-from clothgym.mesh import ClothMesh
+from clothgym.bending import add_bend_forces
+from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
+from clothgym.integrators.base import SCRATCH, Integrator, advance_positions, advance_velocities
 
 
-def _stable_substep(w: float, damping_time: float) -> float:
+def stable_substep(w: float, damping_time: float) -> float:
     """Positive root of ``(h w)^2 + 2 h tau w^2 = 4``: the damper's rate at frequency w [rad/s] is tau w^2."""
     return float(np.sqrt(damping_time**2 + 4 / w**2) - damping_time)
 
 
-def largest_substep(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inverse_mass: NDArray) -> tuple[float, str]:
+def largest_substep(o: Oscillators) -> tuple[float, str]:
     """The bound at the sheet's largest frequency."""
-    h = _stable_substep(largest_frequency(mesh, stiffness, inverse_mass), damping_time)
-    return h, "beyond it the stiffest mode of the sheet grows without bound"
+    return stable_substep(largest_frequency(o), o.damping_time), "beyond it the stiffest mode of the sheet grows without bound"
 
 
-def surely_allowed(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inverse_mass: NDArray) -> float:
+def surely_allowed(o: Oscillators) -> float:
     """The bound at a frequency that is certainly no smaller."""
-    return _stable_substep(frequency_bound(mesh, stiffness, inverse_mass), damping_time)
+    return stable_substep(frequency_bound(o), o.damping_time)
 
 
 @kernel
-def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push, h, work):
-    f = work[:-1]
-    row = work[-1]
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    stiffness, rigidity, damping_time = elastic
+    f = work[: x.shape[0]]
     f[:] = push
-    add_spring_forces(x, v, f, springs, stiffness, damping_time, row)
-    advance_velocities(v, w, f, gravity, drag_rate, h, row)
+    add_spring_forces(x, v, f, elements.springs, stiffness, damping_time, work[-1])
+    add_bend_forces(x, v, f, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+    advance_velocities(v, w, f, gravity, drag_rate, h, work[-1])
     advance_positions(x, v, h)
 
 
@@ -47,9 +46,11 @@ def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push,
 SEMI_IMPLICIT_EULER = Integrator(
     "semi_implicit_euler",
     order=1,
+    cost="one force pass",
+    damping="as an explicit force",
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    safety=0.8,
     springs_by_particle=True,
+    safety=0.8,
 )

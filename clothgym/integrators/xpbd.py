@@ -1,36 +1,39 @@
-"""Extended position-based dynamics with small steps: one Gauss-Seidel pass over the springs a substep.
+"""Extended position-based dynamics, by default with small steps: one Gauss-Seidel pass over the elements a substep.
 
 Macklin, Mueller and Chentanez 2016 (XPBD), eq. 18 with the damping of eq. 26; Macklin et al. 2019 (Small Steps) for one pass
-a substep, in which the multipliers start from zero and need no memory.
+a substep, in which the multipliers start from zero and need no memory.  ``iterations`` beyond one accumulate them within the
+substep, and converge to backward Euler.
 
-Order 1.  Cost: one projection pass a substep.  On one spring it is implicit Euler to rounding: amplitude 1/sqrt(1 + (h w)^2) a
+Order 1.  Cost: one projection pass an iteration.  On one spring it is implicit Euler to rounding: amplitude 1/sqrt(1 + (h w)^2) a
 substep.  Never unstable, but soft when under-resolved: a chain of N links has the stiffness k/(1 + q^2 (N - 1)/N) with
 q = h sqrt(k/m), 5 % too little at q = 0.229.  Damping along springs enters implicitly.
 """
 
 from __future__ import annotations
 
+from types import MappingProxyType
+
 import numpy as np
-from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.integrators.base import Integrator
-from clothgym.mesh import ClothMesh
+from clothgym.bending import project_bends
+from clothgym.forces import Oscillators
+from clothgym.integrators.base import SCRATCH, Integrator
 
 FIVE_PERCENT = 0.229
 
 
-def largest_substep(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inverse_mass: NDArray) -> tuple[float, str]:
+def largest_substep(o: Oscillators) -> tuple[float, str]:
     """The substep at which ``h sqrt(k/m)`` of the stiffest spring on the lightest particle reaches 0.229."""
-    springs = mesh.springs
-    k = springs.weight * stiffness[springs.kind]
-    lightest = np.max(inverse_mass[springs.particles], axis=1)
-    return float(FIVE_PERCENT / np.sqrt(np.max(k * lightest))), "beyond it the sheet is more than 5 % too soft"
+    springs = o.elements.springs
+    k = springs.weight * o.stiffness[springs.kind]
+    lightest = np.max(o.inverse_mass[springs.particles], axis=1)
+    return float(FIVE_PERCENT / np.sqrt(np.max(k * lightest))), "beyond it one pass leaves the sheet more than 5 % too soft"
 
 
-def surely_allowed(mesh: ClothMesh, stiffness: NDArray, damping_time: float, inverse_mass: NDArray) -> float:
+def surely_allowed(o: Oscillators) -> float:
     """The formula is quick: the same."""
-    return largest_substep(mesh, stiffness, damping_time, inverse_mass)[0]
+    return largest_substep(o)[0]
 
 
 @kernel
@@ -115,6 +118,42 @@ def _project_undamped_springs_of_one(x, w, springs, compliance):
 
 
 @kernel
+def project_springs_with_memory(x, start, w, springs, pull, damping, multipliers):
+    """One of several passes: what earlier ones have put into the multipliers, (springs, lanes) [kg m], is kept in account.
+
+    pull: ``k h^2`` [kg], (kinds, lanes): eq. 18 and 26 of the paper times it, so that no stiffness of zero is divided by.
+    """
+    ends, rest_length, kind, weight = springs
+    one = x.dtype.type(1)
+    tiny = x.dtype.type(1e-12)
+    for s in range(ends.shape[0]):
+        i = ends[s, 0]
+        j = ends[s, 1]
+        xi, xj, si, sj, wi, wj = x[i], x[j], start[i], start[j], w[i], w[j]
+        scale = pull[kind[s]]
+        share = weight[s]
+        r = rest_length[s]
+        known = multipliers[s]
+        for l in range(x.shape[2]):
+            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            ux, uy, uz = dx - (sj[0, l] - si[0, l]), dy - (sj[1, l] - si[1, l]), dz - (sj[2, l] - si[2, l])
+            inverse = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+            length = (dx * dx + dy * dy + dz * dz) * inverse
+            g = damping[l]
+            k = share * scale[l]
+            force = k * (length - r + g * (ux * dx + uy * dy + uz * dz) * inverse)
+            change = (force - known[l]) / (k * (one + g) * (wi[l] + wj[l]) + one)
+            known[l] += change
+            lam = change * inverse
+            xi[0, l] += wi[l] * lam * dx
+            xi[1, l] += wi[l] * lam * dy
+            xi[2, l] += wi[l] * lam * dz
+            xj[0, l] -= wj[l] * lam * dx
+            xj[1, l] -= wj[l] * lam * dy
+            xj[2, l] -= wj[l] * lam * dz
+
+
+@kernel
 def predict(x, v, w, start, gravity, push, drag_rate, h, row):
     """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity."""
     one = x.dtype.type(1)
@@ -150,33 +189,52 @@ def take_velocities(x, v, w, start, h):
 
 
 @kernel
-def substep(x, v, w, springs, stiffness, damping_time, drag_rate, gravity, push, h, work):
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    stiffness, rigidity, damping_time = elastic
+    springs, bends = elements
     one = x.dtype.type(1)
-    lanes = x.shape[2]
-    start = work[:-1]
+    n, lanes = x.shape[0], x.shape[2]
+    iterations = options[0]
+    start = work[:n]
     predict(x, v, w, start, gravity, push, drag_rate, h, work[-1])
-    compliance = np.empty_like(stiffness)
+    pull, compliance, damping, bend = (
+        np.empty_like(stiffness), np.empty_like(stiffness), np.empty_like(damping_time), np.empty_like(rigidity)
+    )  # fmt: skip
     for kind in range(stiffness.shape[0]):
         for l in range(lanes):
+            pull[kind, l] = stiffness[kind, l] * h * h
             compliance[kind, l] = one / (stiffness[kind, l] * h * h)
-    damping = np.empty_like(damping_time)
     damped = False
     for l in range(lanes):
+        bend[l] = rigidity[l] * h * h
         damping[l] = damping_time[l] / h
         damped |= damping[l] > 0
-    if damped:
-        project_springs(x, start, w, springs, compliance, damping)
+    if iterations == 1:
+        if damped:
+            project_springs(x, start, w, springs, compliance, damping)
+        else:
+            project_undamped_springs(x, w, springs, compliance)
+        project_bends(x, start, w, bends, bend, damping, one, work[:0], work[-SCRATCH:])
     else:
-        project_undamped_springs(x, w, springs, compliance)
+        rows = (springs.kind.shape[0] + 2) // 3
+        of_springs = work[n : n + rows].reshape((3 * rows, lanes))
+        of_bends = work[n + rows : n + rows + bends.weight.shape[0]]
+        work[n : n + rows + bends.weight.shape[0]] = 0
+        for _ in range(iterations):
+            project_springs_with_memory(x, start, w, springs, pull, damping, of_springs)
+            project_bends(x, start, w, bends, bend, damping, one, of_bends, work[-SCRATCH:])
     take_velocities(x, v, w, start, h)
 
 
 XPBD = Integrator(
     "xpbd",
     order=1,
+    cost="one projection pass an iteration",
+    damping="implicitly, in each projection",
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    safety=1.0,
     springs_by_particle=False,
+    options=MappingProxyType({"iterations": 1}),
+    multipliers=True,
 )

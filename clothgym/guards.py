@@ -1,0 +1,120 @@
+"""Floor 4: what keeps a simulation from going wrong unseen: bounds on the substep, and a look at every step's outcome."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.forces import Oscillators
+from clothgym.integrators import Integrator
+from clothgym.mesh import ClothMesh
+from clothgym.parameters import FIGURES
+from clothgym.state import Elements, Fabric
+
+FASTEST = 1e3  # no cloth moves at a kilometre a second [m/s]
+
+
+@kernel
+def mark_diverged(x, v, diverged):
+    """Set the flags, (lanes,), of lanes where something is not finite, or faster than ``FASTEST``."""
+    limit = x.dtype.type(FASTEST)
+    for p in range(x.shape[0]):
+        for c in range(3):
+            for l in range(x.shape[2]):
+                fine = abs(v[p, c, l]) < limit and abs(x[p, c, l]) < np.inf
+                diverged[l] |= not fine
+
+
+def oscillators(mesh: ClothMesh, elements: Elements, fabric: Fabric, free_w: NDArray, block: int, lane: int) -> Oscillators:
+    """What decides on the substep of the environment in that block and lane; elements in float64."""
+    return Oscillators(
+        positions=mesh.rest_positions,
+        elements=elements,
+        stiffness=fabric.stiffness[block, :, lane].astype(np.float64),
+        rigidity=float(fabric.rigidity[block, lane]),
+        damping_time=float(fabric.damping_time[block, lane]),
+        inverse_mass=free_w[block, :, lane].astype(np.float64),
+    )
+
+
+def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_step: float) -> int:
+    """Substeps of a control step [s] from the integrator's bound.
+
+    Raises:
+        ValueError: it has none: no substep is small enough.
+    """
+    largest, why = integrator.largest_substep(oscillators)
+    if largest <= 0:
+        raise ValueError(
+            f"substeps='auto': {integrator.name} has no bound here, {why}; give a number of substeps, a fabric with damping_time, "
+            "or another integrator, semi_implicit_euler for instance"
+        )
+    return integrator.automatic_substeps(time_step, largest)
+
+
+def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_step: float, substeps: int) -> None:
+    """Warn of the first environment for which the substeps are too few, with the number that would do."""
+    h = time_step / substeps
+    for one in each:
+        # the sharp bound needs an eigenvalue: only for those that a quick one does not clear
+        if h <= integrator.surely_allowed(one):
+            continue
+        largest, why = integrator.largest_substep(one)
+        if h > largest:
+            remedy = "Take another integrator, or a fabric with damping_time."
+            if largest > 0:
+                remedy = f"Use substeps={integrator.automatic_substeps(time_step, largest)} or substeps='auto'."
+            warnings.warn(
+                f"{substeps} substeps of {h:.3g} s are too few for {integrator.name}: its bound here is {largest:.3g} s, {why}. "
+                f"{remedy}",
+                stacklevel=4,
+            )
+            return
+
+
+def refuse_figures(integrator: Integrator, before: NDArray, after: NDArray) -> None:
+    """Refuse material figures that an integrator cannot have; before, after: (num_envs, figures).
+
+    Raises:
+        ValueError: a figure that means nothing to it has changed, or one that enters its matrix differs between environments.
+    """
+    for column, name in enumerate(FIGURES):
+        if name in integrator.ignored and not np.array_equal(after[:, column], before[:, column]):
+            raise ValueError(refusal(integrator, name))
+        if name in integrator.shared and np.ptp(after[:, column]) > 0:
+            raise ValueError(refusal(integrator, name))
+
+
+def refusal(integrator: Integrator, name: str) -> str:
+    """Why an integrator refuses a figure."""
+    if name in integrator.ignored:
+        return f"{integrator.name} knows no {name}: its stiffness is a matter of its options ({', '.join(integrator.options)})"
+    return (
+        f"{integrator.name} factorises one matrix for all environments: {name} cannot differ between them; set it for all, or take "
+        "another integrator"
+    )
+
+
+def report_divergence(new: NDArray, steps: NDArray, integrator: Integrator, substeps: int, stop: bool) -> None:
+    """Tell of environments that have just diverged, a mask.
+
+    Raises:
+        FloatingPointError: instead of a warning, if ``stop``.
+    """
+    envs = np.flatnonzero(new)
+    if not len(envs):
+        return
+    which = f"environment {envs[0]}" if len(envs) == 1 else f"environments {', '.join(map(str, envs[:8]))}"
+    more = f" and {len(envs) - 8} more" if len(envs) > 8 else ""
+    message = (
+        f"{which}{more} diverged in control step {steps[envs[0]]}: {integrator.name} with {substeps} substeps left a position that "
+        f"is not finite or a speed above {FASTEST:g} m/s. Use more substeps ('auto' follows the bound), slower hands or a softer "
+        "fabric; reset() starts them afresh. The other environments are not affected."
+    )
+    if stop:
+        raise FloatingPointError(message)
+    warnings.warn(message, RuntimeWarning, stacklevel=3)

@@ -1,0 +1,57 @@
+"""Explicit (forward) Euler: positions with the old velocities, velocities with the old positions' forces.
+
+Order 1.  Cost: one force pass a substep.  It is here to be seen failing: an undamped oscillator of frequency w grows by
+sqrt(1 + (h w)^2) in every substep, whatever the substep is.  With dampers of retardation time tau along the springs it is
+stable while ``h <= tau`` and ``(h w)^2 - 2 h tau w^2 + 4 >= 0`` (from the eigenvalues of its step matrix; Hairer, Lubich and
+Wanner, Geometric Numerical Integration, 2006, I.1.2 for the undamped case).  Damping along springs enters as an explicit force.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.bending import add_bend_forces
+from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
+from clothgym.integrators.base import SCRATCH, Integrator, advance_positions, advance_velocities
+
+
+def _stable_substep(w: float, damping_time: float) -> float:
+    """The smaller of tau and of the smaller root of ``(h w)^2 - 2 h tau w^2 + 4 = 0``, if it has any."""
+    oscillating = damping_time**2 - 4 / w**2
+    return min(damping_time, damping_time - np.sqrt(oscillating)) if oscillating > 0 else damping_time
+
+
+def largest_substep(o: Oscillators) -> tuple[float, str]:
+    """The bound at the sheet's largest frequency."""
+    why = "beyond it every mode of the sheet grows without bound" if o.damping_time else "without damping it grows at any substep"
+    return float(_stable_substep(largest_frequency(o), o.damping_time)), why
+
+
+def surely_allowed(o: Oscillators) -> float:
+    """The bound at a frequency that is certainly no smaller."""
+    return float(_stable_substep(frequency_bound(o), o.damping_time))
+
+
+@kernel
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    stiffness, rigidity, damping_time = elastic
+    f = work[: x.shape[0]]
+    f[:] = push
+    add_spring_forces(x, v, f, elements.springs, stiffness, damping_time, work[-1])
+    add_bend_forces(x, v, f, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+    advance_positions(x, v, h)
+    advance_velocities(v, w, f, gravity, drag_rate, h, work[-1])
+
+
+EXPLICIT_EULER = Integrator(
+    "explicit_euler",
+    order=1,
+    cost="one force pass",
+    damping="as an explicit force, and it alone can make the method stable",
+    substep=substep,
+    largest_substep=largest_substep,
+    surely_allowed=surely_allowed,
+    springs_by_particle=True,
+    safety=0.8,
+)

@@ -1,0 +1,198 @@
+"""Backward Euler, linearised once a substep and solved by conjugate gradients.
+
+Baraff and Witkin 1998, Large Steps in Cloth Simulation.
+
+With v* the velocity that gravity, drag and the air would leave, f the elements' force, K its stiffness and D its damping matrix,
+a substep solves ``(M + h D + h^2 K) d = h f(x, v*) - h^2 K v*`` and takes ``v = v* + d``, ``x <- x + h v`` (their eq. 16, about v*
+in place of v).  ``newton_iterations`` beyond 1 linearise again where the substep would end, ``M d = h f(x + h v, v) - M (v - v*)``:
+that is Newton's method for the full backward Euler equations, with K without what would make it indefinite.
+
+Conjugate gradients take the inverse masses as preconditioner.  A held particle's is zero, and that is the filter of their
+section 5.3: its residual never enters, and its velocity stays exact after any number of iterations.  The residuals of a free sheet
+sum to zero in every iteration, so that its momentum stays exact too.  Each lane has its own step lengths, and stops where its
+residual is ``tolerance`` times the first: what the others do does not change its bits.
+
+Order 1.  Cost: a force pass, and a product with the stiffness matrix for each iteration and one more.  Never unstable; a mode of
+frequency w keeps 1/sqrt(1 + (h w)^2) of its amplitude a substep.  Damping along springs enters implicitly, in D.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.bending import add_bend_forces, add_bend_products
+from clothgym.forces import Oscillators, add_spring_forces, add_spring_products, frequency_bound, largest_frequency
+from clothgym.integrators.base import SCRATCH, Integrator, advance_velocities, move_on
+
+# substeps so many times those at which explicit methods become unstable still follow a swinging sheet (see docs/physics.md)
+STIFFEST = 8.0
+
+
+def largest_substep(o: Oscillators) -> tuple[float, str]:
+    """Where ``h w`` of the stiffest mode reaches 8."""
+    return STIFFEST / largest_frequency(o), "beyond it the sheet swings visibly too little (it is never unstable)"
+
+
+def surely_allowed(o: Oscillators) -> float:
+    """The same at a frequency that is certainly no smaller."""
+    return STIFFEST / frequency_bound(o)
+
+
+@kernel
+def weigh(w, total, r, h):
+    """``r <- h r - M total`` for free particles and zero for held ones: what is left of the backward Euler equations [N s]."""
+    zero = r.dtype.type(0)
+    for p in range(r.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            rc, tc = r[p, c], total[p, c]
+            for l in range(r.shape[2]):
+                rc[l] = h * rc[l] - tc[l] / wp[l] if wp[l] > zero else zero
+
+
+@kernel
+def add_to(a, b):
+    """``a <- a + b``."""
+    for p in range(a.shape[0]):
+        for c in range(3):
+            ac, bc = a[p, c], b[p, c]
+            for l in range(a.shape[2]):
+                ac[l] += bc[l]
+
+
+@kernel
+def _begin(w, r, p, rho):
+    """First search direction, ``p = M^-1 r``, and the residual's square in that norm, (lanes,)."""
+    rho[:] = 0
+    for i in range(r.shape[0]):
+        wi = w[i]
+        for c in range(3):
+            rc, pc = r[i, c], p[i, c]
+            for l in range(r.shape[2]):
+                pc[l] = wi[l] * rc[l]
+                rho[l] += pc[l] * rc[l]
+
+
+@kernel
+def _mass_product(w, p, q):
+    """``q = M p``; a held particle has ``p = 0``."""
+    zero, one = p.dtype.type(0), p.dtype.type(1)
+    for i in range(p.shape[0]):
+        wi = w[i]
+        for c in range(3):
+            pc, qc = p[i, c], q[i, c]
+            for l in range(p.shape[2]):
+                qc[l] = pc[l] * (one / wi[l]) if wi[l] > zero else zero
+
+
+@kernel
+def _product_along(p, q, out):
+    """``p . q`` of each lane, (lanes,)."""
+    out[:] = 0
+    for i in range(p.shape[0]):
+        for c in range(3):
+            pc, qc = p[i, c], q[i, c]
+            for l in range(p.shape[2]):
+                out[l] += pc[l] * qc[l]
+
+
+@kernel
+def _advance(w, v, total, p, q, r, step, after):
+    """``v += step p``, ``total += step p``, ``r -= step q``, and the new residual's square, (lanes,)."""
+    after[:] = 0
+    for i in range(p.shape[0]):
+        wi = w[i]
+        for c in range(3):
+            vc, tc, pc, qc, rc = v[i, c], total[i, c], p[i, c], q[i, c], r[i, c]
+            for l in range(p.shape[2]):
+                d = step[l] * pc[l]
+                vc[l] += d
+                tc[l] += d
+                rc[l] -= step[l] * qc[l]
+                after[l] += wi[l] * rc[l] * rc[l]
+
+
+@kernel
+def _turn(w, r, p, share):
+    """The next search direction, ``p = M^-1 r + share p``."""
+    for i in range(p.shape[0]):
+        wi = w[i]
+        for c in range(3):
+            pc, rc = p[i, c], r[i, c]
+            for l in range(p.shape[2]):
+                pc[l] = wi[l] * rc[l] + share[l] * pc[l]
+
+
+@kernel
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    stiffness, rigidity, damping_time = elastic
+    t = x.dtype.type
+    zero = t(0)
+    n, lanes = x.shape[0], x.shape[2]
+    newton_iterations, iterations, tolerance = options
+    start, total, r, p, q = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n], work[4 * n : 5 * n]
+    scratch = work[-SCRATCH:]
+    along, across, bend, goal, rho, step = np.empty((6, lanes), x.dtype)
+    for l in range(lanes):
+        across[l] = h * h
+        along[l] = h * h + h * damping_time[l]
+    advance_velocities(v, w, push, gravity, drag_rate, h, work[-1])
+    start[:] = x
+    total[:] = 0
+    for newton in range(newton_iterations):
+        if newton > 0:
+            move_on(x, v, start, h)
+        r[:] = 0
+        add_spring_forces(x, v, r, elements.springs, stiffness, damping_time, work[-1])
+        add_bend_forces(x, v, r, elements.bends, rigidity, damping_time, scratch)
+        weigh(w, total, r, h)
+        if newton == 0:
+            for l in range(lanes):
+                step[l] = -across[l]
+                bend[l] = -across[l] * rigidity[l]
+            q[:] = 0
+            add_spring_products(x, v, q, elements.springs, stiffness, step, step, work[-1])
+            add_bend_products(x, v, q, elements.bends, bend, scratch)
+            add_to(r, q)
+        for l in range(lanes):
+            bend[l] = along[l] * rigidity[l]
+        _begin(w, r, p, rho)
+        for l in range(lanes):
+            goal[l] = rho[l] * t(tolerance) * t(tolerance)
+        for _ in range(iterations):
+            going = False
+            for l in range(lanes):
+                going |= rho[l] > goal[l]
+            if not going:
+                break
+            _mass_product(w, p, q)
+            add_spring_products(x, p, q, elements.springs, stiffness, along, across, work[-1])
+            add_bend_products(x, p, q, elements.bends, bend, scratch)
+            _product_along(p, q, step)
+            for l in range(lanes):
+                step[l] = rho[l] / step[l] if rho[l] > goal[l] and step[l] > zero else zero
+            after = scratch[0, 0]
+            _advance(w, v, total, p, q, r, step, after)
+            for l in range(lanes):
+                share = after[l] / rho[l] if rho[l] > zero else zero
+                rho[l] = after[l] if step[l] > zero else zero
+                step[l] = share
+            _turn(w, r, p, step)
+    move_on(x, v, start, h)
+
+
+IMPLICIT_EULER = Integrator(
+    "implicit_euler",
+    order=1,
+    cost="a force pass, and a matrix product an iteration",
+    damping="implicitly, in the matrix",
+    substep=substep,
+    largest_substep=largest_substep,
+    surely_allowed=surely_allowed,
+    springs_by_particle=True,
+    options=MappingProxyType({"newton_iterations": 1, "iterations": 200, "tolerance": 1e-3}),
+    fields=5,
+)

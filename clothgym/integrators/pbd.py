@@ -1,0 +1,112 @@
+"""Position-based dynamics: Mueller, Heidelberger, Hennix and Ratcliff 2007.
+
+Particles fall freely for a substep, then ``iterations`` Gauss-Seidel passes move the ends of each spring towards its rest length,
+and velocities are what was moved.  A pass takes the share ``k' = 1 - (1 - k)^(1/iterations)`` of each constraint (their section
+3.3), so that a lone one is left with 1 - k of its error whatever the number of passes.
+
+It is here because it is everywhere.  It does not converge, and no material figure but the density means anything to it: the
+stiffness k is a number from 0 to 1 a substep, ``stretch`` for threads and diagonals and ``bend`` for what bends, and twice the
+substeps make another fabric.  A lone oscillator loses amplitude by sqrt(1 - k) a substep and turns by acos(sqrt(1 - k)), for any h.
+
+Order: none.  Cost: one projection pass an iteration.  Never unstable.  Damping along springs does not enter: the projections
+damp far more.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.bending import project_bends
+from clothgym.forces import Oscillators
+from clothgym.integrators.base import SCRATCH, Integrator
+from clothgym.integrators.xpbd import predict, take_velocities
+from clothgym.mesh import SHEAR
+
+USUAL = 1 / 300  # [s]
+RIGID = 1e12  # a scale at which projecting a bend solves it whole
+
+
+def largest_substep(o: Oscillators) -> tuple[float, str]:
+    """What is usual, for want of anything to hold it against."""
+    return USUAL, "no substep is right for it: its stiffness depends on the substep and the iterations"
+
+
+def surely_allowed(o: Oscillators) -> float:
+    """Any: there is nothing to warn of that is not always so."""
+    return float("inf")
+
+
+@kernel
+def project_rigid_springs(x, w, springs, stretch, bend):
+    """Move both ends of each spring by the share ``stretch``, or ``bend`` for what bends, of its error, in place."""
+    ends, rest_length, kind, _ = springs
+    tiny = x.dtype.type(1e-12)
+    for s in range(ends.shape[0]):
+        i = ends[s, 0]
+        j = ends[s, 1]
+        xi, xj, wi, wj = x[i], x[j], w[i], w[j]
+        r = rest_length[s]
+        share = bend if kind[s] > SHEAR else stretch
+        for l in range(x.shape[2]):
+            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            d2 = dx * dx + dy * dy + dz * dz + tiny
+            lam = share * (d2 - r * np.sqrt(d2)) / (d2 * (wi[l] + wj[l] + tiny))
+            xi[0, l] += wi[l] * lam * dx
+            xi[1, l] += wi[l] * lam * dy
+            xi[2, l] += wi[l] * lam * dz
+            xj[0, l] -= wj[l] * lam * dx
+            xj[1, l] -= wj[l] * lam * dy
+            xj[2, l] -= wj[l] * lam * dz
+
+
+@kernel
+def share_of_a_pass(k, iterations):
+    """``1 - (1 - k)^(1/iterations)``, by Newton's method on ``y^iterations = 1 - k`` from above: no power function in a kernel."""
+    left = 1.0 - k
+    if left <= 0.0:
+        return 1.0
+    y = 1.0
+    for _ in range(60 * iterations):
+        power = 1.0
+        for _ in range(iterations - 1):
+            power *= y
+        change = (power * y - left) / (iterations * power)
+        y -= change
+        if change <= 1e-16:
+            break
+    return 1.0 - y
+
+
+@kernel
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    _, rigidity, damping_time = elastic
+    t = x.dtype.type
+    n = x.shape[0]
+    iterations, stretch, bend = options
+    start = work[:n]
+    scale, damping = np.empty_like(rigidity), np.empty_like(rigidity)
+    scale[:] = RIGID
+    damping[:] = 0
+    along, across = t(share_of_a_pass(stretch, iterations)), t(share_of_a_pass(bend, iterations))
+    predict(x, v, w, start, gravity, push, drag_rate, h, work[-1])
+    for _ in range(iterations):
+        project_rigid_springs(x, w, elements.springs, along, across)
+        project_bends(x, start, w, elements.bends, scale, damping, across, work[:0], work[-SCRATCH:])
+    take_velocities(x, v, w, start, h)
+
+
+PBD = Integrator(
+    "pbd",
+    order=None,
+    cost="one projection pass an iteration",
+    damping="not at all: the projections damp far more",
+    substep=substep,
+    largest_substep=largest_substep,
+    surely_allowed=surely_allowed,
+    springs_by_particle=False,
+    options=MappingProxyType({"iterations": 10, "stretch": 0.9, "bend": 0.1}),
+    ignored=frozenset({"stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"}),
+)

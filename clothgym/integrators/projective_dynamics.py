@@ -1,0 +1,216 @@
+"""Projective dynamics: Liu, Bargteil, O'Brien and Kavan 2013, Fast simulation of mass-spring systems.
+
+The backward Euler equations ``M (v - v*) = h f(x + h v, v)`` are solved by ``iterations`` of a local and a global step.  Put
+together these are a descent with a matrix that never changes, ``A = M + (h^2 + h tau) sum k (e_i - e_j)(e_i - e_j)^T`` (their eq.
+14; Liu, Bouaziz and Kavan 2017 read it that way): evaluate what is left of the equations, solve with A, add.  So the forces are
+those of all other integrators, dampers along springs and hinges included, and the fixed point is theirs of backward Euler; A only
+says how fast it is reached.  What bends enters A as the quadratic model.
+
+A is factorised once, at set-up, and shared by all lanes: figures that enter it must be the same in all environments.  Which
+particles are held may differ, and change in every step: with S the held ones, ``d = A^-1 (r - E_S (A^-1_SS)^-1 (A^-1 r)_S)``
+leaves them where they are exactly, from columns of A^-1 that are kept for those that can be held.
+
+Order 1, where the iterations suffice.  Cost: a force pass and two triangular solves an iteration.  Never unstable; too few
+iterations make it sluggish.  A mode of frequency w keeps 1/sqrt(1 + (h w)^2) of its amplitude a substep.  Damping along springs
+enters implicitly.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.bending import add_bend_forces
+from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
+from clothgym.integrators.base import SCRATCH, Integrator, Preparation, advance_velocities, move_on
+from clothgym.integrators.implicit_euler import add_to, weigh
+
+# h w of the stiffest mode up to which ten iterations follow a swinging sheet (see docs/physics.md)
+STIFFEST = 4.0
+
+
+def largest_substep(o: Oscillators) -> tuple[float, str]:
+    """Where ``h w`` of the stiffest mode reaches 4."""
+    return STIFFEST / largest_frequency(o), "beyond it ten iterations leave the sheet sluggish (it is never unstable)"
+
+
+def surely_allowed(o: Oscillators) -> float:
+    """The same at a frequency that is certainly no smaller."""
+    return STIFFEST / frequency_bound(o)
+
+
+def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
+    """Factors ``P A P^T = L D L^T``, and the columns of A^-1 of those that can be held.
+
+    Returns:
+        order: particle of each row, (particles,).
+        starts, columns, values: L without its diagonal by rows; and rows_starts, rows, rows_values: by columns.
+        inverse_diagonal: of D, (particles,).
+        slot: column of ``held`` that a particle has, or -1, (particles,).
+        held: columns of A^-1, (holdable, particles).
+    """
+    from scipy.sparse import coo_matrix, csc_matrix, diags  # imported here: they would double the time of a warm start
+    from scipy.sparse.linalg import splu
+
+    o, h, holdable = preparation
+    springs, bends = o.elements
+    n = len(o.positions)
+    scale = h * h + h * o.damping_time
+    i, j = springs.particles.T
+    k = scale * springs.weight * o.stiffness[springs.kind]
+    rows, columns, values = [i, j, i, j], [i, j, j, i], [k, k, -k, -k]
+    for a in range(4):
+        for b in range(4):
+            rows.append(bends.particles[:, a])
+            columns.append(bends.particles[:, b])
+            values.append(scale * o.rigidity * bends.curves[:, a] * bends.curves[:, b])
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    matrix = csc_matrix(coo_matrix(entries, shape=(n, n)) + diags(1 / o.inverse_mass))
+    # no pivoting: the matrix is positive definite, and U = D L^T
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    order = np.argsort(factors.perm_c)
+    unit = np.zeros((n, len(holdable)))
+    unit[holdable, np.arange(len(holdable))] = 1
+    slot = np.full(n, -1, np.int64)
+    slot[holdable] = np.arange(len(holdable))
+    by_column = csc_matrix(factors.L)
+    by_column.setdiag(0)
+    by_column.eliminate_zeros()
+    by_row = by_column.tocsr()
+    by_row.sort_indices()
+    by_column.sort_indices()
+    return (
+        order, by_row.indptr, by_row.indices, by_row.data, by_column.indptr, by_column.indices, by_column.data,
+        1 / factors.U.diagonal(), slot, factors.solve(unit).T.copy(),
+    )  # fmt: skip
+
+
+@kernel
+def _subtract_products(y, row, starts, columns, values):
+    """``y[row] -= sum values y[columns]``; y: (particles, 3 lanes)."""
+    own = y[row]
+    for e in range(starts[row], starts[row + 1]):
+        other = y[columns[e]]
+        value = values[e]
+        for l in range(own.shape[0]):
+            own[l] -= value * other[l]
+
+
+@kernel
+def solve(plan, r, y):
+    """``r <- A^-1 r`` by two triangular solves; y: scratch of the same shape, (particles, 3, lanes)."""
+    order, starts, columns, values, row_starts, rows, row_values, inverse_diagonal = plan[:8]
+    n = r.shape[0]
+    flat_r, flat_y = r.reshape((n, r.shape[1] * r.shape[2])), y.reshape((n, r.shape[1] * r.shape[2]))
+    for i in range(n):
+        flat_y[i] = flat_r[order[i]]
+        _subtract_products(flat_y, i, starts, columns, values)
+    for i in range(n - 1, -1, -1):
+        own = flat_y[i]
+        for l in range(own.shape[0]):
+            own[l] *= inverse_diagonal[i]
+        _subtract_products(flat_y, i, row_starts, rows, row_values)
+        flat_r[order[i]] = flat_y[i]
+
+
+@kernel
+def factorise_held(w, slot, held, members, count, lower):
+    """List the held particles of each lane, and factorise their part of A^-1 (Cholesky): held, (holdable, particles)."""
+    count[:] = 0
+    for p in range(w.shape[0]):
+        for l in range(w.shape[1]):
+            if w[p, l] == 0 and slot[p] >= 0:
+                members[count[l], l] = p
+                count[l] += 1
+    for l in range(w.shape[1]):
+        for a in range(count[l]):
+            for b in range(a + 1):
+                value = held[slot[members[a, l]], members[b, l]]
+                for c in range(b):
+                    value -= lower[a, c, l] * lower[b, c, l]
+                lower[a, b, l] = np.sqrt(value) if a == b else value / lower[b, b, l]
+
+
+@kernel
+def keep_held(d, slot, held, members, count, lower, force):
+    """Take from ``d = A^-1 r`` what the held particles' own forces do, so that they stay: (particles, 3, lanes)."""
+    force[:] = 0
+    for l in range(d.shape[2]):
+        m = count[l]
+        for c in range(3):
+            for a in range(m):
+                value = d[members[a, l], c, l]
+                for b in range(a):
+                    value -= lower[a, b, l] * force[slot[members[b, l]], c, l]
+                force[slot[members[a, l]], c, l] = value / lower[a, a, l]
+            for a in range(m - 1, -1, -1):
+                value = force[slot[members[a, l]], c, l]
+                for b in range(a + 1, m):
+                    value -= lower[b, a, l] * force[slot[members[b, l]], c, l]
+                force[slot[members[a, l]], c, l] = value / lower[a, a, l]
+    for k in range(held.shape[0]):
+        anyone = False
+        for c in range(3):
+            for l in range(d.shape[2]):
+                anyone |= force[k, c, l] != 0
+        if anyone:
+            for p in range(d.shape[0]):
+                share = held[k, p]
+                for c in range(3):
+                    for l in range(d.shape[2]):
+                        d[p, c, l] -= share * force[k, c, l]
+    for l in range(d.shape[2]):
+        for a in range(count[l]):
+            for c in range(3):
+                d[members[a, l], c, l] = 0
+
+
+@kernel
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    stiffness, rigidity, damping_time = elastic
+    slot, held = plan[8], plan[9]
+    n, lanes = x.shape[0], x.shape[2]
+    iterations = options[0]
+    start, total, r, y = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
+    most = 0
+    for l in range(lanes):
+        own = 0
+        for p in range(n):
+            own += 1 if w[p, l] == 0 else 0
+        most = max(most, own)
+    members, count = np.empty((most, lanes), np.int64), np.empty(lanes, np.int64)
+    lower, force = np.empty((most, most, lanes), x.dtype), np.empty((held.shape[0], 3, lanes), x.dtype)
+    factorise_held(w, slot, held, members, count, lower)
+    advance_velocities(v, w, push, gravity, drag_rate, h, work[-1])
+    start[:] = x
+    total[:] = 0
+    for _ in range(iterations):
+        move_on(x, v, start, h)
+        r[:] = 0
+        add_spring_forces(x, v, r, elements.springs, stiffness, damping_time, work[-1])
+        add_bend_forces(x, v, r, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+        weigh(w, total, r, h)
+        solve(plan, r, y)
+        keep_held(r, slot, held, members, count, lower, force)
+        add_to(v, r)
+        add_to(total, r)
+    move_on(x, v, start, h)
+
+
+PROJECTIVE_DYNAMICS = Integrator(
+    "projective_dynamics",
+    order=1,
+    cost="a force pass and two triangular solves an iteration",
+    damping="implicitly, in the matrix and in each iteration's forces",
+    substep=substep,
+    largest_substep=largest_substep,
+    surely_allowed=surely_allowed,
+    springs_by_particle=True,
+    options=MappingProxyType({"iterations": 10}),
+    fields=4,
+    prepare=prepare,
+    shared=frozenset({"density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"}),
+)

@@ -1,0 +1,115 @@
+"""Floor 4: strain limiting, Provot 1995: threads and diagonals beyond a threshold are drawn back to it after each substep.
+
+A sweep goes over the springs: of one that is too long, two free ends move equally, one free end moves alone, and two held ones
+stay.  One sweep is not enough, for each correction stretches the neighbours: sweeps go on until no spring is ``TOLERANCE`` beyond
+the threshold, or ``SWEEPS`` are done; what is then left is reported.  In the same visit, the ends of a spring at its limit lose the
+velocity with which they part, by an impulse between their masses: that takes kinetic energy and can never add any.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.mesh import SHEAR
+
+TOLERANCE = 0.005
+SWEEPS = 100
+BEFORE, AFTER, USED = 0, 1, 2
+
+
+class Limiting(NamedTuple):
+    """What strain limiting did in the last control step, (num_envs,) each: the largest strain that it met, the largest that it left
+    at the end, and the most sweeps that a substep took."""
+
+    before: NDArray
+    after: NDArray
+    sweeps: NDArray
+
+
+@kernel
+def limit_strain(x, v, w, springs, limit, report):
+    """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
+
+    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes).  report: rows BEFORE, AFTER and USED, (3, lanes): the first
+    and the last keep the largest of the control step.
+    """
+    lanes = x.shape[2]
+    largest = np.empty(lanes, x.dtype)
+    enough = x.dtype.type(limit + TOLERANCE)
+    for sweep in range(SWEEPS + 1):
+        _largest_strain(x, springs, largest)
+        going = False
+        for l in range(lanes):
+            going |= largest[l] > enough
+            report[AFTER, l] = largest[l]
+            if sweep == 0:
+                report[BEFORE, l] = max(report[BEFORE, l], largest[l])
+        if not going or sweep == SWEEPS:
+            return
+        for l in range(lanes):
+            if largest[l] > enough:
+                report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
+        _sweep(x, v, w, springs, x.dtype.type(limit), enough, largest)
+
+
+@kernel
+def no_limit(x, v, w, springs, limit, report):
+    """Leave the springs as they are."""
+
+
+@kernel
+def _largest_strain(x, springs, largest):
+    """Of the springs that do not bend, (lanes,)."""
+    ends, rest_length, kind, _ = springs
+    one = x.dtype.type(1)
+    largest[:] = 0
+    for s in range(ends.shape[0]):
+        if kind[s] > SHEAR:
+            continue
+        xi, xj = x[ends[s, 0]], x[ends[s, 1]]
+        inverse = one / (rest_length[s] * rest_length[s])
+        for l in range(x.shape[2]):
+            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            largest[l] = max(largest[l], (dx * dx + dy * dy + dz * dz) * inverse)
+    for l in range(x.shape[2]):
+        largest[l] = np.sqrt(largest[l]) - one
+
+
+@kernel
+def _sweep(x, v, w, springs, limit, enough, largest):
+    """Visit each spring of the lanes whose largest strain is beyond ``enough``."""
+    ends, rest_length, kind, _ = springs
+    one, zero, half = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0.5)
+    for s in range(ends.shape[0]):
+        if kind[s] > SHEAR:
+            continue
+        i, j = ends[s, 0], ends[s, 1]
+        xi, xj, vi, vj, wi, wj = x[i], x[j], v[i], v[j], w[i], w[j]
+        longest = (one + limit) * rest_length[s]
+        for l in range(x.shape[2]):
+            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            length = np.sqrt(dx * dx + dy * dy + dz * dz)
+            mobile = wi[l] + wj[l]
+            if largest[l] > enough and length >= longest and mobile > zero:
+                nx, ny, nz = dx / length, dy / length, dz / length
+                excess = length - longest
+                own = half if wi[l] > zero and wj[l] > zero else (one if wi[l] > zero else zero)
+                first, second = own * excess, (one - own) * excess
+                xi[0, l] += first * nx
+                xi[1, l] += first * ny
+                xi[2, l] += first * nz
+                xj[0, l] -= second * nx
+                xj[1, l] -= second * ny
+                xj[2, l] -= second * nz
+                parting = (vj[0, l] - vi[0, l]) * nx + (vj[1, l] - vi[1, l]) * ny + (vj[2, l] - vi[2, l]) * nz
+                impulse = max(parting, zero) / mobile
+                vi[0, l] += wi[l] * impulse * nx
+                vi[1, l] += wi[l] * impulse * ny
+                vi[2, l] += wi[l] * impulse * nz
+                vj[0, l] -= wj[l] * impulse * nx
+                vj[1, l] -= wj[l] * impulse * ny
+                vj[2, l] -= wj[l] * impulse * nz

@@ -1,0 +1,169 @@
+"""Floor 1: sheets of triangles: from arrays, from files, and the disc of the drape test."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym.checks import count, finite, positive
+from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, coloured_hinges, coloured_springs, frozen
+
+FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
+
+
+def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
+    """A sheet whose rest shape is that of the triangles, flat or not.
+
+    Its edges are springs with the weight ``(A_0 + A_1)/e^2`` of Van Gelder 1998 (Approximate simulation of elastic membranes by
+    triangulated spring meshes), which give equilateral triangles the fabric's Young's modulus, and Poisson's ratio 1/3.
+
+    Args:
+        vertices: [m], (particles, 3).
+        triangles: indices of vertices, (triangles, 3), all with the same side up.
+
+    Raises:
+        ValueError: not such arrays, a triangle without area, an edge of more than two triangles or of two that disagree on
+            which side is up, or a vertex of no triangle; the message names it.
+    """
+    x = finite("vertices", vertices)
+    corners = _checked(x, triangles)
+    edges, inverse = np.unique(np.sort(_edges(corners), axis=1), axis=0, return_inverse=True)
+    twice = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1)
+    beside = np.bincount(inverse, weights=np.tile(twice / 2, 3))
+    hinges = _calibrated(coloured_hinges(x, corners), x)
+    # opposite corners: polygons of rigid sides store B kappa^2 / 2 an area where the radius of curvature is their distance l:
+    # half the spring's constant times (l^3 kappa^2 / 32)^2, on the third of its triangles that an edge stands for
+    across = hinges.particles[:, 2:]
+    span = np.linalg.norm(x[across[:, 1]] - x[across[:, 0]], axis=1)
+    area = np.bincount(corners.ravel(), weights=np.repeat(twice / 6, 3), minlength=len(x))
+    around = _beside(hinges.particles[:, :2], edges, beside)
+    springs = coloured_springs(
+        x,
+        np.concatenate([edges, across]),
+        np.repeat([EDGE, OPPOSITE], [len(edges), len(across)]),
+        np.concatenate([beside / np.sum((x[edges[:, 1]] - x[edges[:, 0]]) ** 2, axis=1), around / 3 / span**4]),
+    )
+    width, height = np.ptp(x[:, 0]), np.ptp(x[:, 1])
+    return ClothMesh(
+        (float(width), float(height)), frozen(x.copy()), springs, frozen(corners.astype(np.int32)), frozen(area), hinges
+    )
+
+
+def disc(radius: float, rings: int) -> ClothMesh:
+    """A round sheet, flat at z = 0 and centred on the origin: ring ``r`` has ``6 r`` particles, the first is the centre.
+
+    Raises:
+        ValueError: a radius that is not positive, or fewer than one ring.
+    """
+    positive("radius", radius)
+    count("rings", rings)
+    points, triangles = [np.zeros((1, 3))], []
+    for ring in range(1, rings + 1):
+        angle = np.arange(6 * ring) * 2 * np.pi / (6 * ring)
+        points.append(radius * ring / rings * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1))
+        inner, outer = 1 + 3 * (ring - 1) * (ring - 2), 1 + 3 * ring * (ring - 1)
+        for sector in range(6):
+            for k in range(ring):
+                a, b = outer + sector * ring + k, outer + (sector * ring + k + 1) % (6 * ring)
+                c = inner + (sector * (ring - 1) + k) % (6 * (ring - 1)) if ring > 1 else 0
+                triangles.append((a, b, c))
+                if k < ring - 1:
+                    d = inner + (sector * (ring - 1) + k + 1) % (6 * (ring - 1))
+                    triangles.append((b, d, c))
+    return triangle_mesh(np.concatenate(points), triangles)
+
+
+def load_mesh(path: str | Path) -> ClothMesh:
+    """A sheet from a mesh file (obj, ply, stl, off, glb, ...), in metres; its shape there is its rest shape.
+
+    Raises:
+        ImportError: trimesh is not there: ``pip install clothgym[mesh]``.
+        ValueError: the file is none, holds no triangles, or is no sheet (see ``triangle_mesh``).
+    """
+    try:
+        import trimesh
+    except ImportError:
+        raise ImportError("load_mesh reads files with trimesh: pip install 'clothgym[mesh]'") from None
+    if not Path(path).is_file():
+        raise ValueError(f"{str(path)!r}: there is no such file")
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do
+        raise ValueError(f"{str(path)!r} cannot be read as a mesh: {error or type(error).__name__}") from error
+    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+        raise ValueError(f"{str(path)!r} holds no triangles: export the sheet as a triangle mesh, for instance obj or ply")
+    # some formats repeat a vertex in every triangle; where texture or normals differ it is the same particle still
+    loaded.merge_vertices(merge_tex=True, merge_norm=True)
+    try:
+        return triangle_mesh(np.asarray(loaded.vertices), np.asarray(loaded.faces))
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} is no sheet: {error}") from error
+
+
+def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
+    """Hinges whose weights are scaled together so that cylinders, averaged over their directions, store B kappa^2 / 2 an area.
+
+    A hinge stands for a third of its triangles.  In the plane of its unfolded triangles, with x along the edge, a surface of
+    curvature K turns it by ``a K_xx + b K_yy + 2 c K_xy``; over the directions of a cylinder the square's mean is
+    ``3/8 (a^2 + b^2) + ab/4 + c^2/2``.
+    """
+    xi, xj, xk, xl = (x[hinges.particles[:, c]] for c in range(4))
+    length = np.linalg.norm(xj - xi, axis=1)
+    along = (xj - xi) / length[:, None]
+    unfolded = []
+    for corner, side in ((xk, 1), (xl, -1)):
+        foot = np.sum((corner - xi) * along, axis=1)
+        unfolded.append((foot, side * np.sqrt(np.maximum(np.sum((corner - xi) ** 2, axis=1) - foot**2, 0))))
+    zero = np.zeros_like(length)
+    px = np.stack([zero, length, unfolded[0][0], unfolded[1][0]], axis=1)
+    py = np.stack([zero, zero, unfolded[0][1], unfolded[1][1]], axis=1)
+    a, b, c = (np.sum(hinges.slopes * q, axis=1) / 2 for q in (px * px, py * py, px * py))
+    square = 3 / 8 * (a * a + b * b) + a * b / 4 + c * c / 2
+    area = (length * (np.abs(py[:, 2]) + np.abs(py[:, 3])) / 2).sum() / 3
+    return hinges._replace(weight=frozen(hinges.weight * (area / max((hinges.weight * square).sum(), 1e-300))))
+
+
+def _edges(triangles: NDArray) -> NDArray:
+    """Directed edges, (3 triangles, 2)."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def _beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
+    """Area of the triangles beside some of the edges [m^2], (len(ends),)."""
+    size = edges.max() + 1
+    ends = np.sort(ends, axis=1).astype(np.int64)
+    return area[np.searchsorted(edges[:, 0] * size + edges[:, 1], ends[:, 0] * size + ends[:, 1])]
+
+
+def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+    """Triangles that make a sheet."""
+    if x.ndim != 2 or x.shape[1] != 3 or not len(x):
+        raise ValueError(f"vertices have shape {x.shape}: must be (particles, 3)")
+    corners = np.asarray(triangles)
+    if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners) or corners.dtype.kind not in "iu":
+        raise ValueError(f"triangles have shape {corners.shape} of {corners.dtype}: must be (triangles, 3) integers")
+    if corners.min() < 0 or corners.max() >= len(x):
+        wrong = int(np.flatnonzero((corners < 0).any(axis=1) | (corners >= len(x)).any(axis=1))[0])
+        raise ValueError(f"triangle {wrong} is {corners[wrong].tolist()}: vertices are 0 to {len(x) - 1}")
+    corners = corners.astype(np.int64)
+    sides = [x[corners[:, b]] - x[corners[:, a]] for a, b in ((0, 1), (1, 2), (2, 0))]
+    twice = np.linalg.norm(np.cross(sides[0], sides[2]), axis=1)
+    longest = np.max([np.sum(side**2, axis=1) for side in sides], axis=0)
+    flat = twice <= FLATTEST * longest
+    if np.any(flat):
+        worst = int(np.flatnonzero(flat)[0])
+        raise ValueError(f"triangle {worst}, {corners[worst].tolist()}, is degenerate (no area): remove it, or merge its corners")
+    loose = np.setdiff1d(np.arange(len(x)), corners)
+    if len(loose):
+        raise ValueError(f"vertex {loose[0]} belongs to no triangle: remove it ({len(loose)} such vertices)")
+    directed, times = np.unique(_edges(corners), axis=0, return_counts=True)
+    if np.any(times > 1):
+        a, b = directed[np.argmax(times > 1)].tolist()
+        total = int(np.sum(np.all(np.sort(_edges(corners), axis=1) == sorted((a, b)), axis=1)))
+        if total > 2:
+            raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two")
+        raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: turn one round")
+    return corners
