@@ -141,8 +141,8 @@ class Simulation:
         self._surface = surface_arrays(mesh, self.dtype)
         self._advance = _compiled(self.integrator.substep, self.integrator.name, self.bending, strain_limit is not None)
         self._parameters: NDArray
+        self._reported: NDArray
         self._plan: tuple[NDArray, ...] = ()
-        self._planned_substeps = 0
 
         self.set_state(
             at_rest(
@@ -420,7 +420,7 @@ class Simulation:
         self._planned_substeps = 0
         self._limited = np.zeros((self.layout.blocks, 3, self.layout.lanes), dtype)
         self._diverged = np.zeros((self.layout.blocks, self.layout.lanes), bool)
-        self._reported: NDArray = np.zeros(self.num_envs, bool)
+        self._reported = np.zeros(self.num_envs, bool)
         self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
