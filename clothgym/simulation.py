@@ -116,7 +116,7 @@ class Simulation:
             raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
         members("colliders", colliders, Collider, "Plane, Sphere, Capsule or Box")
         members("grippers", grippers, Gripper, "Gripper")
-        count("num_envs", num_envs)
+        self.num_envs = count("num_envs", num_envs)
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
         self.threads = count("threads", threads) if threads is not None else _jit.default_threads()
@@ -129,7 +129,7 @@ class Simulation:
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
-        self.layout = Layout.choose(int(num_envs), self.threads)
+        self.layout = Layout.choose(self.num_envs, self.threads)
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
@@ -141,8 +141,8 @@ class Simulation:
         self._surface = surface_arrays(mesh, self.dtype)
         self._advance = _compiled(self.integrator.substep, self.integrator.name, self.bending, strain_limit is not None)
         self._parameters: NDArray
-        self._reported: NDArray
         self._plan: tuple[NDArray, ...] = ()
+        self._planned_substeps = 0
 
         self.set_state(
             at_rest(
@@ -188,7 +188,8 @@ class Simulation:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
             self._steps += 1
             if self._diverged.any() and self.on_divergence != "ignore":
-                new, self._reported = self.diverged & ~self._reported, self.diverged
+                new = self.diverged & ~self._reported
+                self._reported |= new
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
 
     def _prepare(self) -> None:
@@ -212,10 +213,6 @@ class Simulation:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
 
     # --- what can be seen -----------------------------------------------------------------------------------------------
-
-    @property
-    def num_envs(self) -> int:
-        return self.layout.num_envs
 
     @property
     def positions(self) -> NDArray:
