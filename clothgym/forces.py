@@ -85,15 +85,15 @@ def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
 
 
 @kernel
-def add_spring_products(x, p, y, springs, stiffness, along, across, row):
+def add_spring_products(x, p, y, springs, along, across, row):
     """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (particles, 3, lanes).
 
-    With n the direction, ``k (along n n^T + across max(1 - r/d, 0) (I - n n^T))`` a spring: what a compressed one would push aside
-    is left out, so that the matrix has no negative eigenvalue (Choi and Ko 2002).  stiffness: k [N/m], (kinds, lanes); along,
-    across: (lanes,); row: scratch, (3, lanes).
+    With n the direction, ``along n n^T + across max(1 - r/d, 0) (I - n n^T)`` a spring, both proportional to its stiffness: what a
+    compressed one would push aside is left out, so that the matrix has no negative eigenvalue (Choi and Ko 2002).
+    along, across: by kind, (kinds, lanes); row: scratch, (3, lanes).
     """
     if x.shape[2] == 1:
-        _add_spring_products_of_one(x[:, :, 0], p[:, :, 0], y[:, :, 0], springs, stiffness[:, 0], along[0], across[0])
+        _add_spring_products_of_one(x[:, :, 0], p[:, :, 0], y[:, :, 0], springs, along[:, 0], across[:, 0])
         return
     ends, rest_length, kind, weight = springs
     one, zero = x.dtype.type(1), x.dtype.type(0)
@@ -104,7 +104,7 @@ def add_spring_products(x, p, y, springs, stiffness, along, across, row):
         i = ends[s, 0]
         j = ends[s, 1]
         xi, xj, pi, pj, yi, yj = x[i], x[j], p[i], p[j], flat[i], flat[j]
-        k = stiffness[kind[s]]
+        kn, kt = along[kind[s]], across[kind[s]]
         share = weight[s]
         r = rest_length[s]
         for l in range(lanes):
@@ -115,8 +115,9 @@ def add_spring_products(x, p, y, springs, stiffness, along, across, row):
             uy = pj[1, l] - pi[1, l]
             uz = pj[2, l] - pi[2, l]
             q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
-            aside = share * k[l] * across[l] * max(one - r * q, zero)
-            g = (share * k[l] * along[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+            stretched = one - r * q
+            aside = share * kt[l] * (stretched if stretched > zero else zero)
+            g = (share * kn[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
             row[0, l] = g * dx + aside * ux
             row[1, l] = g * dy + aside * uy
             row[2, l] = g * dz + aside * uz
@@ -127,7 +128,7 @@ def add_spring_products(x, p, y, springs, stiffness, along, across, row):
 
 
 @kernel
-def _add_spring_products_of_one(x, p, y, springs, stiffness, along, across):
+def _add_spring_products_of_one(x, p, y, springs, along, across):
     """The same arithmetic on a single environment, (particles, 3)."""
     ends, rest_length, kind, weight = springs
     one, zero = x.dtype.type(1), x.dtype.type(0)
@@ -137,9 +138,9 @@ def _add_spring_products_of_one(x, p, y, springs, stiffness, along, across):
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         ux, uy, uz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
-        k = weight[s] * stiffness[kind[s]]
-        aside = k * across * max(one - rest_length[s] * q, zero)
-        g = (k * along - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+        stretched = one - rest_length[s] * q
+        aside = weight[s] * across[kind[s]] * (stretched if stretched > zero else zero)
+        g = (weight[s] * along[kind[s]] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
         tx, ty, tz = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
         y[i, 0] -= tx
         y[i, 1] -= ty

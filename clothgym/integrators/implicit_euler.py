@@ -64,28 +64,21 @@ def add_to(a, b):
 
 
 @kernel
-def _begin(w, r, p, rho):
-    """First search direction, ``p = M^-1 r``, and the residual's square in that norm, (lanes,)."""
-    rho[:] = 0
-    for i in range(r.shape[0]):
-        wi = w[i]
-        for c in range(3):
-            rc, pc = r[i, c], p[i, c]
-            for l in range(r.shape[2]):
-                pc[l] = wi[l] * rc[l]
-                rho[l] += pc[l] * rc[l]
+def _turn(w, r, p, q, share, mass):
+    """The next search direction, ``p = M^-1 r + share p``, and its product with the masses, ``q = M p``, in one pass.
 
-
-@kernel
-def _mass_product(w, p, q):
-    """``q = M p``; a held particle has ``p = 0``."""
-    zero, one = p.dtype.type(0), p.dtype.type(1)
+    A held particle has neither.  share: (lanes,); mass: scratch, (lanes,).
+    """
+    one, zero = p.dtype.type(1), p.dtype.type(0)
     for i in range(p.shape[0]):
         wi = w[i]
+        for l in range(p.shape[2]):
+            mass[l] = one / (wi[l] if wi[l] > zero else one)
         for c in range(3):
-            pc, qc = p[i, c], q[i, c]
+            rc, pc, qc = r[i, c], p[i, c], q[i, c]
             for l in range(p.shape[2]):
-                qc[l] = pc[l] * (one / wi[l]) if wi[l] > zero else zero
+                pc[l] = wi[l] * rc[l] + share[l] * pc[l]
+                qc[l] = mass[l] * pc[l]
 
 
 @kernel
@@ -100,30 +93,29 @@ def _product_along(p, q, out):
 
 
 @kernel
-def _advance(w, v, total, p, q, r, step, after):
-    """``v += step p``, ``total += step p``, ``r -= step q``, and the new residual's square, (lanes,)."""
+def _square(w, r, out):
+    """``r . M^-1 r`` of each lane, (lanes,)."""
+    out[:] = 0
+    for i in range(r.shape[0]):
+        wi = w[i]
+        for c in range(3):
+            rc = r[i, c]
+            for l in range(r.shape[2]):
+                out[l] += wi[l] * rc[l] * rc[l]
+
+
+@kernel
+def _advance(w, d, p, q, r, step, after):
+    """``d += step p``, ``r -= step q``, and the new residual's square, (lanes,)."""
     after[:] = 0
     for i in range(p.shape[0]):
         wi = w[i]
         for c in range(3):
-            vc, tc, pc, qc, rc = v[i, c], total[i, c], p[i, c], q[i, c], r[i, c]
+            dc, pc, qc, rc = d[i, c], p[i, c], q[i, c], r[i, c]
             for l in range(p.shape[2]):
-                d = step[l] * pc[l]
-                vc[l] += d
-                tc[l] += d
+                dc[l] += step[l] * pc[l]
                 rc[l] -= step[l] * qc[l]
                 after[l] += wi[l] * rc[l] * rc[l]
-
-
-@kernel
-def _turn(w, r, p, share):
-    """The next search direction, ``p = M^-1 r + share p``."""
-    for i in range(p.shape[0]):
-        wi = w[i]
-        for c in range(3):
-            pc, rc = p[i, c], r[i, c]
-            for l in range(p.shape[2]):
-                pc[l] = wi[l] * rc[l] + share[l] * pc[l]
 
 
 @kernel
@@ -133,12 +125,14 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     zero = t(0)
     n, lanes = x.shape[0], x.shape[2]
     newton_iterations, iterations, tolerance = options
-    start, total, r, p, q = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n], work[4 * n : 5 * n]
+    start, total, d = work[:n], work[n : 2 * n], work[2 * n : 3 * n]
+    r, p, q = work[3 * n : 4 * n], work[4 * n : 5 * n], work[5 * n : 6 * n]
     scratch = work[-SCRATCH:]
-    along, across, bend, goal, rho, step = np.empty((6, lanes), x.dtype)
-    for l in range(lanes):
-        across[l] = h * h
-        along[l] = h * h + h * damping_time[l]
+    goal, rho, step, after, mass, bend = np.empty((6, lanes), x.dtype)
+    along, across = np.empty_like(stiffness), np.empty_like(stiffness)
+    for kind in range(stiffness.shape[0]):
+        for l in range(lanes):
+            across[kind, l] = -stiffness[kind, l] * h * h
     advance_velocities(v, w, push, gravity, drag_rate, h, work[-1])
     start[:] = x
     total[:] = 0
@@ -151,36 +145,39 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         weigh(w, total, r, h)
         if newton == 0:
             for l in range(lanes):
-                step[l] = -across[l]
-                bend[l] = -across[l] * rigidity[l]
-            q[:] = 0
-            add_spring_products(x, v, q, elements.springs, stiffness, step, step, work[-1])
-            add_bend_products(x, v, q, elements.bends, bend, scratch)
-            add_to(r, q)
+                bend[l] = -rigidity[l] * h * h
+            add_spring_products(x, v, r, elements.springs, across, across, work[-1])
+            add_bend_products(x, v, r, elements.bends, bend, scratch)
+            for kind in range(stiffness.shape[0]):
+                for l in range(lanes):
+                    across[kind, l] = stiffness[kind, l] * h * h
+                    along[kind, l] = stiffness[kind, l] * (h * h + h * damping_time[l])
+        _square(w, r, rho)
         for l in range(lanes):
-            bend[l] = along[l] * rigidity[l]
-        _begin(w, r, p, rho)
-        for l in range(lanes):
+            bend[l] = rigidity[l] * (h * h + h * damping_time[l])
             goal[l] = rho[l] * t(tolerance) * t(tolerance)
+            step[l] = zero
+        d[:] = 0
+        p[:] = 0
         for _ in range(iterations):
             going = False
             for l in range(lanes):
                 going |= rho[l] > goal[l]
             if not going:
                 break
-            _mass_product(w, p, q)
-            add_spring_products(x, p, q, elements.springs, stiffness, along, across, work[-1])
+            _turn(w, r, p, q, step, mass)
+            add_spring_products(x, p, q, elements.springs, along, across, work[-1])
             add_bend_products(x, p, q, elements.bends, bend, scratch)
             _product_along(p, q, step)
             for l in range(lanes):
                 step[l] = rho[l] / step[l] if rho[l] > goal[l] and step[l] > zero else zero
-            after = scratch[0, 0]
-            _advance(w, v, total, p, q, r, step, after)
+            _advance(w, d, p, q, r, step, after)
             for l in range(lanes):
                 share = after[l] / rho[l] if rho[l] > zero else zero
                 rho[l] = after[l] if step[l] > zero else zero
                 step[l] = share
-            _turn(w, r, p, step)
+        add_to(v, d)
+        add_to(total, d)
     move_on(x, v, start, h)
 
 
@@ -194,5 +191,5 @@ IMPLICIT_EULER = Integrator(
     surely_allowed=surely_allowed,
     springs_by_particle=True,
     options=MappingProxyType({"newton_iterations": 1, "iterations": 200, "tolerance": 1e-3}),
-    fields=5,
+    fields=6,
 )
