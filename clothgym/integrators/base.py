@@ -134,6 +134,26 @@ def advance_velocities(v, w, f, gravity, drag_rate, h, row):
 
 
 @kernel
+def predict_velocities(v, w, push, gravity, drag_rate, h, row):
+    """What free particles' velocity would be without the elements: ``v <- v/(1 + h drag_rate) + h (push w + gravity)``.
+
+    Only what was there is dragged, so that implicit methods come to rest where forces balance, whatever the substep is.
+    push [N], (particles, 3, lanes).  row: scratch, (1, lanes).
+    """
+    one = v.dtype.type(1)
+    keep = row[0]
+    for l in range(v.shape[2]):
+        keep[l] = one / (one + h * drag_rate[l])
+    for p in range(v.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            vc, fc, gc = v[p, c], push[p, c], gravity[c]
+            for l in range(v.shape[2]):
+                free = vc[l] * keep[l] + h * (fc[l] * wp[l] + gc[l])
+                vc[l] = free if wp[l] > 0 else vc[l]
+
+
+@kernel
 def advance_positions(x, v, h):
     """``x <- x + h v``, held particles too."""
     for p in range(x.shape[0]):

@@ -25,21 +25,26 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import SCRATCH, Integrator, Preparation, advance_velocities, move_on
+from clothgym.integrators import implicit_euler
+from clothgym.integrators.base import SCRATCH, Integrator, Preparation, move_on, predict_velocities
 from clothgym.integrators.implicit_euler import add_to, weigh
 
-# h w of the stiffest mode up to which ten iterations follow a swinging sheet (see docs/physics.md)
+# h w of the stiffest mode up to which ten iterations come near enough to the fixed point (see docs/physics.md)
 STIFFEST = 4.0
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
-    """Where ``h w`` of the stiffest mode reaches 4."""
-    return STIFFEST / largest_frequency(o), "beyond it ten iterations leave the sheet sluggish (it is never unstable)"
+    """Backward Euler's, but no more than where ``h w`` of the stiffest mode reaches 4."""
+    swinging, why = implicit_euler.largest_substep(o)
+    stiff = STIFFEST / largest_frequency(o)
+    return (
+        (swinging, why) if swinging < stiff else (stiff, "beyond it ten iterations leave the sheet sluggish (it is never unstable)")
+    )
 
 
 def surely_allowed(o: Oscillators) -> float:
     """The same at a frequency that is certainly no smaller."""
-    return STIFFEST / frequency_bound(o)
+    return min(implicit_euler.surely_allowed(o), STIFFEST / frequency_bound(o))
 
 
 def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
@@ -184,7 +189,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     members, count = np.empty((most, lanes), np.int64), np.empty(lanes, np.int64)
     lower, force = np.empty((most, most, lanes), x.dtype), np.empty((held.shape[0], 3, lanes), x.dtype)
     factorise_held(w, slot, held, members, count, lower)
-    advance_velocities(v, w, push, gravity, drag_rate, h, work[-1])
+    predict_velocities(v, w, push, gravity, drag_rate, h, work[-1])
     start[:] = x
     total[:] = 0
     for _ in range(iterations):

@@ -155,7 +155,10 @@ def project_springs_with_memory(x, start, w, springs, pull, damping, multipliers
 
 @kernel
 def predict(x, v, w, start, gravity, push, drag_rate, h, row):
-    """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity."""
+    """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity.
+
+    The velocity is that of ``base.predict_velocities``, in the same pass.
+    """
     one = x.dtype.type(1)
     keep = row[0]
     for l in range(x.shape[2]):
@@ -165,7 +168,7 @@ def predict(x, v, w, start, gravity, push, drag_rate, h, row):
         for c in range(3):
             xc, vc, sc, fc, gc = x[p, c], v[p, c], start[p, c], push[p, c], gravity[c]
             for l in range(x.shape[2]):
-                free = (vc[l] + h * (fc[l] * wp[l] + gc[l])) * keep[l]
+                free = vc[l] * keep[l] + h * (fc[l] * wp[l] + gc[l])
                 vc[l] = free if wp[l] > 0 else vc[l]
                 sc[l] = xc[l]
                 xc[l] += h * vc[l]
