@@ -76,7 +76,7 @@ class StrainTask(Task):
         threshold: float = 0.10,
         cost_penalty: float = 0.0,
         strain_limit: float | None = None,
-        integrator: str | None = None,
+        integrator: str | Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         if strain_limit is not None or integrators.get(integrator or self.physics.integrator).limits_strain:

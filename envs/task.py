@@ -66,7 +66,7 @@ class Task(ABC):
     def __init__(
         self,
         num_envs: int,
-        integrator: str | None = None,
+        integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",

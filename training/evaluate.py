@@ -41,6 +41,8 @@ class Args:
     """Episodes for each policy."""
     seed: int = HELD_OUT
     """Seed of the first episode."""
+    env_kwargs: str = "{}"
+    """Keyword arguments of the environment, as JSON: '{"substeps": 100}'; a run's own otherwise."""
     json: Path | None = None
     """Where to write the scores, if anywhere."""
 
@@ -143,12 +145,14 @@ def main(args: Args) -> None:
     kwargs: dict[str, Any] = {}
     for name in args.policy:
         kwargs |= policies.env_kwargs(name)
+    kwargs |= policies.parsed_kwargs(args.env_kwargs)
     # a name that is none is told before anything runs
     chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
     for name, policy in chosen.items():
         episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
         scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
-    print(f"{args.env}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
+    told = f", {json.dumps(kwargs)}" if kwargs else ""
+    print(f"{args.env}{told}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
     if args.json is not None:
         write_json(args.json, scores[args.policy[0]] if len(scores) == 1 else scores)
         print(f"written to {args.json}")

@@ -65,6 +65,21 @@ def env_kwargs(name: str) -> dict[str, Any]:
     return {} if name in (*SCRIPTED, "random") else dict(read_config(Path(name))["env_kwargs"])
 
 
+def parsed_kwargs(text: str) -> dict[str, Any]:
+    """Keyword arguments of an environment from JSON.
+
+    Raises:
+        ValueError: the text is not JSON, or no object.
+    """
+    try:
+        kwargs = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f'--env-kwargs {text!r} is not JSON ({error}); for instance \'{{"integrator": "xpbd"}}\'') from None
+    if not isinstance(kwargs, dict):
+        raise ValueError(f'--env-kwargs {text!r}: must be a JSON object, for instance \'{{"integrator": "xpbd"}}\'')
+    return kwargs
+
+
 def read_config(folder: Path) -> dict[str, Any]:
     folder = folder.parent if folder.name == CHECKPOINT else folder
     if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():

@@ -59,6 +59,8 @@ class Args:
     """Folder of a run to go on with; its configuration is used."""
     hyperparams: Path | None = None
     """Hyperparameters by environment id, in rl_zoo3's format; hyperparams/ALGO.yml by default."""
+    env_kwargs: str = "{}"
+    """Keyword arguments of the environment, as JSON: '{"integrator": "xpbd"}'; over those of the hyperparameter file."""
     eval_episodes: int = 200
     """Held-out episodes of each evaluation on the way."""
     final_episodes: int = 500
@@ -159,7 +161,7 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         "algo": args.algo,
         "lagrange": hyperparameters.pop("lagrange", {}),
         "clone": hyperparameters.pop("clone", {}),
-        "env_kwargs": hyperparameters.pop("env_kwargs", {}),
+        "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(args.env_kwargs),
         "num_envs": hyperparameters.pop("n_envs"),
         "timesteps": args.timesteps if args.timesteps is not None else int(hyperparameters["n_timesteps"]),
         "seed": args.seed,

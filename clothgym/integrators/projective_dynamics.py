@@ -37,9 +37,9 @@ def largest_substep(o: Oscillators) -> tuple[float, str]:
     """Backward Euler's, but no more than where ``h w`` of the stiffest mode reaches 4."""
     swinging, why = implicit_euler.largest_substep(o)
     stiff = STIFFEST / largest_frequency(o)
-    return (
-        (swinging, why) if swinging < stiff else (stiff, "beyond it ten iterations leave the sheet sluggish (it is never unstable)")
-    )
+    if swinging < stiff:
+        return swinging, why
+    return stiff, "beyond it ten iterations leave the sheet sluggish (it is never unstable)"
 
 
 def surely_allowed(o: Oscillators) -> float:
