@@ -297,8 +297,8 @@ class ClothDrapeEnv(ClothEnv):
     ``info["normalized_performance"]`` = min(C / C_ref, 1) / (1 + (e / 0.2 L)^2) / (1 + (v / 0.1 m/s)^2), with the rms speed v:
     0 for a sheet that does not touch the target's top, 1 for the fine sheet's coverage, dead centre and at rest.
     ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and v under 0.05 m/s.  ``info`` also has ``coverage``,
-    ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``, ``settling``, ``failure`` and
-    ``reward_terms``.  What belongs to the judgement is 0 until then.
+    ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``, ``strain_before_limiting``, ``settling``,
+    ``failure`` and ``reward_terms``.  What belongs to the judgement is 0 until then.
 
     ## Starting State
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
@@ -312,7 +312,9 @@ class ClothDrapeEnv(ClothEnv):
     ## Arguments
     | Argument | Default | Meaning |
     | --- | --- | --- |
-    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or as ``{"name": ..., option: ...}``, with automatic substeps |
+    | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
+    | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
     | ``substeps`` | 50 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |

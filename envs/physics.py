@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import number
+from clothgym.guards import refusal
 from clothgym.hands import Gripper
+from clothgym.integrators import Integrator
 from clothgym.material import Material, spring_stiffness
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, FIGURES
@@ -79,6 +82,14 @@ def checked_wind(figures: Mapping[str, Any]) -> Wind:
     return Wind(**figures)
 
 
+def check_ranges(physics: Physics, ranges: Mapping[str, tuple[float, float]], integrator: Integrator) -> None:
+    """Refuse ranges that the integrator or the sheet cannot have."""
+    for name in ranges:
+        if name in integrator.shared | integrator.ignored:
+            raise ValueError(f"randomize: {refusal(integrator, name)}")
+    check_springs_exist(physics, ranges)
+
+
 def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]]) -> None:
     """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
     if not ranges:
@@ -88,6 +99,22 @@ def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, floa
         fabric = Material(**dict(zip(FIGURES, corner)))
         stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity
         spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend))
+
+
+def check_material_option(
+    material: Any, physics: Physics, ranges: Mapping[str, tuple[float, float]], simulation: Simulation
+) -> None:
+    """Refuse figures that no episode can have; ranges: of those that are drawn."""
+    if not isinstance(material, Mapping):
+        raise ValueError(f"reset option material={material!r}: must be a dict of figures")
+    method = simulation.integrator
+    for name, value in material.items():
+        if name not in FIGURES:
+            raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
+        number(f"reset option material: {name}", value)
+        if name in method.ignored or (name in method.shared and simulation.num_envs > 1):
+            raise ValueError(f"reset option material: {refusal(method, name)}")
+    check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in material.items()}})
 
 
 def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:

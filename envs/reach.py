@@ -204,7 +204,8 @@ class ClothReachEnv(ClothEnv):
     ## Judgement
     ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
     doing nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
-    ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``settling``, ``failure`` and ``reward_terms``.
+    ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure``
+    and ``reward_terms``.
     What belongs to the judgement is 0 until then.
 
     ## Starting State
@@ -220,7 +221,9 @@ class ClothReachEnv(ClothEnv):
     ## Arguments
     | Argument | Default | Meaning |
     | --- | --- | --- |
-    | ``integrator`` | ``"semi_implicit_euler"`` | a name of ``clothgym.INTEGRATORS``; another one takes automatic substeps |
+    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or as ``{"name": ..., option: ...}``, with automatic substeps |
+    | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
+    | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
     | ``substeps`` | 50 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |

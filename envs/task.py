@@ -17,11 +17,10 @@ import numpy as np
 from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit
-from clothgym.checks import number
+from clothgym import _jit, integrators
 from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, within_ball
 from clothgym.envs.measures import SUMMARY, largest_strain, see_points, summarize
-from clothgym.envs.physics import Physics, check_springs_exist, checked_ranges, checked_wind, most_demanding
+from clothgym.envs.physics import Physics, check_material_option, check_ranges, checked_ranges, checked_wind, most_demanding
 from clothgym.mesh import SHEAR
 from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
 from clothgym.simulation import Simulation
@@ -44,6 +43,7 @@ class Task(ABC):
         num_envs: environments in the batch.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
+        bending, strain_limit: as ``Simulation`` takes them.
         obs_mode: one of ``obs_modes``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the judgement alone).
         randomize: ranges of material figures drawn at each reset, ``{"density": [0.1, 0.2]}``.
@@ -68,6 +68,8 @@ class Task(ABC):
         num_envs: int,
         integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
+        bending: str = "springs",
+        strain_limit: float | None = None,
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",
         randomize: Mapping[str, Sequence[float]] | None = None,
@@ -81,15 +83,16 @@ class Task(ABC):
         self.randomize = checked_ranges(randomize or {})
         physics = self.physics
         self.wind = physics.wind if wind is None else checked_wind(wind)
-        check_springs_exist(physics, self.randomize)
+        method = integrators.get(integrator if integrator is not None else physics.integrator)
+        check_ranges(physics, self.randomize, method)
         if substeps is None:
-            substeps = physics.substeps if integrator in (None, physics.integrator) and not self.randomize else "auto"
+            substeps = physics.substeps if method.name == physics.integrator and not self.randomize else "auto"
         self.simulation = Simulation(
             physics.mesh,
             # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
             material=most_demanding(physics.material, self.randomize),
             num_envs=num_envs,
-            integrator=integrator if integrator is not None else physics.integrator,
+            integrator=method,
             time_step=physics.time_step,
             substeps=substeps,  # type: ignore[arg-type]
             colliders=self._colliders(),
@@ -97,6 +100,8 @@ class Task(ABC):
             anchors=physics.anchors,  # type: ignore[arg-type]
             anchor_speed=2 * physics.hand_speed,
             grippers=physics.grippers,
+            bending=bending,
+            strain_limit=strain_limit,
             threads=threads,
             on_divergence="ignore",  # a step's outcome says so
         )
@@ -241,14 +246,7 @@ class Task(ABC):
         unknown = set(options) - set(self.reset_options)
         if unknown:
             raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
-        material = options.get("material", {})
-        if not isinstance(material, Mapping):
-            raise ValueError(f"reset option material={material!r}: must be a dict of figures")
-        for name, value in material.items():
-            if name not in FIGURES:
-                raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
-            number(f"reset option material: {name}", value)
-        check_springs_exist(self.physics, self.randomize | {name: (value, value) for name, value in material.items()})
+        check_material_option(options.get("material", {}), self.physics, self.randomize, self.simulation)
 
     def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
         figures = {name: getattr(self.physics.material, name) for name in FIGURES}
@@ -300,7 +298,10 @@ class Task(ABC):
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
         strain = largest_strain(summary)
-        info: dict[str, Any] = {"strain_max": strain} | self._account(running, failure, strain) | self._judgement()
+        limiting = self.simulation.limiting
+        before = strain.copy() if limiting is None else limiting.before
+        info: dict[str, Any] = {"strain_max": strain, "strain_before_limiting": before}
+        info |= self._account(running, failure, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value
         terms = self._reward_terms(moves, acting, running, judged, failure, summary, info) | self._prices(failure, info)
