@@ -254,7 +254,7 @@ class ClothDrapeGripperEnv(ClothEnv):
     | --- | --- | --- |
     | ``grippers`` | 2 | or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder) |
     | ``slip_force`` | ``None`` | pull at which the cloth slips out of a gripper [N]; it weighs 0.53 N |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or as ``{"name": ..., option: ...}``, with automatic substeps |
+    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
     | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
     | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
     | ``substeps`` | 50 | or ``"auto"`` |

@@ -221,7 +221,7 @@ class ClothReachEnv(ClothEnv):
     ## Arguments
     | Argument | Default | Meaning |
     | --- | --- | --- |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or as ``{"name": ..., option: ...}``, with automatic substeps |
+    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
     | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
     | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
     | ``substeps`` | 50 | or ``"auto"`` |

@@ -364,8 +364,9 @@ class ClothStrainEnv(ClothEnv):
     When each clip is within 0.15 L of its place at the goal, or time is up: ``info["is_success"]`` if it has arrived,
     ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the way, 1 on arrival.
     ``info`` also has ``strain_max`` (and ``strain_before_limiting``, the same), ``strain_p95``, ``strain_excess`` (over the
-    threshold), ``tension_left`` and ``tension_right`` (pull of the sheet at each clip [N], without what accelerates the clipped cloth), ``settling`` (never),
-    ``failure`` and ``reward_terms``.  All are of the end of the step; what happens within it is not scored.
+    threshold), ``tension_left`` and ``tension_right`` (pull of the sheet at each clip [N], without what accelerates the clipped
+    cloth), ``settling`` (never), ``failure`` and ``reward_terms``.  All are of the end of the step; what happens within it is not
+    scored.
 
     What scripted agents score on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy noop random
     careless expert``); careless is each clip straight to its place at full speed, expert the pair held apart as at rest, at
@@ -397,7 +398,7 @@ class ClothStrainEnv(ClothEnv):
     | --- | --- | --- |
     | ``threshold`` | 0.10 | strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient |
     | ``cost_penalty`` | 0 | what each such step takes from the reward |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or as ``{"name": ..., option: ...}``, with automatic substeps |
+    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
     | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
     | ``substeps`` | 35 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
