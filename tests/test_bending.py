@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from clothgym import Material, Simulation, disc, grid, triangle_mesh
 from clothgym.bending import BEND_SCRATCH, BENDING
 from clothgym.forces import add_spring_forces
-from clothgym.mesh import BEND_X
+from clothgym.mesh import BEND_X, NUM_KINDS, STRUCTURAL_X
 from clothgym.state import element_arrays
 
 HINGED = ["hinge", "quadratic"]
@@ -177,7 +177,6 @@ def test_a_grid_s_cylinder_costs_the_same_in_any_direction(model, degrees):
     """A sheet of twice the sides without two of the smaller: what is left has no border, and stores B kappa^2/2 an area."""
     small, large = grid(21, 21, 0.5, 0.5), grid(41, 41, 1.0, 1.0)
     one, four = (bend_energy(model, mesh, cylinder(mesh, 0.5, degrees)) for mesh in (small, large))
-    print(model, degrees, (four - 2 * one) / 0.5 / (B * 0.5**2 / 2))
     assert (four - 2 * one) / 0.5 == pytest.approx(B * 0.5**2 / 2, rel=5e-3)
 
 
@@ -190,7 +189,6 @@ def test_a_disc_s_cylinder_stores_the_plate_s_energy(model):
             bend_energy(model, mesh, cylinder(mesh, 0.5, degrees)) / (B * 0.5**2 / 2 * mesh.area.sum())
             for degrees in (0, 11, 22.5, 30, 45)
         ]
-        print(model, rings, ratios)
         assert ratios == pytest.approx(np.ones(5), rel=0.1)
         assert np.mean(ratios) == pytest.approx(1, abs=1.5 / rings)
 
@@ -232,7 +230,8 @@ def test_the_heavy_elastica_s_equation_gives_the_published_table(gravity):
 
 @pytest.mark.parametrize("model", HINGED)
 def test_a_strip_hangs_as_the_heavy_elastica(model):
-    """Reach, droop, and angles of chord and end within 2 % at G from 0.5 to 30, each a lane of its own.
+    """Reach, droop, and angles of chord and end at G from 0.5 to 30, each a lane of its own: 2 % are asked for, and 30 spacings
+    keep within half a percent.
 
     A hinge stands for the curvature of half a spacing on both sides: held by its first two columns, the strip is clamped midway
     between them.
@@ -247,7 +246,7 @@ def test_a_strip_hangs_as_the_heavy_elastica(model):
         mesh, material, len(loads), bending=model, air_density=0, anchors=[0, 1, columns, columns + 1], dtype="float64", threads=1
     )
     simulation.set_parameters(bend_rigidity=1 / loads, warn=False)
-    simulation.step(round(6 / simulation.time_step))
+    simulation.step(round(4 / simulation.time_step))
     x = simulation.positions[:, :columns]
     clamp = (x[:, 0] + x[:, 1]) / 2
     run = x[:, -1] - clamp
@@ -256,21 +255,22 @@ def test_a_strip_hangs_as_the_heavy_elastica(model):
         reach, droop = run[lane, 0], -run[lane, 2]
         last = x[lane, -1] - x[lane, -2]
         found = (reach, droop, np.degrees(np.arctan2(droop, reach)), np.degrees(np.arctan2(-last[2], last[0])))
-        print(model, load, np.round(np.array(found) / truth - 1, 5), np.abs(simulation.velocities[lane]).max())
-        assert found == pytest.approx(tuple(truth), rel=0.02)
+        assert found == pytest.approx(tuple(truth), rel=5e-3)
 
 
 @pytest.mark.parametrize("model", HINGED)
-def test_a_pinned_strip_buckles_under_euler_s_load(model):
+@pytest.mark.parametrize(("rows", "width"), [(3, 0.05), (3, 0.15), (7, 0.15)])
+def test_a_pinned_strip_buckles_under_euler_s_load(model, rows, width):
     """pi^2 B/L^2 per width: the compression at which the flat state's stiffness across the plane loses its first eigenvalue,
-    by central differences of the kernels' forces."""
+    by central differences of the kernels' forces; narrow or wide, of square or oblong cells."""
     columns, length, young = 41, 1.0, 1e3
-    mesh = grid(3, columns, length, 0.05)
+    mesh = grid(rows, columns, length, width)
     elements = element_arrays(mesh, np.dtype(np.float64), hinged=True, by_particle=False)
-    simulation = Simulation(mesh, Material(stretch_stiffness=young, shear_stiffness=3 / 8 * young), bending=model, substeps=10000)
-    stiffness = simulation.get_state().stiffness[0].astype(float)
+    # threads along the strip only: their tension is all the load
+    stiffness = np.zeros(NUM_KINDS)
+    stiffness[STRUCTURAL_X] = young * mesh.spacing[1] / mesh.spacing[0]
     n, step = mesh.num_particles, 1e-7
-    index = np.arange(n).reshape(3, columns)
+    index = np.arange(n).reshape(rows, columns)
     free = np.setdiff1d(index, index[:, [0, -1]])
 
     def forces(x):
@@ -283,8 +283,7 @@ def test_a_pinned_strip_buckles_under_euler_s_load(model):
         return f
 
     def compressed(strain):
-        """Free to widen by Poisson's ratio, which is 1/3 for these moduli."""
-        return mesh.rest_positions * (1 - strain, 1 + strain / 3, 1)
+        return mesh.rest_positions * (1 - strain, 1, 1)
 
     def firmness(strain):
         shift = np.zeros((n, 3, len(free)))
@@ -295,6 +294,5 @@ def test_a_pinned_strip_buckles_under_euler_s_load(model):
 
     euler = np.pi**2 * B / length**2
     strain = brentq(firmness, 0.5 * euler / young, 1.5 * euler / young, rtol=1e-4)
-    load = -forces(compressed(strain)[:, :, None])[index[:, 0], 0, 0].sum() / 0.05
-    print(model, load / euler)
-    assert load == pytest.approx(euler, rel=0.03)
+    load = -forces(compressed(strain)[:, :, None])[index[:, 0], 0, 0].sum() / width
+    assert load == pytest.approx(euler, rel=3e-3)
