@@ -34,7 +34,7 @@ class Springs(NamedTuple):
 
 
 class Hinges(NamedTuple):
-    """The inner edges, across which two triangles bend; sorted by colour.
+    """The inner edges, across which two triangles bend, sorted by colour; on a grid those of both ways to cut its cells.
 
     particles: both ends of the edge, then the opposite corners of its triangles, (hinges, 4).
     weight: bending moment of a hinge over rigidity times angle, (hinges,): e/h, with e the edge's length and h the spacing of
@@ -143,12 +143,16 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     triangles = np.stack([first, second], axis=1).reshape(-1, 3).astype(np.int32)
     area = (dx * dy * np.outer(across_y, across_x)).ravel()
 
-    hinges = coloured_hinges(positions, triangles)
-    # e/h is right for the lines of the grid.  A diagonal alone resists the twist of its cell, whose energy per area
+    # hinges of these triangles and of those with the other diagonal in each cell, each counting half: with the former alone every
+    # second particle differs from its neighbours, gives way to a bend, and leaves a strip two thirds of its rigidity
+    other = np.stack([np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1)),
+                      np.where(even, np.stack([b, d, c], 1), np.stack([a, d, c], 1))], axis=1)  # fmt: skip
+    hinges = Hinges(*map(np.concatenate, zip(*(coloured_hinges(positions, t) for t in (triangles, other.reshape(-1, 3))))))
+    # e/h is right for the lines of the grid.  The diagonals alone resist the twist of a cell, whose energy per area
     # B (d2u/dxdy)^2 asks for half of what e/h gives on square cells: then a bend costs the same in any direction
     diagonal = np.ptp(hinges.particles[:, :2] % cols, axis=1) * np.ptp(hinges.particles[:, :2] // cols, axis=1) > 0
-    weights = np.where(diagonal, 2 * dx * dy / (dx * dx + dy * dy), hinges.weight)
-    hinges = hinges._replace(weight=frozen(weights))
+    weights = np.where(diagonal, 2 * dx * dy / (dx * dx + dy * dy), hinges.weight) / 2
+    hinges = Hinges(*map(frozen, hinges._replace(weight=weights)))
     return ClothMesh(
         (float(width), float(height)), frozen(positions), springs, frozen(triangles), frozen(area), hinges, (rows, cols)
     )
