@@ -37,9 +37,6 @@ def simulation_of(mesh, name, h, mass, stiffness, gravity, anchors, damping_time
     state.free_inverse_mass[:] = 1 / np.asarray(mass)
     state.damping_time[:] = damping_time
     state.drag_rate[:] = drag_rate
-    if name in IMPLICIT:
-        # these take drag off what gravity has just added, too: as much more of it weighs the same
-        state.gravity *= 1 + h * drag_rate
     simulation.set_state(state)
     return simulation
 
