@@ -268,7 +268,7 @@ class Bending:
     Attributes:
         name: its key in the table.
         hinged: whether hinges resist bending; else skip springs do.
-        isotropic: whether they resist displacements along the sheet as they do those across it: of the flat sheet they know no normal.
+        isotropic: whether they resist displacements along the sheet as they do those across it, as they know no normal.
         kernels: by the names that integrators call them by.
     """
 

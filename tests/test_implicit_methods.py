@@ -98,7 +98,7 @@ def test_the_fixed_point_is_backward_euler_s(method, bending):
     state = simulation.get_state()
     x, v = state.positions[0], state.velocities[0]
     goal = x[[0, 3]]
-    for step in range(8):
+    for _ in range(8):
         goal = goal + ((0, 0, 0), (0, 2e-3, 1e-3))
         simulation.move_anchors(goal)
         v[[0, 3]] = (goal - x[[0, 3]]) / h

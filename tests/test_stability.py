@@ -126,7 +126,12 @@ RIGID = Material(stretch_stiffness=26.1, shear_stiffness=10.5, bend_rigidity=0.1
 @pytest.mark.parametrize(
     ("name", "bending", "damping"),
     [
-        *((name, "springs", damping) for name in EXPLICIT for damping in (0.0, 1.5, 3.0) if (name, damping) != ("explicit_euler", 0)),
+        *(
+            (name, "springs", damping)
+            for name in EXPLICIT
+            for damping in (0.0, 1.5, 3.0)
+            if (name, damping) != ("explicit_euler", 0)
+        ),
         ("semi_implicit_euler", "hinge", 0.0),
         ("rk4", "quadratic", 0.0),
     ],
@@ -166,7 +171,7 @@ def test_automatic_substeps_follow_stiffness(name):
 
 @pytest.mark.parametrize("name", UNCONDITIONAL)
 def test_no_step_is_too_large_for_an_implicit_method(name):
-    """Crumpled, at a hundred times the explicit bound: the sheet is never larger than twice its diagonal, nor faster than at first."""
+    """Crumpled, at a hundred times the explicit bound: never larger than twice the sheet's diagonal, nor faster than at first."""
     bound = sheet("semi_implicit_euler", 1e-5, SPRINGS).largest_substep()[0]
     simulation = sheet(name, 100 * bound, SPRINGS)
     rest = simulation.mesh.rest_positions
