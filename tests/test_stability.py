@@ -154,7 +154,7 @@ def test_bound_of_a_sheet_is_sharp(name, bending, damping):
 
 @pytest.mark.parametrize(("name", "factor"), [*((name, 10) for name in (*EXPLICIT, "xpbd")), ("implicit_euler", 1), ("pbd", 1)])
 def test_automatic_substeps_follow_stiffness(name, factor):
-    """A hundredfold stiffness, with dampers of the same share of critical, needs tenfold substeps; implicit Euler follows slow swings only, pbd nothing."""
+    """A hundredfold stiffness, with dampers as near to critical: ten times the substeps; implicit Euler follows swings only."""
     mesh = grid(5, 5, 0.3, 0.3)
     soft, stiff = (
         Simulation(
