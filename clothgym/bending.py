@@ -268,11 +268,13 @@ class Bending:
     Attributes:
         name: its key in the table.
         hinged: whether hinges resist bending; else skip springs do.
+        isotropic: whether they resist displacements along the sheet as they do those across it, as they know no normal.
         kernels: by the names that integrators call them by.
     """
 
     name: str
     hinged: bool
+    isotropic: bool
     kernels: dict[str, Any]
 
     def energy(self, bends: BendArrays, x: NDArray, rigidity: NDArray) -> NDArray:
@@ -293,9 +295,9 @@ def _kernels(forces: Any, products: Any, project: Any) -> dict[str, Any]:
 BENDING: dict[str, Bending] = {
     model.name: model
     for model in (
-        Bending("springs", False, _kernels(add_bend_forces, add_bend_products, project_bends)),
-        Bending("hinge", True, _kernels(add_hinge_forces, add_hinge_products, project_hinges)),
-        Bending("quadratic", True, _kernels(add_quadratic_forces, add_quadratic_products, project_quadratic)),
+        Bending("springs", False, False, _kernels(add_bend_forces, add_bend_products, project_bends)),
+        Bending("hinge", True, False, _kernels(add_hinge_forces, add_hinge_products, project_hinges)),
+        Bending("quadratic", True, True, _kernels(add_quadratic_forces, add_quadratic_products, project_quadratic)),
     )
 }
 

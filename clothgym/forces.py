@@ -199,6 +199,7 @@ class Oscillators(NamedTuple):
     """What decides on one environment's largest substep, in float64.
 
     positions: at rest [m], (particles, 3).  stiffness: of springs by kind [N/m], (kinds,).  rigidity: of hinges [N m].
+    isotropic: whether hinges resist displacements along the sheet as they do those across it, see ``bending.Bending``.
     damping_time [s].  inverse_mass [1/kg], (particles,).
     """
 
@@ -206,6 +207,7 @@ class Oscillators(NamedTuple):
     elements: Elements
     stiffness: NDArray
     rigidity: float
+    isotropic: bool
     damping_time: float
     inverse_mass: NDArray
 
@@ -220,10 +222,10 @@ def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
     if not len(bends.particles):
         return rows
     curves = np.sqrt(o.rigidity) * bends.curves
-    if not bends.rest_angle.any():
+    if o.isotropic:
         rows += [(bends.particles, curves[:, :, None] * axis) for axis in np.eye(3)]
         return rows
-    # a hinge that is bent at rest: the corners move along their triangles' normals, the ends share both
+    # a hinge's corners move along their triangles' normals, the ends share both
     xi, xj, xk, xl = (o.positions[bends.particles[:, m]] for m in range(4))
     e = xj - xi
     normals = [np.cross(e, xk - xi), np.cross(xl - xi, e)]

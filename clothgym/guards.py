@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
+from clothgym.bending import Bending
 from clothgym.forces import Oscillators
 from clothgym.integrators import Integrator
 from clothgym.mesh import ClothMesh
@@ -29,13 +30,16 @@ def mark_diverged(x, v, diverged):
                 diverged[l] |= not fine
 
 
-def oscillators(mesh: ClothMesh, elements: Elements, fabric: Fabric, free_w: NDArray, block: int, lane: int) -> Oscillators:
+def oscillators(
+    mesh: ClothMesh, elements: Elements, bending: Bending, fabric: Fabric, free_w: NDArray, block: int, lane: int
+) -> Oscillators:
     """What decides on the substep of the environment in that block and lane; elements in float64."""
     return Oscillators(
         positions=mesh.rest_positions,
         elements=elements,
         stiffness=fabric.stiffness[block, :, lane].astype(np.float64),
         rigidity=float(fabric.rigidity[block, lane]),
+        isotropic=bending.isotropic,
         damping_time=float(fabric.damping_time[block, lane]),
         inverse_mass=free_w[block, :, lane].astype(np.float64),
     )

@@ -207,7 +207,7 @@ class Simulation:
     def _oscillators(self, env: int) -> Oscillators:
         """What decides on an environment's substep."""
         place = divmod(env, self.layout.lanes)
-        return guards.oscillators(self.mesh, self._exact_elements, self._fabric, self._free_w, *place)
+        return guards.oscillators(self.mesh, self._exact_elements, self.bending, self._fabric, self._free_w, *place)
 
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)

@@ -33,19 +33,20 @@ def chain():
         drag_rate=0.0,
         anchors=(0,),
         time_step=None,
+        spacing=1.0,
     ):
         time_step = time_step or h
         simulation = Simulation(
-            line_mesh(particles),
-            Material(shear_stiffness=0, bend_rigidity=0),
+            line_mesh(particles, spacing),
+            # so soft and so damped that no integrator warns before the figures are set
+            Material(stretch_stiffness=1e-9, shear_stiffness=0, bend_rigidity=0, damping_time=1e3),
             integrator=integrator,
             time_step=time_step,
-            substeps="auto",
+            substeps=round(time_step / h),
             gravity=gravity,
             anchors=anchors,
             dtype="float64",
         )
-        simulation.substeps = round(time_step / h)
         state = simulation.get_state()
         state.stiffness[:] = 0
         state.stiffness[:, STRUCTURAL_X] = stiffness

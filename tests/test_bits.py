@@ -11,9 +11,9 @@ NAMES = list(INTEGRATORS)
 IDS = list(ENVIRONMENTS)
 STEPS = 16
 # substeps that are few and stable on the environments' sheets
-SUBSTEPS = {"semi_implicit_euler": 60, "xpbd": 220}
-# one environment with every integrator, the others as they are
-CASES = [(IDS[0], name) for name in NAMES] + [(env_id, None) for env_id in IDS[1:]]
+SUBSTEPS = {"semi_implicit_euler": 60, "implicit_euler": 12, "xpbd": 220}
+# one environment with integrators of each kind, the others as they are
+CASES = [(IDS[0], name) for name in SUBSTEPS] + [(env_id, None) for env_id in IDS[1:]]
 every_case = pytest.mark.parametrize(("env_id", "name"), CASES)
 
 
@@ -150,21 +150,52 @@ def test_state_restored_before_a_reset_draws_the_same_episode(env_id):
     assert_same(again, first, 2)
 
 
+# of each method, on the sheet below
+CORE_SUBSTEPS = {"explicit_euler": 400, "implicit_euler": 20, "projective_dynamics": 20, "pbd": 5, "xpbd": 150}
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_core_lanes_of_different_fabrics(name, dtype):
-    """One lane of its own and the same lane among sixteen others of other fabrics: the scalar branch and the wide one."""
+    """One lane of its own and the same lane among sixteen others of other fabrics: the scalar branch and the wide one.
+
+    Projective dynamics has one fabric for all: there gravity differs.
+    """
     mesh = grid(6, 6, 0.3, 0.3)
     solids = [Plane(point=(0, 0, -0.05)), Sphere(center=(0, 0, -0.1), radius=0.08)]
     positions = mesh.rest_positions + np.random.default_rng(0).normal(scale=1e-3, size=(36, 3))
+    world = {"integrator": name, "colliders": solids, "anchors": [0], "dtype": dtype, "substeps": CORE_SUBSTEPS.get(name, 150)}
     densities = np.linspace(0.12, 0.3, 17)
-    batch = Simulation(mesh, num_envs=17, integrator=name, colliders=solids, anchors=[0], dtype=dtype, threads=1, substeps=150)
-    batch.set_parameters(density=densities)
+    figures = {"gravity": densities[:, None] * (5, 0, -40)} if name == "projective_dynamics" else {"density": densities}
+    batch = Simulation(mesh, num_envs=17, threads=1, **world)
+    batch.set_parameters(**figures)
     batch.reset(positions=positions)
     batch.step(20)
+    assert not batch.diverged.any()
     for lane in (0, 9, 16):
-        alone = Simulation(mesh, integrator=name, substeps=batch.substeps, colliders=solids, anchors=[0], dtype=dtype)
-        alone.set_parameters(density=densities[lane])
+        alone = Simulation(mesh, **world)
+        alone.set_parameters(**{figure: values[lane] for figure, values in figures.items()})
         alone.reset(positions=positions)
         alone.step(20)
         assert np.array_equal(alone.positions[0], batch.positions[lane])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_core_state_and_threads(name):
+    """Saved in mid-run and restored elsewhere, with an anchor let go; on one thread and on two."""
+    mesh = grid(5, 5, 0.3, 0.3)
+    world = {"integrator": name, "num_envs": 40, "anchors": [0, 4], "substeps": CORE_SUBSTEPS.get(name, 150)}
+    ends = []
+    for threads in (1, 2):
+        simulation = Simulation(mesh, threads=threads, **world)
+        simulation.step(3)
+        simulation.release(envs=[1, 30], anchors=[1, 0])
+        state = simulation.get_state()
+        simulation.step(5)
+        other = Simulation(mesh, threads=threads, **world)
+        other.set_state(state)
+        other.step(5)
+        assert np.array_equal(simulation.positions, other.positions) and np.array_equal(simulation.velocities, other.velocities)
+        ends.append(simulation.positions)
+    assert np.array_equal(ends[0], ends[1])
+    assert not np.array_equal(ends[0][0], ends[0][1])

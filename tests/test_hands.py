@@ -6,6 +6,7 @@ import pytest
 from clothgym import INTEGRATORS, Gripper, Material, Simulation, State, grid
 
 NAMES = list(INTEGRATORS)
+CONSISTENT = [name for name in NAMES if INTEGRATORS[name].order is not None]  # pbd's springs do not pull with the fabric's force
 MESH = grid(5, 5, 0.2, 0.2)
 STEP = 1 / 30
 REST = MESH.rest_positions
@@ -230,7 +231,7 @@ def test_a_sheet_at_rest_pulls_with_its_weight(anchors, dtype):
         assert one[0] > 0.05 * weight(s)[0] and one[0] == pytest.approx(-other[0], rel=0.02)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CONSISTENT)
 def test_a_gripper_feels_the_weight_that_it_took_over(name):
     s = simulation(integrator=name, anchors=[24], grippers=[gripper(24, closing_time=0.03)], material=CALM, dtype="float64")
     s.step(300)
@@ -259,7 +260,7 @@ def test_the_wind_s_force_on_held_particles_is_part_of_the_pull():
 
 
 @pytest.mark.parametrize(("share", "stays"), [(0.9, False), (1.1, True)])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", CONSISTENT)
 def test_cloth_slips_out_of_a_gripper_that_is_too_weak_for_its_weight(name, share, stays):
     total = CALM.density * 0.04 * G
     s = simulation(
@@ -276,7 +277,7 @@ def test_cloth_slips_out_of_a_gripper_that_is_too_weak_for_its_weight(name, shar
     if stays:
         assert s.grippers.held.tolist() == [[1], [1]] and fallen == pytest.approx([0, 0], abs=1e-5)
         # twice the weight is too much for it
-        s.set_parameters([1], density=2 * CALM.density)
+        s.set_parameters([1], gravity=(0, 0, -2 * G))
         s.step(30)
         assert s.grippers.held.tolist() == [[1], [0]]
     else:
@@ -307,7 +308,7 @@ def test_a_lane_among_seventeen_does_what_it_does_alone(name):
     }
 
     def run(lanes):
-        s = simulation(integrator=name, num_envs=len(lanes), substeps=160, **hands)
+        s = simulation(integrator=name, num_envs=len(lanes), substeps=450 if name == "explicit_euler" else 160, **hands)
         seen = []
         for phase in range(3):
             if phase == 1 and 3 in lanes:
