@@ -145,14 +145,15 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
 
     # hinges of these triangles and of those with the other diagonal in each cell, each counting half: with the former alone every
     # second particle differs from its neighbours, gives way to a bend, and leaves a strip two thirds of its rigidity
-    other = np.stack([np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1)),
-                      np.where(even, np.stack([b, d, c], 1), np.stack([a, d, c], 1))], axis=1)  # fmt: skip
-    hinges = Hinges(*map(np.concatenate, zip(*(coloured_hinges(positions, t) for t in (triangles, other.reshape(-1, 3))))))
+    third = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
+    fourth = np.where(even, np.stack([b, d, c], 1), np.stack([a, d, c], 1))
+    both = [coloured_hinges(positions, t) for t in (triangles, np.stack([third, fourth], axis=1).reshape(-1, 3))]
+    hinges = Hinges(*(np.concatenate(fields) for fields in zip(*both)))
     # e/h is right for the lines of the grid.  The diagonals alone resist the twist of a cell, whose energy per area
     # B (d2u/dxdy)^2 asks for half of what e/h gives on square cells: then a bend costs the same in any direction
     diagonal = np.ptp(hinges.particles[:, :2] % cols, axis=1) * np.ptp(hinges.particles[:, :2] // cols, axis=1) > 0
     weights = np.where(diagonal, 2 * dx * dy / (dx * dx + dy * dy), hinges.weight) / 2
-    hinges = Hinges(*map(frozen, hinges._replace(weight=weights)))
+    hinges = Hinges(*(frozen(field) for field in hinges._replace(weight=weights)))
     return ClothMesh(
         (float(width), float(height)), frozen(positions), springs, frozen(triangles), frozen(area), hinges, (rows, cols)
     )

@@ -33,8 +33,8 @@ AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked
 
 
 def advance(
-    first, last, x, v, w, elements, surface, fabric, kinds, colliders, h, substeps, air_every, options, plan, rows, limit, limited,
-    diverged,
+    first, last, x, v, w, elements, surface, fabric, kinds, colliders, h, carried, substeps, air_every, options, plan, rows, limit,
+    limited, diverged,
 ):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
@@ -50,7 +50,7 @@ def advance(
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
-            resolve(x[b], v[b], w[b], kinds, colliders[b], h, contact)
+            resolve(x[b], v[b], w[b], kinds, colliders[b], h, carried, contact)
         mark_diverged(x[b], v[b], diverged[b])
 
 
@@ -170,6 +170,7 @@ class Simulation:
         """Advance all environments by ``n`` control steps; hands move towards their targets at a bounded speed."""
         count("n", n)
         h = self.dtype.type(self.time_step / self.substeps)
+        carried = self.dtype.type(h * self.integrator.carried)
         self._prepare()
         rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
@@ -179,7 +180,7 @@ class Simulation:
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric, self._kinds, self._colliders,
-                h, self.substeps, air_every, options, self._plan, rows, limit, self._limited, self._diverged,
+                h, carried, self.substeps, air_every, options, self._plan, rows, limit, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):

@@ -6,12 +6,8 @@ import pytest
 from clothgym import INTEGRATORS, Box, Capsule, Material, Plane, Simulation, Sphere, grid
 
 NAMES = list(INTEGRATORS)
-# contact takes what it stops from the positions as h times the end velocity, which is not what these methods moved by
-APART = {"explicit_euler", "verlet", "rk4"}
-CONTACT_NAMES = [
-    pytest.param(name, marks=pytest.mark.xfail(reason="moves by other velocities than contact resolves")) if name in APART else name
-    for name in NAMES
-]
+# explicit Euler moves on with the velocity of before: what gravity has just added is stopped a substep later
+LATE = {"explicit_euler"}
 G = 9.81
 
 
@@ -64,7 +60,7 @@ def test_box_distance_to_its_nearest_point():
     assert distances(Box(half_sides=tuple(half), yaw=yaw, thickness=0), x) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("name", CONTACT_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     "collider",
     [
@@ -90,7 +86,8 @@ def test_inward_velocity_is_killed_and_nothing_is_inside(name, collider):
     )
     touching = simulation.contacts().distance[0] < 1e-9
     assert touching.any()
-    assert np.min(np.sum(v * normals, axis=1)[touching]) > -1e-9
+    inward = G * simulation.time_step / simulation.substeps if name in LATE else 1e-8
+    assert np.min(np.sum(v * normals, axis=1)[touching]) > -inward
 
 
 def slope(name, angle, friction, seconds=1.0):
@@ -110,13 +107,13 @@ def slope(name, angle, friction, seconds=1.0):
     return np.mean(simulation.positions[0, :, 0]), np.mean(simulation.velocities[0, :, 0])
 
 
-@pytest.mark.parametrize("name", CONTACT_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("friction", [0.3, 0.5])
 def test_a_sheet_rests_or_slides_on_either_side_of_the_angle_of_friction(name, friction):
     angle = np.arctan(friction)
     still, _ = slope(name, np.arctan(0.98 * friction), friction)
     gone, _ = slope(name, np.arctan(1.02 * friction), friction)
-    assert abs(still) < 1e-6
+    assert abs(still) < (5e-4 if name in LATE else 1e-6)
     assert gone > 0.5 * 0.5 * G * 0.02 * friction * np.cos(angle)
 
 
@@ -128,7 +125,7 @@ def test_sliding_acceleration(name):
     assert speed == pytest.approx(G * (np.sin(angle) - friction * np.cos(angle)), rel=0.01)
 
 
-@pytest.mark.parametrize("name", CONTACT_NAMES)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_moving_plate_drags_the_sheet(name):
     """mu g until it moves with the plate: v(t) = mu g t, then the plate's."""
     mesh = grid(4, 4, 0.06, 0.06)

@@ -3,7 +3,7 @@
 Applied once after each substep, to the positions and velocities that the integrator left.  The normal impulse is the inward
 velocity that is taken away; friction takes at most ``mu`` times as much from the tangential velocity (Bridson, Fedkiw and
 Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction takes from the velocity is taken from the substep's
-displacement too, or a sheet at rest on a slope would creep by ``h^2 g sin`` a substep.
+displacement too, as far as the integrator has moved by it, or a sheet at rest on a slope would creep by ``h^2 g sin`` a substep.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def distance_and_normal(x, collider, kind, out):
 
 
 @kernel
-def _push_out(x, v, w, collider, h, contact):
+def _push_out(x, v, w, collider, carried, contact):
     """Correct one particle's position and velocity, (3, lanes), for the distance and normal in ``contact``."""
     zero = x.dtype.type(0)
     one = x.dtype.type(1)
@@ -107,20 +107,21 @@ def _push_out(x, v, w, collider, h, contact):
         lost = lost if touching else zero
         stopped = stopped if touching else zero
         depth = -distance if touching else zero
-        x[0, l] += depth * nx - h * lost * tx
-        x[1, l] += depth * ny - h * lost * ty
-        x[2, l] += depth * nz - h * lost * tz
+        x[0, l] += depth * nx - carried * lost * tx
+        x[1, l] += depth * ny - carried * lost * ty
+        x[2, l] += depth * nz - carried * lost * tz
         v[0, l] += stopped * nx - lost * tx
         v[1, l] += stopped * ny - lost * ty
         v[2, l] += stopped * nz - lost * tz
 
 
 @kernel
-def resolve(x, v, w, kinds, colliders, h, contact):
+def resolve(x, v, w, kinds, colliders, h, carried, contact):
     """Resolve the contacts of one block after a substep of ``h`` [s], and move the solids on by their velocity.
 
     x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes), held particles are left alone; kinds: (colliders,);
-    colliders: rows of ``shapes``, (colliders, ROWS, lanes); contact: scratch, (4, lanes).
+    colliders: rows of ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the
+    positions already [s]; contact: scratch, (4, lanes).
     """
     for k in range(kinds.shape[0]):
         collider = colliders[k]
@@ -130,7 +131,7 @@ def resolve(x, v, w, kinds, colliders, h, contact):
         for p in range(x.shape[0]):
             if _may_touch(x[p], collider, kinds[k]):
                 distance_and_normal(x[p], collider, kinds[k], contact)
-                _push_out(x[p], v[p], w[p], collider, h, contact)
+                _push_out(x[p], v[p], w[p], collider, carried, contact)
 
 
 @kernel

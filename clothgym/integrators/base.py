@@ -56,6 +56,7 @@ class Integrator:
         largest_substep: the largest substep [s] that the method should be used with, and why, as a clause of a sentence; zero
             if there is none.
         surely_allowed: a substep [s] that is certainly no larger than that, found quickly.
+        carried: share of the substep for which what is new in the velocity has already moved the positions, at a substep's end.
         springs_by_particle: whether the result does not depend on the springs' order, so that the fastest one may be used.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
         options: numbers that the kernel takes, by name, with the values they have now.
@@ -76,6 +77,7 @@ class Integrator:
     surely_allowed: Callable[[Oscillators], float]
     springs_by_particle: bool
     safety: float = 1.0
+    carried: float = 1.0
     options: Mapping[str, int | float] = field(default_factory=lambda: MappingProxyType({}))
     fields: int = 1
     multipliers: bool = False

@@ -54,4 +54,5 @@ EXPLICIT_EULER = Integrator(
     surely_allowed=surely_allowed,
     springs_by_particle=True,
     safety=0.8,
+    carried=0.0,
 )

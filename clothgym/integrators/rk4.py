@@ -93,5 +93,6 @@ RK4 = Integrator(
     surely_allowed=surely_allowed,
     springs_by_particle=True,
     safety=0.8,
+    carried=0.5,
     fields=5,
 )

@@ -53,4 +53,5 @@ VERLET = Integrator(
     surely_allowed=surely_allowed,
     springs_by_particle=True,
     safety=0.8,
+    carried=0.5,
 )
