@@ -79,6 +79,8 @@ def disc(radius: float, rings: int) -> ClothMesh:
 def load_mesh(path: str | Path) -> ClothMesh:
     """A sheet from a mesh file (obj, ply, stl, off, glb, ...), in metres; its shape there is its rest shape.
 
+    Vertices at the very same place are one particle.  A reader may leave out vertices that no triangle uses (obj's does).
+
     Raises:
         ImportError: trimesh is not there: ``pip install clothgym[mesh]``.
         ValueError: the file is none, holds no triangles, or is no sheet (see ``triangle_mesh``).
@@ -88,19 +90,35 @@ def load_mesh(path: str | Path) -> ClothMesh:
     except ImportError:
         raise ImportError("load_mesh reads files with trimesh: pip install 'clothgym[mesh]'") from None
     if not Path(path).is_file():
-        raise ValueError(f"{str(path)!r}: there is no such file")
+        what = "it is a folder: name a file in it" if Path(path).is_dir() else "there is no such file: check the path"
+        raise ValueError(f"{str(path)!r}: {what}")
+    advice = "export the sheet as a triangle mesh, for instance obj or ply"
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise ValueError(f"{str(path)!r} cannot be read as a mesh: {error or type(error).__name__}") from error
+        raise ValueError(f"{str(path)!r} cannot be read as a mesh ({error or type(error).__name__}): {advice}") from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise ValueError(f"{str(path)!r} holds no triangles: export the sheet as a triangle mesh, for instance obj or ply")
-    # some formats repeat a vertex in every triangle; where texture or normals differ it is the same particle still
-    loaded.merge_vertices(merge_tex=True, merge_norm=True)
+        raise ValueError(f"{str(path)!r} holds no triangles: {advice}")
     try:
-        return triangle_mesh(np.asarray(loaded.vertices), np.asarray(loaded.faces))
+        x = np.array(loaded.vertices, np.float64)
+        nowhere = np.flatnonzero(~np.isfinite(x).all(axis=1))
+        if len(nowhere):
+            raise ValueError(f"vertex {nowhere[0]} is at {x[nowhere[0]].tolist()}: give it a finite place")
+        return triangle_mesh(*_merged(x, _indices(x, np.array(loaded.faces))))
     except ValueError as error:
         raise ValueError(f"{str(path)!r} is no sheet: {error}") from error
+
+
+def _merged(x: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
+    """Vertices without repetition, in the order in which they first come, and the triangles between them.
+
+    Some formats repeat a vertex in every triangle; where texture or normals differ it is the same particle still.
+    """
+    _, first, which = np.unique(x, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return x[first[order]], place[which.reshape(-1)][triangles]
 
 
 def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
@@ -138,8 +156,8 @@ def _beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
     return area[np.searchsorted(edges[:, 0] * size + edges[:, 1], ends[:, 0] * size + ends[:, 1])]
 
 
-def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
-    """Triangles that make a sheet."""
+def _indices(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+    """Triangles between those vertices, which are all in use."""
     if x.ndim != 2 or x.shape[1] != 3 or not len(x):
         raise ValueError(f"vertices have shape {x.shape}: must be (particles, 3)")
     corners = np.asarray(triangles)
@@ -147,8 +165,16 @@ def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
         raise ValueError(f"triangles have shape {corners.shape} of {corners.dtype}: must be (triangles, 3) integers")
     if corners.min() < 0 or corners.max() >= len(x):
         wrong = int(np.flatnonzero((corners < 0).any(axis=1) | (corners >= len(x)).any(axis=1))[0])
-        raise ValueError(f"triangle {wrong} is {corners[wrong].tolist()}: vertices are 0 to {len(x) - 1}")
-    corners = corners.astype(np.int64)
+        raise ValueError(f"triangle {wrong} is {corners[wrong].tolist()}: must name vertices from 0 to {len(x) - 1}")
+    loose = np.setdiff1d(np.arange(len(x)), corners)
+    if len(loose):
+        raise ValueError(f"vertex {loose[0]} belongs to no triangle: remove it ({len(loose)} such vertices)")
+    return corners.astype(np.int64)
+
+
+def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+    """Triangles that make a sheet."""
+    corners = _indices(x, triangles)
     sides = [x[corners[:, b]] - x[corners[:, a]] for a, b in ((0, 1), (1, 2), (2, 0))]
     twice = np.linalg.norm(np.cross(sides[0], sides[2]), axis=1)
     longest = np.max([np.sum(side**2, axis=1) for side in sides], axis=0)
@@ -156,14 +182,15 @@ def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
     if np.any(flat):
         worst = int(np.flatnonzero(flat)[0])
         raise ValueError(f"triangle {worst}, {corners[worst].tolist()}, is degenerate (no area): remove it, or merge its corners")
-    loose = np.setdiff1d(np.arange(len(x)), corners)
-    if len(loose):
-        raise ValueError(f"vertex {loose[0]} belongs to no triangle: remove it ({len(loose)} such vertices)")
+    _, first, again = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
+    if np.any(again > 1):
+        twin = corners[first[np.argmax(again > 1)]].tolist()
+        raise ValueError(f"triangle {twin} is there {again.max()} times: remove it but for one")
     directed, times = np.unique(_edges(corners), axis=0, return_counts=True)
     if np.any(times > 1):
         a, b = directed[np.argmax(times > 1)].tolist()
         total = int(np.sum(np.all(np.sort(_edges(corners), axis=1) == sorted((a, b)), axis=1)))
         if total > 2:
-            raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two")
+            raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two, remove the others")
         raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: turn one round")
     return corners

@@ -24,6 +24,7 @@ FLOORS = {
     "clothgym.limiting": 4,
     "clothgym.simulation": 5,
     "clothgym.render": 6,
+    "clothgym.scenes": 6,
     "clothgym.envs": 7,
     "clothgym.adapters": 8,
     "clothgym.cli": 8,

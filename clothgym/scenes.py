@@ -1,0 +1,243 @@
+"""Floor 6: the two tests by which textile laboratories tell fabrics apart, as scenes: Cusick's drape test and the cantilever.
+
+Both run until the sheet is at rest.  Linear drag calms it (``CALM``); what is left at rest does not depend on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym.checks import count, finite, positive
+from clothgym.integrators import Integrator
+from clothgym.material import Material
+from clothgym.mesh import ClothMesh, grid
+from clothgym.simulation import GRAVITY, Simulation
+from clothgym.triangles import disc
+
+SPECIMEN_RADIUS, SUPPORT_RADIUS = 0.15, 0.09  # of the drape test [m], BS 5058 and ISO 9073-9
+CALM = 20.0  # rate of the linear drag [1/s]: about critical for a skirt or a strip some centimetres long
+REST_SPEED = 1e-3  # a sheet is at rest when no particle is faster [m/s]
+LOADING = 1.0  # the weight comes on slowly, as the specimen is lowered on to the instrument's disc [s]
+ASYMMETRY, MOST_WAVES = 1e-4, 12  # a specimen starts with slight waves, so that it can fold: heights [m], and how many around it
+LINES = 4000  # scan lines across a shadow
+COLUMNS, ROWS = 20, 3  # free particles along a strip, and particles across it
+
+Option = str | Mapping[str, Any] | Integrator
+
+
+class Drape(NamedTuple):
+    """A drape test: one value an environment.
+
+    coefficient: of drape, from 0 (limp) to 1 (flat), (num_envs,).  speed: of the fastest particle at the end [m/s],
+    (num_envs,).  seconds: simulated until then.  positions: [m], (num_envs, particles, 3).  mesh: the specimen.
+    """
+
+    coefficient: NDArray[np.float64]
+    speed: NDArray[np.float64]
+    seconds: float
+    positions: NDArray
+    mesh: ClothMesh
+
+
+class Cantilever(NamedTuple):
+    """A cantilever test.
+
+    droop, elastica: angle of the chord from the clamp to the tip under the horizontal, measured and of the heavy elastica [deg].
+    weight: the strip's over its rigidity, ``G = rho g L^3/B``.  speed: of the fastest particle at the end [m/s].
+    positions: [m], (particles, 3).
+    """
+
+    droop: float
+    elastica: float
+    weight: float
+    speed: float
+    positions: NDArray
+
+
+def bending_length(material: Material) -> float:
+    """Peirce's ``c = (B/(rho g))^(1/3)`` [m]: a strip twice as long droops by 41.5 degrees."""
+    return float((material.bend_rigidity / (material.density * GRAVITY)) ** (1 / 3))
+
+
+def cusick_drape(
+    material: Material,
+    rings: int = 15,
+    num_envs: int = 1,
+    seed: int = 0,
+    bending: str = "hinge",
+    integrator: Option = "semi_implicit_euler",
+    dtype: str = "float32",
+    seconds: float = 6.0,
+) -> Drape:
+    """Let a round specimen of 15 cm radius hang over a disc of 9 cm, and measure its shadow.
+
+    The instrument clamps the specimen between two discs; here the particles over the disc are held where they are.  Each
+    environment starts from heights of its own, drawn with ``seed``, seed + 1, ..., and may come to rest in other folds.
+
+    Args:
+        material: the fabric; its own ``air_drag`` is replaced.
+        rings: of the specimen's mesh, a multiple of 5, so that one lies on the disc's edge.
+        seconds: to give up after; ``Drape.speed`` tells whether the sheet was at rest by then.
+
+    Raises:
+        ValueError: another number of rings, or whatever ``Simulation`` does not take.
+    """
+    if count("rings", rings) % 5:
+        raise ValueError(f"rings={rings!r}: must be a multiple of 5, so that a ring lies on the support's edge")
+    mesh = disc(SPECIMEN_RADIUS, rings)
+    edge = rings * 3 // 5
+    held = 1 + 3 * edge * (edge + 1)  # particles of the rings up to the edge come first
+    simulation = Simulation(
+        mesh,
+        _calmed(material),
+        num_envs,
+        integrator,
+        air_density=0.0,
+        anchors=[range(held)],
+        bending=bending,
+        dtype=dtype,
+    )
+    simulation.reset(positions=np.stack([_uneven(mesh.rest_positions, seed + env) for env in range(num_envs)]))
+    loading = round(LOADING / simulation.time_step)
+    for step in range(loading):
+        simulation.set_parameters(gravity=(0.0, 0.0, -GRAVITY * (step + 1) / loading))
+        simulation.step()
+    passed = LOADING + _settle(simulation, seconds)
+    # areas of the mesh itself, whose rings are polygons: a flat sheet has 1, a limp one 0
+    inside = np.all(mesh.triangles < held, axis=1)
+    support = projected_area(mesh.rest_positions, mesh.triangles[inside])
+    shadows = np.array([projected_area(one, mesh.triangles) for one in simulation.positions])
+    coefficient = (shadows - support) / (float(mesh.area.sum()) - support)
+    return Drape(coefficient, _fastest(simulation), passed, simulation.positions, mesh)
+
+
+def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
+    """Area of the triangles' shadow on the ground [m^2], where several lie over each other counted once.
+
+    Along each of ``LINES`` lines the shadow's length is that of the union of intervals, exactly; from line to line it is
+    nearly linear, and summed by the midpoint rule.  positions: [m], (particles, 3).
+    """
+    corners = finite("positions", positions)[np.asarray(triangles)][:, :, :2]
+    low, high = corners[:, :, 1].min(), corners[:, :, 1].max()
+    spacing = (high - low) / LINES
+    if spacing == 0:
+        return 0.0
+    heights = (corners[:, :, 1] - low) / spacing - 0.5  # line k is at height k
+    first, last = np.ceil(heights.min(axis=1)).astype(int), np.floor(heights.max(axis=1)).astype(int)
+    crossed = np.maximum(last - first + 1, 0)
+    triangle = np.repeat(np.arange(len(corners)), crossed)
+    line = np.arange(len(triangle)) - np.repeat(np.cumsum(crossed) - crossed, crossed) + first[triangle]
+    left, right = np.full(len(triangle), np.inf), np.full(len(triangle), -np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        from_line, rise = line - heights[triangle, a], heights[triangle, b] - heights[triangle, a]
+        meets = (from_line * (line - heights[triangle, b]) <= 0) & (rise != 0)
+        share = np.divide(from_line, rise, out=np.zeros_like(rise), where=meets)
+        x = corners[triangle, a, 0] + share * (corners[triangle, b, 0] - corners[triangle, a, 0])
+        left, right = np.where(meets, np.minimum(left, x), left), np.where(meets, np.maximum(right, x), right)
+    # lines are laid end to end, so that one running maximum serves them all
+    width = np.ptp(corners[:, :, 0]) + 1.0
+    left, right = left + line * width, right + line * width
+    order = np.argsort(left)
+    left, right = left[order], right[order]
+    covered = np.concatenate([[-np.inf], np.maximum.accumulate(right)[:-1]])
+    return float(np.sum(np.maximum(right - np.maximum(left, covered), 0)) * spacing)
+
+
+def cantilever(
+    material: Material,
+    overhang: float = 0.04,
+    columns: int = COLUMNS,
+    bending: str = "hinge",
+    integrator: Option = "semi_implicit_euler",
+    dtype: str = "float32",
+    seconds: float = 6.0,
+) -> Cantilever:
+    """Clamp a strip at one end, let the other hang over, and measure how far it droops (Peirce 1930, ASTM D1388).
+
+    The last two columns of held particles are the clamp.  Its hinges bend over half a cell on either side, so its edge is taken
+    half a cell behind the last held column.
+
+    Args:
+        material: the fabric; its own ``air_drag`` is replaced.
+        overhang: length L of the strip beyond the clamp [m].
+        columns: of free particles.
+
+    Raises:
+        ValueError: a length that is not positive, or whatever ``Simulation`` does not take.
+    """
+    cell = positive("overhang", overhang) / (count("columns", columns) + 0.5)
+    mesh = grid(ROWS, columns + 2, (columns + 1) * cell, (ROWS - 1) * cell)
+    column = np.arange(mesh.num_particles) % (columns + 2)
+    simulation = Simulation(
+        mesh,
+        _calmed(material),
+        integrator=integrator,
+        air_density=0.0,
+        anchors=[np.flatnonzero(column < 2)],
+        bending=bending,
+        dtype=dtype,
+    )
+    _settle(simulation, seconds)
+    x = simulation.positions[0].astype(np.float64)
+    tip = x[column == columns + 1].mean(axis=0) - x[column == 1].mean(axis=0)
+    droop = np.degrees(np.arctan2(-tip[2], tip[0] + cell / 2))
+    weight = (overhang / bending_length(material)) ** 3
+    return Cantilever(float(droop), elastica_droop(weight), weight, float(_fastest(simulation)[0]), simulation.positions[0])
+
+
+def elastica_droop(weight: float) -> float:
+    """Chord angle of a heavy inextensible strip, clamped level [deg]: ``theta'' = -G (1 - s) cos(theta)`` on 0 <= s <= 1, with
+    theta = 0 at the clamp and theta' = 0 at the tip.
+
+    weight: ``G = rho g L^3/B``.
+    """
+    from scipy.integrate import solve_bvp  # imported here: it would double the time of a warm start
+
+    s = np.linspace(0, 1, 200) ** 2  # a heavy strip bends near the clamp
+    bent = np.pi / 2 * (1 - np.exp(-s * positive("weight", weight) ** (1 / 3) / 2))
+    solution = solve_bvp(
+        lambda s, y: np.stack([y[1], -weight * (1 - s) * np.cos(y[0]), np.cos(y[0]), np.sin(y[0])]),
+        lambda clamp, tip: np.array([clamp[0], tip[1], clamp[2], clamp[3]]),
+        s,
+        np.stack([bent, np.gradient(bent, s), s, s]),
+        tol=1e-8,
+        max_nodes=100_000,
+    )
+    return float(np.degrees(np.arctan2(solution.y[3, -1], solution.y[2, -1])))
+
+
+def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
+    """A flat specimen with slight waves around its overhanging rim, the same on any mesh: (particles, 3)."""
+    random = np.random.default_rng(seed)
+    waves = np.arange(2, MOST_WAVES + 1)
+    height, phase = random.normal(scale=ASYMMETRY, size=len(waves)), random.uniform(0, 2 * np.pi, len(waves))
+    radius, angle = np.hypot(x[:, 0], x[:, 1]), np.arctan2(x[:, 1], x[:, 0])
+    out = np.maximum(radius - SUPPORT_RADIUS, 0) / (SPECIMEN_RADIUS - SUPPORT_RADIUS)
+    raised = x.copy()
+    raised[:, 2] += out * (height * np.cos(waves * angle[:, None] + phase)).sum(axis=1)
+    return raised
+
+
+def _calmed(material: Material) -> Material:
+    return replace(material, air_drag=CALM * material.density)
+
+
+def _fastest(simulation: Simulation) -> NDArray[np.float64]:
+    """Speed of the fastest particle [m/s], (num_envs,)."""
+    return np.linalg.norm(simulation.velocities.astype(np.float64), axis=2).max(axis=1)
+
+
+def _settle(simulation: Simulation, seconds: float) -> float:
+    """Step until all sheets are at rest, ``seconds`` at most; the time that took [s]."""
+    tenth = max(1, round(0.1 / simulation.time_step))
+    # a sheet that starts flat is slow at first, too
+    passed = 0.0
+    while passed < positive("seconds", seconds) and (passed < 0.5 or _fastest(simulation).max() > REST_SPEED):
+        simulation.step(tenth)
+        passed += tenth * simulation.time_step
+    return passed
