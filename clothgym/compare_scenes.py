@@ -128,8 +128,8 @@ def _particles(size: tuple[int, int, float, float], rows: slice, columns: slice)
 
 SHEET = (17, 17, 1.0, 1.0)
 TOP_CORNERS = (272, 288)
-STRIP = (4, 19, 0.36, 0.06)
-RIBBON = (3, 81, 1.2, 0.03)
+STRIP = (4, 13, 0.24, 0.06)
+RIBBON = (5, 61, 1.2, 0.08)
 
 SCENES: dict[str, Scene] = {
     scene.name: scene
@@ -144,8 +144,8 @@ SCENES: dict[str, Scene] = {
             substeps=(5, 10, 20, 40, 80, 160, 320),
             shown=10,
             reference_substeps=320,
-            eye=(2.0, -2.2, 1.5),
-            target=(0.0, 0.12, 0.75),
+            eye=(1.6, -1.9, 1.35),
+            target=(0.06, 0.55, 0.68),
             altitude=1.2,
         ),
         Scene(
@@ -175,7 +175,7 @@ SCENES: dict[str, Scene] = {
             held=TOP_CORNERS,
             seconds=3.0,
             substeps=(5, 10, 20, 40, 80, 160, 320),
-            shown=20,
+            shown=10,
             reference_substeps=320,
             eye=(0.8, -3.4, 1.2),
             target=(0.0, 0.0, 0.75),
@@ -189,15 +189,15 @@ SCENES: dict[str, Scene] = {
             name="thin_strip",
             breaks="a stiff strip, clamped at one end, bows under its weight: its shape is all bending, which skip springs miss",
             size=STRIP,
-            material=Material(density=0.15, stretch_stiffness=100.0, shear_stiffness=40.0, bend_rigidity=2e-3, air_drag=1.5),
+            material=Material(density=0.05, bend_rigidity=2e-4, air_drag=0.5),
             held=_particles(STRIP, slice(None), slice(0, 2)),
             seconds=2.0,
             substeps=(5, 10, 20, 40, 80, 160),
             shown=20,
             reference_substeps=160,
-            eye=(0.15, -0.85, 0.5),
-            target=(0.0, 0.0, 0.3),
-            altitude=0.4,
+            eye=(0.12, -0.6, 0.42),
+            target=(0.0, 0.0, 0.24),
+            altitude=0.32,
             bending="hinge",
             variants={"skip springs": {"bending": "springs"}},
             settled=True,
@@ -221,16 +221,16 @@ SCENES: dict[str, Scene] = {
         ),
         Scene(
             name="long_ribbon",
-            breaks="eighty links in a row swing down from one end: a correction that travels one link a pass does not arrive",
+            breaks="sixty links in a row swing down from one end: a correction that travels one link a pass does not arrive",
             size=RIBBON,
             material=Material.preset("cotton", air_drag=0.15),
             held=_particles(RIBBON, slice(None), slice(0, 2)),
             seconds=0.5,
             substeps=(5, 10, 20, 40, 80, 160, 320),
-            shown=20,
+            shown=10,
             reference_substeps=320,
-            eye=(0.2, -2.9, 1.3),
-            target=(0.0, 0.0, 0.8),
+            eye=(0.5, -1.9, 1.6),
+            target=(-0.26, 0.0, 0.87),
             altitude=1.4,
         ),
     )
