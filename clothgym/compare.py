@@ -26,6 +26,7 @@ from clothgym.simulation import Simulation
 
 Row = dict[str, Any]
 
+BURST = 10.0  # strain of a sheet that has blown up, if not as far as to be flagged as diverged
 LANES = 64  # sheets in the batch that is timed
 VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting, and the seconds after which fewer of them will do
 # what of an integrator's options is tried: the first is its default
@@ -126,6 +127,8 @@ def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple
         if s.diverged[0]:
             return row | {"stable": False}, None
     strain = float(s.strain().max())
+    if strain > BURST:
+        return row | {"stable": False}, None
     row |= {"stable": True, "error_mm": rms_mm(s.positions[0], truth), "largest_strain": strain}
     if scene.settled:
         row["strain_error"] = strain / about["largest_strain"] - 1
