@@ -1,4 +1,4 @@
-"""The command line: what there is, how fast it is here, and compiling ahead of time."""
+"""The command line: what there is, how fast it is here, how integrators compare, and compiling ahead of time."""
 
 from __future__ import annotations
 
@@ -18,11 +18,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = commands.add_parser("bench", help="measure speed on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
     bench.add_argument("--quick", action="store_true", help="fewer cases, in a few seconds")
+    compare = commands.add_parser("compare", help="one scene, several integrators: errors, costs and pictures")
+    compare.add_argument("--scene", default="stiff_sheet", metavar="NAME", help="see --list (default: stiff_sheet)")
+    compare.add_argument("--list", action="store_true", help="the scenes, and what each breaks")
+    compare.add_argument("--integrators", nargs="+", metavar="NAME", help="those to compare; all by default")
+    compare.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/compare_SCENE)")
+    compare.add_argument("--quick", action="store_true", help="fewer settings")
+    compare.add_argument("--fresh", action="store_true", help="measure again what the folder has")
     options = parser.parse_args(arguments)
     if options.command == "list":
         _list()
     elif options.command == "warmup":
         _warm_up()
+    elif options.command == "compare":
+        _compare(options, compare)
     else:
         _bench(options.json, options.quick)
     return 0
@@ -76,3 +85,18 @@ def _bench(path: Path | None, quick: bool) -> None:
     if path is not None:
         path.write_text(json.dumps(results, indent=1) + "\n")
         print(f"written to {path}")
+
+
+def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    from clothgym import compare
+
+    if options.list:
+        print(compare.scene_list())
+        return
+    try:
+        plan = compare.plan(options.scene, options.integrators, options.quick)
+    except ValueError as error:
+        parser.error(str(error))
+    folder = options.out or Path("runs") / f"compare_{options.scene}"
+    print(compare.table(compare.run(plan, folder, options.fresh)))
+    print(f"written to {folder}: results.json, table.txt, work_precision.png, sheets.png")

@@ -1,0 +1,313 @@
+"""One scene, several integrators: what each costs, and how far it is from the converged answer.
+
+The reference is the same sheet with the same material, solved by ``rk4`` in float64 with many substeps; with half of these it
+shows how converged it is.  Errors are root-mean-square distances of particles at the scene's end.  Costs are processor time of
+one thread, the median of several control steps, with the integrators in turn, so that noise hits all alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym import integrators
+from clothgym.bench import machine
+from clothgym.compare_scenes import FRAME, SCENES, Scene, scene_named
+from clothgym.simulation import Simulation
+
+Row = dict[str, Any]
+
+BURST = 10.0  # strain of a sheet that has blown up, if not as far as to be flagged as diverged
+LANES = 64  # sheets in the batch that is timed
+VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting, and the seconds after which fewer of them will do
+# what of an integrator's options is tried: the first is its default
+CHOICES: dict[str, tuple[dict[str, int], ...]] = {
+    "implicit_euler": ({"newton_iterations": 1}, {"newton_iterations": 3}),
+    "projective_dynamics": ({"iterations": 10}, {"iterations": 3}),
+    "pbd": ({"iterations": 10},),
+    "xpbd": ({"iterations": 1}, {"iterations": 4}),
+}
+
+
+class Setting(NamedTuple):
+    """What is measured: an integrator, its options, the substeps of a control step, and a variant of the scene, if any."""
+
+    integrator: str
+    options: Mapping[str, int]
+    substeps: int
+    variant: str
+
+    def matches(self, row: Row) -> bool:
+        return self == Setting(*(row[name] for name in self._fields))
+
+    def simulation(self, scene: Scene, num_envs: int = 1) -> Simulation:
+        return scene.simulation({"name": self.integrator, **self.options}, self.substeps, self.variant, num_envs)
+
+
+class Plan(NamedTuple):
+    """A scene and what is tried on it; ``quick`` tries less."""
+
+    scene: Scene
+    names: tuple[str, ...]
+    quick: bool = False
+
+    def settings(self) -> list[Setting]:
+        """By integrator, option and substeps; then the scene's variants, at the picture's substeps."""
+        scene = self.scene
+        tried = [n for place, n in enumerate(scene.substeps) if n == scene.shown or place % 2 or not self.quick]
+        of = {name: CHOICES.get(name, ({},))[: 1 if self.quick else None] for name in self.names}
+        return [Setting(name, options, n, "") for name in self.names for options in of[name] for n in tried] + [
+            Setting(name, of[name][0], scene.shown, variant) for variant in scene.variants for name in self.names
+        ]
+
+    def shown(self) -> list[Setting]:
+        """Those in the picture."""
+        settings = [s for s in self.settings() if s.substeps == self.scene.shown]
+        return [s for s in settings if s.options == CHOICES.get(s.integrator, ({},))[0]]
+
+
+def plan(scene: str, names: Sequence[str] | None = None, quick: bool = False) -> Plan:
+    """What is to be measured; all integrators if no names are given.
+
+    Raises:
+        ValueError: no such scene or integrator; the message lists those that there are.
+    """
+    names = tuple(dict.fromkeys(names or integrators.INTEGRATORS))
+    return Plan(scene_named(scene), tuple(integrators.get(name).name for name in names), quick)
+
+
+# --- one setting --------------------------------------------------------------------------------------------------------
+
+
+def rms_mm(a: NDArray, b: NDArray) -> float:
+    """Root of the mean squared distance of particles [mm]; positions [m], (particles, 3)."""
+    return float(1e3 * np.sqrt(np.mean(np.sum((a.astype(np.float64) - b) ** 2, axis=1))))
+
+
+def angular_momentum(s: Simulation) -> NDArray:
+    """About the centre of mass [kg m^2/s], (3,)."""
+    state = s.get_state()
+    mass = 1 / state.free_inverse_mass[0].astype(np.float64)
+    x, v = (a[0].astype(np.float64) - np.average(a[0], axis=0, weights=mass) for a in (state.positions, state.velocities))
+    return np.sum(mass[:, None] * np.cross(x, v), axis=0)
+
+
+def reference(scene: Scene) -> tuple[NDArray, Row]:
+    """The converged sheet [m], (particles, 3), and what is known of it."""
+    ends = []
+    for substeps in (scene.reference_substeps // 2, scene.reference_substeps):
+        s = scene.simulation("rk4", substeps, dtype="float64")
+        s.step(scene.frames)
+        ends.append(s.positions[0])
+    about = {"integrator": "rk4", "dtype": "float64", "substeps": scene.reference_substeps, "seconds": scene.seconds}
+    return ends[1], about | {"half_substeps_mm": rms_mm(*ends), "largest_strain": float(s.strain().max())}
+
+
+def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple[Row, NDArray | None]:
+    """A row of the table but for the costs, and the sheet at the end if the run was stable."""
+    s = setting.simulation(scene)
+    largest, _ = s.largest_substep()
+    row: Row = setting._asdict() | {
+        "options": dict(setting.options),
+        "consistent": s.integrator.order is not None,
+        "auto_substeps": s.integrator.automatic_substeps(FRAME, largest) if largest > 0 else None,
+    }
+    energy, momentum = s.energy().total[0], angular_momentum(s)
+    for _ in range(scene.frames):
+        s.step()
+        if s.diverged[0]:
+            return row | {"stable": False}, None
+    strain = float(s.strain().max())
+    if strain > BURST:
+        return row | {"stable": False}, None
+    row |= {"stable": True, "error_mm": rms_mm(s.positions[0], truth), "largest_strain": strain}
+    if scene.settled:
+        row["strain_error"] = strain / about["largest_strain"] - 1
+    if scene.conserves:
+        row["energy_kept"] = float(s.energy().total[0] / energy)
+        row["spin_kept"] = float(angular_momentum(s) @ momentum / (momentum @ momentum))
+    return row, s.positions[0]
+
+
+def costs(scene: Scene, settings: Sequence[Setting], num_envs: int) -> list[float]:
+    """Seconds of a control step of each setting's batch: medians over visits in turn."""
+    batches = [setting.simulation(scene, num_envs) for setting in settings]
+    times: list[list[float]] = [[] for _ in batches]
+    for s in batches:
+        s.step()
+    for visit in range(VISITS):
+        for s, taken in zip(batches, times):
+            if visit < AT_LEAST or sum(taken) < ENOUGH:
+                begun = time.thread_time()  # not the clock's: what else the machine does is no cost of ours
+                s.step()
+                taken.append(time.thread_time() - begun)
+    return [statistics.median(taken) for taken in times]
+
+
+def add_costs(scene: Scene, rows: Sequence[Row]) -> None:
+    """Fill in the costs of rows that are measured together."""
+    settings = [Setting(*(row[name] for name in Setting._fields)) for row in rows]
+    together, alone = costs(scene, settings, LANES), costs(scene, settings, 1)
+    for row, setting, batch, single in zip(rows, settings, together, alone):
+        s = setting.simulation(scene)
+        passes = setting.substeps * (1 if setting.integrator == "implicit_euler" else setting.options.get("iterations", 1))
+        elements = s.view.springs.kind.size + s.bending.hinged * scene.mesh.hinges.weight.size
+        row |= {
+            "ms_batch": 1e3 * batch / (LANES * FRAME),
+            "ms_alone": 1e3 * single / FRAME,
+            "ns_per_element": 1e9 * batch / (LANES * passes * elements),
+        }
+
+
+# --- all of them --------------------------------------------------------------------------------------------------------
+
+
+class Record:
+    """The results in a folder: written after every row, found again by the next run."""
+
+    def __init__(self, folder: Path, scene: Scene, fresh: bool) -> None:
+        self.path, self.sheets_path = folder / "results.json", folder / "sheets.npz"
+        folder.mkdir(parents=True, exist_ok=True)
+        self.results: Row = {
+            "machine": machine(),
+            "scene": json.loads(json.dumps(dataclasses.asdict(scene))),
+            "reference": None,
+            "rows": [],
+        }
+        self.sheets: dict[str, NDArray] = {}
+        if fresh or not (self.path.exists() and self.sheets_path.exists()):
+            return
+        earlier = json.loads(self.path.read_text())
+        # rows of another machine, version or scene would compare nothing
+        here = [(r["scene"], {k: v for k, v in r["machine"].items() if k != "date"}) for r in (earlier, self.results)]
+        if here[0] != here[1]:
+            print(f"{self.path} is of another scene, version or machine: measuring anew", file=sys.stderr)
+            return
+        self.results = earlier
+        with np.load(self.sheets_path, allow_pickle=False) as file:
+            self.sheets = dict(file)
+
+    def find(self, setting: Setting) -> Row | None:
+        return next((row for row in self.results["rows"] if setting.matches(row)), None)
+
+    def write(self) -> None:
+        """Sheets first: a row that is there has its sheet."""
+        part = self.sheets_path.with_name("part.npz")
+        np.savez(part, **self.sheets)  # type: ignore[arg-type]
+        part.replace(self.sheets_path)
+        part = self.path.with_suffix(".part")
+        part.write_text(json.dumps(self.results, indent=1) + "\n")
+        part.replace(self.path)
+
+
+def sheet_name(setting: Setting) -> str:
+    return setting.integrator + (f", {setting.variant}" if setting.variant else "")
+
+
+def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
+    """Measure what the folder does not have yet, and draw; returns the results.
+
+    Raises:
+        ImportError: matplotlib is missing; nothing has been measured then.
+    """
+    from clothgym import compare_pictures
+
+    compare_pictures.pyplot()
+    scene, settings, shown = plan.scene, plan.settings(), plan.shown()
+    record = Record(folder, scene, fresh)
+    if record.results["reference"] is None:
+        _tell(f"{scene.name}: converging the reference")
+        record.sheets["reference"], record.results["reference"] = reference(scene)
+        record.write()
+    for place, setting in enumerate(settings):
+        if record.find(setting) is None:
+            _tell(f"{scene.name}: error {place + 1} of {len(settings)}, {sheet_name(setting)}")
+            row, sheet = measure(scene, setting, record.sheets["reference"], record.results["reference"])
+            if sheet is not None and setting in shown:
+                record.sheets[sheet_name(setting)] = sheet
+            record.results["rows"].append(row)
+            record.write()
+    rows = [row for row in map(record.find, settings) if row is not None]
+    for group in _to_be_timed(rows):
+        _tell(f"{scene.name}: cost of {len(group)} settings with {group[0]['substeps']} substeps")
+        add_costs(scene, group)
+        record.write()
+    print(file=sys.stderr)
+    results = record.results | {"rows": rows}
+    (folder / "table.txt").write_text(table(results) + "\n")
+    compare_pictures.draw_work_precision(results, folder / "work_precision.png")
+    pictured = [(setting, record.find(setting) or {}, record.sheets.get(sheet_name(setting))) for setting in shown]
+    compare_pictures.draw_sheets(scene, record.sheets["reference"], pictured, folder / "sheets.png")
+    return results
+
+
+def _to_be_timed(rows: Sequence[Row]) -> Iterator[list[Row]]:
+    """Stable rows without a cost, those with as many substeps together."""
+    for substeps in sorted({row["substeps"] for row in rows}):
+        group = [row for row in rows if row["substeps"] == substeps and row["stable"] and "ms_batch" not in row]
+        if group:
+            yield group
+
+
+def _tell(text: str) -> None:
+    print(f"\r{text:<79}", end="", file=sys.stderr, flush=True)
+
+
+# --- as text ------------------------------------------------------------------------------------------------------------
+
+COLUMNS = {
+    "error_mm": ("error mm", "{:.3g}", 1),
+    "largest_strain": ("strain %", "{:.1f}", 100),
+    "strain_error": ("its error %", "{:+.1f}", 100),
+    "energy_kept": ("energy kept %", "{:.1f}", 100),
+    "spin_kept": ("spin kept %", "{:.1f}", 100),
+    "ms_batch": ("ms/s batch", "{:.3g}", 1),
+    "ms_alone": ("ms/s alone", "{:.3g}", 1),
+    "ns_per_element": ("ns/element", "{:.2f}", 1),
+}
+
+
+def told(options: Mapping[str, int], variant: str = "") -> str:
+    """Options and variant as a table has them."""
+    return ", ".join([f"{name.replace('_', ' ')} {value}" for name, value in options.items()] + [variant] * bool(variant))
+
+
+def table(results: Row) -> str:
+    """The rows as text."""
+    about, scene, rows = results["reference"], results["scene"], results["rows"]
+    columns = {key: column for key, column in COLUMNS.items() if any(key in row for row in rows)}
+    lines = [["integrator", "options", "substeps", "auto", "stable", *(title for title, _, _ in columns.values())]]
+    for row in rows:
+        cells = [row["integrator"], told(row["options"], row["variant"]), str(row["substeps"]), str(row["auto_substeps"] or "none")]
+        cells.append(("yes" if row["consistent"] else "inconsistent") if row["stable"] else "NO")
+        lines.append(cells + [form.format(scale * row[key]) if key in row else "-" for key, (_, form, scale) in columns.items()])
+    widths = [max(map(len, column)) for column in zip(*lines)]
+    text = ["  ".join(c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(zip(line, widths))) for line in lines]
+    return "\n".join(
+        [
+            f"{scene['name']}: {scene['breaks']}.",
+            f"Reference: {about['integrator']} in {about['dtype']} with {about['substeps']} substeps of a 1/60 s step "
+            f"({about['half_substeps_mm']:.1g} mm from half as many) after {about['seconds']:g} s; largest strain "
+            f"{100 * about['largest_strain']:.1f} %.",
+            f"auto: substeps by the method's own bound.  ms/s: processor time per simulated second of a sheet, one of {LANES} or "
+            "alone.",
+            "ns/element: per spring or hinge, substep and iteration (implicit_euler: substep), in the batch.",
+            results["machine"]["processor"] + ", " + results["machine"]["date"],
+            "",
+            *text,
+        ]
+    )
+
+
+def scene_list() -> str:
+    """Names and sentences."""
+    return "\n".join(f"{name:<14} {scene.breaks}" for name, scene in SCENES.items())

@@ -1,0 +1,152 @@
+"""What a comparison looks like: a work-precision plot, and the sheets side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.compare_scenes import Scene
+from clothgym.render import Camera, Renderer
+
+if TYPE_CHECKING:
+    from clothgym.compare import Row, Setting
+
+INK, QUIET = "#2b2d42", "#8d99ae"
+COLOURS = {
+    "explicit_euler": "#8a8f98",
+    "semi_implicit_euler": "#d1495b",
+    "verlet": "#2f6fb5",
+    "rk4": "#7b4fa3",
+    "implicit_euler": "#3a8f4e",
+    "projective_dynamics": "#12a5a5",
+    "pbd": "#8c6239",
+    "xpbd": "#edae49",
+}
+REFERENCE = "#c4bdb2"
+STYLES = (("-", "o"), ("--", "s"), (":", "^"))
+PANEL, ACROSS, DPI = 300, 5, 100  # pixels of a sheet's picture, sheets in a row, pixels of an inch
+FLOATING = 1e-4  # as far as an error axis goes down: what is below is the rounding of float32 [mm]
+
+
+def pyplot() -> Any:
+    """matplotlib's, without a window.
+
+    Raises:
+        ImportError: it is missing; the message says how to get it.
+    """
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise ImportError('the plots need matplotlib: pip install "clothgym[plots]"') from error
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
+def draw_work_precision(results: Row, path: Path) -> None:
+    """Error over cost: a colour for each integrator, a line for each choice of its options."""
+    from clothgym.compare import LANES, told
+
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(9.6, 5.0), layout="constrained")
+    axes.set(xscale="log", yscale="log")
+    lines: dict[tuple[str, str], list[Row]] = {}
+    for row in results["rows"]:
+        if not row["variant"]:
+            lines.setdefault((row["integrator"], told(row["options"])), []).append(row)
+    seen: dict[str, int] = {}
+    for (name, options), rows in lines.items():
+        style, marker = STYLES[seen.setdefault(name, 0)]
+        seen[name] += 1
+        stable = [row for row in rows if row["stable"]]
+        failed = [row["substeps"] for row in rows if not row["stable"]]
+        label = f"{name}, {options}" if options else name
+        notes = ["inconsistent"] * (not rows[0]["consistent"])
+        if failed:
+            notes.append(f"unstable with {max(failed)}" + " or fewer" * (len(failed) > 1) if stable else "always unstable")
+        x, y = ([row[key] for row in stable] for key in ("ms_batch", "error_mm"))
+        look = {"ls": style, "marker": marker, "ms": 4.5, "lw": 1.5, "mfc": COLOURS[name] if seen[name] == 1 else "white"}
+        axes.plot(x, np.maximum(y, FLOATING), color=COLOURS[name], label="\n   ".join([label, *notes]), **look)
+        if stable and seen[name] == 1:
+            for row in (stable[0], stable[-1]):
+                place = row["ms_batch"], max(row["error_mm"], FLOATING)
+                beside = (4, -10) if name == "semi_implicit_euler" else (4, 4)  # verlet's line is the same
+                axes.annotate(
+                    row["substeps"], place, beside, textcoords="offset points", fontsize=7.5, color=COLOURS[name], clip_on=True
+                )
+    scene, about = results["scene"], results["reference"]
+    bound = 5 * max(scene["size"][2:])
+    axes.axhline(bound, color=QUIET, lw=0.9, ls=(0, (6, 4)), zorder=0)
+    axes.annotate(
+        "5 mm a metre", (1, bound), (-2, 3), ("axes fraction", "data"), "offset points", ha="right", color=QUIET, fontsize=8
+    )
+    axes.set_xlabel(f"ms of one core per simulated second of one sheet, one of {LANES}", color=INK)
+    axes.set_ylabel(f"rms error after {about['seconds']:g} s [mm]", color=INK)
+    axes.set_title(f"{scene['name']}: {scene['breaks'].split(':')[0]}", loc="left", fontsize=11, color=INK)
+    axes.grid(which="major", color="#e4e2dd", lw=0.6)
+    axes.legend(
+        frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1.0, 1.0), title="numbers: substeps of a 1/60 s step",
+        title_fontsize=8.5, alignment="left",
+    )  # fmt: skip
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting, Row, NDArray | None]], path: Path) -> None:
+    """The reference, and each integrator's sheet in its colour; an unstable one's room is empty.
+
+    reference, sheets: positions [m], (particles, 3).
+    """
+    plt = pyplot()
+    labels, pictures = ["converged reference\n"], [_picture(scene, reference, REFERENCE)]
+    for setting, row, sheet in sheets:
+        outcome = f"{row['error_mm']:.3g} mm off" if row["stable"] else "unstable"
+        detail = setting.variant or f"{setting.substeps} substeps"
+        labels.append(f"{setting.integrator}\n{detail}, {outcome}")
+        pictures.append(_picture(scene, sheet if sheet is not None else None, COLOURS[setting.integrator]))
+    across = min(ACROSS, len(pictures))
+    down = -(-len(pictures) // across)
+    figure = plt.figure(figsize=(across * PANEL / DPI, down * (PANEL + 52) / DPI), facecolor="white")
+    for place, (label, picture) in enumerate(zip(labels, pictures)):
+        row_number, column = divmod(place, across)
+        left, top = column / across, 1 - row_number / down
+        high = PANEL / (PANEL + 52) / down
+        axes = figure.add_axes((left + 0.002, top - high, 1 / across - 0.004, high))
+        axes.imshow(picture, aspect="auto", interpolation="antialiased")
+        axes.set_axis_off()
+        first, second = label.split("\n")
+        colour = COLOURS.get(first, INK)
+        middle, under = left + 0.5 / across, top - high
+        unit = 1 / (down * (PANEL + 52))
+        figure.text(middle, under - 6 * unit, first, ha="center", va="top", fontsize=12, weight="bold", color=colour)
+        figure.text(middle, under - 27 * unit, second, ha="center", va="top", fontsize=10.5, color=INK)
+    figure.savefig(path, dpi=DPI)
+    plt.close(figure)
+
+
+def _picture(scene: Scene, sheet: NDArray | None, colour: str) -> NDArray[np.uint8]:
+    """A sheet in its room, or the room alone, (PANEL, PANEL, 3)."""
+    front = tuple(int(colour[place : place + 2], 16) for place in (1, 3, 5))
+    back = tuple(round(0.6 * value) for value in front)
+    renderer = Renderer(
+        scene.mesh.triangles,
+        scene.mesh.rest_positions[:, :2],
+        Camera(eye=scene.eye, target=scene.target),
+        PANEL,
+        PANEL,
+        antialias=3,
+        threads=1,
+        grid_shape=scene.mesh.shape,
+        front=front,  # type: ignore[arg-type]
+        back=back,  # type: ignore[arg-type]
+    )
+    if sheet is None:
+        return renderer.rgb(np.full_like(scene.mesh.rest_positions, -9.0))  # far below the floor
+    pins = [(tuple(sheet[p]), (43, 45, 66)) for p in scene.held if len(scene.held) <= 4]
+    return renderer.rgb(sheet, markers=pins)  # type: ignore[arg-type]
