@@ -178,7 +178,7 @@ def cantilever(
         _calmed(material),
         integrator=integrator,
         air_density=0.0,
-        anchors=[np.flatnonzero(column < 2)],
+        anchors=[np.flatnonzero(column < 2).tolist()],
         bending=bending,
         dtype=dtype,
     )
