@@ -14,7 +14,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m clothgym", description="Cloth that is fast enough to learn on.")
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("list", help="environments, integrators and fabrics")
-    commands.add_parser("warmup", help="compile all kernels now, so that nothing has to later")
+    warmup = commands.add_parser("warmup", help="compile kernels now, so that nothing has to later")
+    warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; some minutes")
     bench = commands.add_parser("bench", help="measure speed on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
     bench.add_argument("--quick", action="store_true", help="fewer cases, in a few seconds")
@@ -29,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command == "list":
         _list()
     elif options.command == "warmup":
-        _warm_up()
+        _warm_up(options.all)
     elif options.command == "compare":
         _compare(options, compare)
     else:
@@ -47,23 +48,24 @@ def _list() -> None:
         print(f"  clothgym:{env_id}")
     print("integrators")
     for name, integrator in INTEGRATORS.items():
-        print(f"  {name:<22} order {integrator.order}")
+        order = f"order {integrator.order}" if integrator.order else "no order"
+        print(f"  {name:<22} {order}; {integrator.cost} a substep; damping enters {integrator.damping}")
     print("fabrics")
     for name, material in PRESETS.items():
         print(f"  {name:<22} {material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m")
 
 
-def _warm_up() -> None:
+def _warm_up(everything: bool) -> None:
     import gymnasium as gym
 
+    from clothgym import Simulation, grid
+    from clothgym.bending import BENDING
     from clothgym.integrators import INTEGRATORS
     from clothgym.registration import ENVIRONMENTS
 
     begun = time.perf_counter()
-    cases: list[tuple[str, dict[str, Any]]] = [
-        (env_id, {"integrator": integrator}) for env_id in ENVIRONMENTS for integrator in INTEGRATORS
-    ]
     # wind and slipping have kernels of their own
+    cases: list[tuple[str, dict[str, Any]]] = [(env_id, {}) for env_id in ENVIRONMENTS]
     cases += [("ClothReach-v0", {"wind": {"gust": 0.5}}), ("ClothDrapeGripper-v0", {"slip_force": 1.0})]
     for env_id, kwargs in cases:
         env = gym.make(env_id, render_mode="rgb_array", **kwargs)
@@ -74,7 +76,12 @@ def _warm_up() -> None:
             _, _, terminated, _, _ = env.step(env.unwrapped.expert_action())  # type: ignore[attr-defined]
         env.render()
         env.close()
-    print(f"all kernels are ready ({time.perf_counter() - begun:.1f} s)")
+    for integrator in INTEGRATORS:
+        for bending in BENDING if everything else ["springs"]:
+            for limit in (None, 0.1) if everything else [None]:
+                Simulation(grid(3, 3, 0.1, 0.1), integrator=integrator, bending=bending, strain_limit=limit, substeps=1000).step()
+    what = "all kernels are" if everything else "all kernels of the environments and of every integrator are"
+    print(f"{what} ready ({time.perf_counter() - begun:.1f} s)")
 
 
 def _bench(path: Path | None, quick: bool) -> None:

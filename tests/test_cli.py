@@ -19,7 +19,7 @@ def test_list_names_what_there_is(capsys):
 
 def test_warmup_says_when_it_is_done(capsys):
     assert main(["warmup"]) == 0
-    assert "all kernels are ready" in capsys.readouterr().out
+    assert "every integrator are ready" in capsys.readouterr().out
     # and a process that comes after it finds every kernel of every environment
     done = subprocess.run([sys.executable, "-c", AN_EPISODE_OF_EACH], capture_output=True, text=True, timeout=300)
     assert done.stdout.split() == list(ENVIRONMENTS) and not done.stderr, done.stderr

@@ -172,7 +172,7 @@ def test_the_human_window_comes_from_gymnasium_s_wrapper(env_id, monkeypatch):
 @pytest.mark.parametrize(
     ("kwargs", "name"),
     [
-        ({"integrator": "verlet"}, "xpbd"),
+        ({"integrator": "leapfrog"}, "xpbd"),
         ({"obs_mode": "pixels"}, "keypoints"),
         ({"reward_mode": "dense"}, "delta"),
         ({"render_mode": "ansi"}, "rgb_array"),

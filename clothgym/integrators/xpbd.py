@@ -37,11 +37,12 @@ def surely_allowed(o: Oscillators) -> float:
 
 
 @kernel
-def project_springs(x, start, w, springs, compliance, damping):
+def project_springs(x, start, w, springs, compliance, damping, row):
     """Move both ends of each spring towards its rest length, in place.
 
     compliance: ``1/(k h^2)`` [1/kg], (kinds, lanes).  damping: ``tau/h``, (lanes,).  start: positions at the beginning of
-    the substep, whose difference to ``x`` is the velocity that the damper sees.
+    the substep, whose difference to ``x`` is the velocity that the damper sees.  row: scratch, (3, lanes): with as many rows to
+    read as here, simple loops are faster than one that writes where it reads.
     """
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
@@ -60,12 +61,14 @@ def project_springs(x, start, w, springs, compliance, damping):
             g = damping[l]
             push = d2 - r * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
             lam = push / (d2 * ((one + g) * (wi[l] + wj[l]) + flexible * a[l]))
-            xi[0, l] += wi[l] * lam * dx
-            xi[1, l] += wi[l] * lam * dy
-            xi[2, l] += wi[l] * lam * dz
-            xj[0, l] -= wj[l] * lam * dx
-            xj[1, l] -= wj[l] * lam * dy
-            xj[2, l] -= wj[l] * lam * dz
+            row[0, l] = lam * dx
+            row[1, l] = lam * dy
+            row[2, l] = lam * dz
+        for c in range(3):
+            for l in range(x.shape[2]):
+                xi[c, l] += wi[l] * row[c, l]
+            for l in range(x.shape[2]):
+                xj[c, l] -= wj[l] * row[c, l]
 
 
 @kernel
@@ -214,7 +217,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         damped |= damping[l] > 0
     if iterations == 1:
         if damped:
-            project_springs(x, start, w, springs, compliance, damping)
+            project_springs(x, start, w, springs, compliance, damping, work[-1])
         else:
             project_undamped_springs(x, w, springs, compliance)
         project_bends(x, start, w, bends, bend, damping, one, work[:0], work[-SCRATCH:])
