@@ -49,7 +49,7 @@ def _list() -> None:
     print("integrators")
     for name, integrator in INTEGRATORS.items():
         order = f"order {integrator.order}" if integrator.order else "no order"
-        print(f"  {name:<22} {order}; {integrator.cost} a substep; damping enters {integrator.damping}")
+        print(f"  {name:<22} {order}; a substep costs {integrator.cost}")
     print("fabrics")
     for name, material in PRESETS.items():
         print(f"  {name:<22} {material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m")

@@ -188,7 +188,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 IMPLICIT_EULER = Integrator(
     "implicit_euler",
     order=1,
-    cost="a force pass, and a matrix product an iteration",
+    cost="a force pass, and a matrix product for each iteration and one more",
     damping="implicitly, in the matrix",
     substep=substep,
     largest_substep=largest_substep,

@@ -101,7 +101,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 PBD = Integrator(
     "pbd",
     order=None,
-    cost="one projection pass an iteration",
+    cost="one projection pass for each iteration",
     damping="not at all: the projections damp far more",
     substep=substep,
     largest_substep=largest_substep,

@@ -208,7 +208,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 PROJECTIVE_DYNAMICS = Integrator(
     "projective_dynamics",
     order=1,
-    cost="a force pass and two triangular solves an iteration",
+    cost="a force pass and two triangular solves for each iteration",
     damping="implicitly, in the matrix and in each iteration's forces",
     substep=substep,
     largest_substep=largest_substep,

@@ -235,7 +235,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 XPBD = Integrator(
     "xpbd",
     order=1,
-    cost="one projection pass an iteration",
+    cost="one projection pass for each iteration",
     damping="implicitly, in each projection",
     substep=substep,
     largest_substep=largest_substep,
