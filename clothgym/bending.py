@@ -30,7 +30,7 @@ from clothgym._jit import kernel
 from clothgym.mesh import ClothMesh
 from clothgym.state import BendArrays
 
-BEND_SCRATCH = 6
+BEND_SCRATCH = 9
 
 # arctan(z)/z by powers of z^2 for z^2 up to tan(pi/8)^2, interpolated at Chebyshev's points: error at most 8e-13
 ARCTAN = (
@@ -140,42 +140,63 @@ def project_quadratic(x, start, w, bends, scale, damping, relaxation, multiplier
 
 
 @kernel
-def _angle_and_slopes(x, ends, angle, slopes):
+def _angle_and_slopes(x, ends, angle, slopes, rows):
     """The angle between two triangles [rad] into ``angle``, (lanes,), and its derivatives [1/m] into ``slopes``, (12, lanes).
 
     With e the edge, a and b the opposite corners seen from its first end, and the normals ``N = e x a`` and ``M = b x e``:
     ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  Two more halvings bring it where a short polynomial is the arctangent.
-    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.
+    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  rows: scratch, (11, lanes).  Loops that write few rows
+    vectorise: one loop for all this would take four times as long.
     """
     xi, xj, xk, xl = x[ends[0]], x[ends[1]], x[ends[2]], x[ends[3]]
+    lanes = x.shape[2]
     t = x.dtype.type
     one, tiny, least = t(1), t(1e-30), t(1e-9)
     c0, c1, c2, c3 = t(ARCTAN[0]), t(ARCTAN[1]), t(ARCTAN[2]), t(ARCTAN[3])
     c4, c5, c6, c7 = t(ARCTAN[4]), t(ARCTAN[5]), t(ARCTAN[6]), t(ARCTAN[7])
-    for l in range(x.shape[2]):
+    n, m = rows[0:3], rows[3:6]
+    inverse, foot_k, foot_l, tilt_k, tilt_l = rows[6], rows[7], rows[8], rows[9], rows[10]
+    for l in range(lanes):
         ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
         ax, ay, az = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
+        n[0, l], n[1, l], n[2, l] = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
+    for l in range(lanes):
+        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
         bx, by, bz = xl[0, l] - xi[0, l], xl[1, l] - xi[1, l], xl[2, l] - xi[2, l]
-        nx, ny, nz = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
-        mx, my, mz = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
-        e2 = ex * ex + ey * ey + ez * ez + tiny
+        m[0, l], m[1, l], m[2, l] = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
+    for l in range(lanes):
+        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+        ax, ay, az = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
+        inverse[l] = one / (ex * ex + ey * ey + ez * ez + tiny)
+        foot_k[l] = (ax * ex + ay * ey + az * ez) * inverse[l]
+    for l in range(lanes):
+        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+        bx, by, bz = xl[0, l] - xi[0, l], xl[1, l] - xi[1, l], xl[2, l] - xi[2, l]
+        foot_l[l] = (bx * ex + by * ey + bz * ez) * inverse[l]
+        angle[l] = bx * n[0, l] + by * n[1, l] + bz * n[2, l]
+    for l in range(lanes):
+        nx, ny, nz, mx, my, mz = n[0, l], n[1, l], n[2, l], m[0, l], m[1, l], m[2, l]
         n2, m2 = nx * nx + ny * ny + nz * nz + tiny, mx * mx + my * my + mz * mz + tiny
-        length = np.sqrt(e2)
+        length = one / np.sqrt(inverse[l])
         product = np.sqrt(n2) * np.sqrt(m2)
-        cosine = nx * mx + ny * my + nz * mz
-        half = -length * (nx * bx + ny * by + nz * bz) / max(product + cosine, least * product)
+        below, lowest = product + (nx * mx + ny * my + nz * mz), least * product
+        half = -length * angle[l] / (below if below > lowest else lowest)
         quarter = half / (one + np.sqrt(one + half * half))
         z = quarter / (one + np.sqrt(one + quarter * quarter))
         u = z * z
         series = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * (c5 + u * (c6 + u * c7))))))
         angle[l] = t(8) * z * series
-        tilt_k, tilt_l = -length / n2, -length / m2
-        foot_k, foot_l = (ax * ex + ay * ey + az * ez) / e2, (bx * ex + by * ey + bz * ez) / e2
-        near_k, near_l, far_k, far_l = (foot_k - one) * tilt_k, (foot_l - one) * tilt_l, -foot_k * tilt_k, -foot_l * tilt_l
-        slopes[0, l], slopes[1, l], slopes[2, l] = near_k * nx + near_l * mx, near_k * ny + near_l * my, near_k * nz + near_l * mz
-        slopes[3, l], slopes[4, l], slopes[5, l] = far_k * nx + far_l * mx, far_k * ny + far_l * my, far_k * nz + far_l * mz
-        slopes[6, l], slopes[7, l], slopes[8, l] = tilt_k * nx, tilt_k * ny, tilt_k * nz
-        slopes[9, l], slopes[10, l], slopes[11, l] = tilt_l * mx, tilt_l * my, tilt_l * mz
+        tilt_k[l], tilt_l[l] = -length / n2, -length / m2
+    for c in range(3):
+        near, far, of_k, of_l, nc, mc = slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c], n[c], m[c]
+        for l in range(lanes):
+            of_k[l] = tilt_k[l] * nc[l]
+        for l in range(lanes):
+            of_l[l] = tilt_l[l] * mc[l]
+        for l in range(lanes):
+            near[l] = (foot_k[l] - one) * of_k[l] + (foot_l[l] - one) * of_l[l]
+        for l in range(lanes):
+            far[l] = -foot_k[l] * of_k[l] - foot_l[l] * of_l[l]
 
 
 @kernel
@@ -183,20 +204,25 @@ def _rate(p, ends, slopes, out):
     """Derivative of the angle along ``p``, (lanes,)."""
     out[:] = 0
     for m in range(4):
-        pm = p[ends[m]]
-        for e in range(3):
-            for l in range(p.shape[2]):
-                out[l] += slopes[3 * m + e, l] * pm[e, l]
+        pm, s = p[ends[m]], slopes[3 * m : 3 * m + 3]
+        for l in range(p.shape[2]):
+            out[l] += s[0, l] * pm[0, l] + s[1, l] * pm[1, l] + s[2, l] * pm[2, l]
+
+
+@kernel
+def _hinge_rows(scratch):
+    """Rows of scratch that a hinge's kernels use: angle, rate, derivatives, geometry, and two more, (., lanes)."""
+    rows = scratch.reshape((3 * scratch.shape[0], scratch.shape[2]))
+    return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
 
 
 @kernel
 def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
     """Of the energy ``B/2 weight (angle - rest angle)^2``."""
     members, weight, rest_angle, _ = bends
-    rows = scratch.reshape((3 * scratch.shape[0], x.shape[2]))
-    angle, rate, slopes = rows[0], rows[1], rows[2:14]
+    angle, rate, slopes, geometry, _, _ = _hinge_rows(scratch)
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes)
+        _angle_and_slopes(x, members[s], angle, slopes, geometry)
         _rate(v, members[s], slopes, rate)
         share, rest = weight[s], rest_angle[s]
         for l in range(x.shape[2]):
@@ -211,17 +237,18 @@ def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
 @kernel
 def add_hinge_products(x, p, y, bends, scale, scratch):
     members, weight, _, _ = bends
-    rows = scratch.reshape((3 * scratch.shape[0], x.shape[2]))
-    angle, rate, slopes = rows[0], rows[1], rows[2:14]
+    angle, rate, slopes, geometry, _, _ = _hinge_rows(scratch)
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes)
+        _angle_and_slopes(x, members[s], angle, slopes, geometry)
         _rate(p, members[s], slopes, rate)
         share = weight[s]
+        for l in range(x.shape[2]):
+            rate[l] *= share * scale[l]
         for m in range(4):
             ym = y[members[s, m]]
             for e in range(3):
                 for l in range(x.shape[2]):
-                    ym[e, l] += share * scale[l] * rate[l] * slopes[3 * m + e, l]
+                    ym[e, l] += rate[l] * slopes[3 * m + e, l]
 
 
 @kernel
@@ -229,11 +256,10 @@ def project_hinges(x, start, w, bends, scale, damping, relaxation, multipliers, 
     """The constraint ``angle = rest angle``; the damper sees what has been done along its derivative in the substep."""
     members, weight, rest_angle, _ = bends
     one = x.dtype.type(1)
-    rows = scratch.reshape((3 * scratch.shape[0], x.shape[2]))
-    angle, rate, slopes, before, mobility = rows[0], rows[1], rows[2:14], rows[14], rows[15]
+    angle, rate, slopes, geometry, before, mobility = _hinge_rows(scratch)
     keeps = multipliers.shape[0] > 0
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes)
+        _angle_and_slopes(x, members[s], angle, slopes, geometry)
         _rate(x, members[s], slopes, rate)
         _rate(start, members[s], slopes, before)
         mobility[:] = 0
