@@ -3,8 +3,8 @@
     python benchmarks/invariance.py --runs runs/ClothDrape-v0_0                     # substeps doubled and quadrupled: minutes
     python benchmarks/invariance.py --runs runs/ClothDrape-v0_0 --matrix A B ...    # and runs trained elsewhere, on every method
 
-Episodes are paired: episode ``i`` is that of seed ``HELD_OUT + i`` for each policy and each setting, 500 of them.  Success may not
-move by more than 5 points when the substeps are doubled and quadrupled.  The runs of the matrix were trained with
+Episodes are paired: episode ``i`` is that of seed ``HELD_OUT + i`` for each policy and each setting, 500 of them (200 in
+the matrix).  Success may not move by more than 5 points when the substeps are doubled and quadrupled.  The runs of the matrix were trained with
 
     python training/train.py --timesteps 1024000 --run FOLDER --env-kwargs '{"integrator": "xpbd", "substeps": 100}'
 
@@ -101,26 +101,27 @@ def main() -> None:
     parser.add_argument("--runs", nargs="+", required=True, help="folders of runs on the task as it is")
     parser.add_argument("--matrix", nargs="*", default=[], help="folders of runs trained on other integrators")
     parser.add_argument("--episodes", type=int, default=500, help="for each policy and setting")
+    parser.add_argument("--matrix-episodes", type=int, default=200, help="for each cell of the matrix")
     parser.add_argument("--fresh", action="store_true", help="measure again what is there")
     args = parser.parse_args()
     known = json.loads(RESULT.read_text()) if RESULT.exists() and not args.fresh else {}
     results: dict[str, Any] = {"machine": machine(), "substeps": [], "matrix": []}
 
-    def cell(section: str, key: dict[str, Any], policy: str, **kwargs: Any) -> None:
+    def cell(section: str, count: int, key: dict[str, Any], policy: str, **kwargs: Any) -> None:
         row = next((row for row in known.get(section, []) if key.items() <= row.items()), None)
-        results[section].append(row or key | {"succeeded": succeeded(policy, args.episodes, **kwargs)})
+        results[section].append(row or key | {"succeeded": succeeded(policy, count, **kwargs)})
         RESULT.write_text(json.dumps(results) + "\n")
 
     for policy in ("expert", *args.runs):
         for multiple in MULTIPLES:
             substeps = multiple * DrapeTask.physics.substeps
-            cell("substeps", {"policy": Path(policy).name, "substeps": substeps}, policy, substeps=substeps)
+            cell("substeps", args.episodes, {"policy": Path(policy).name, "substeps": substeps}, policy, substeps=substeps)
     print_invariance(results["substeps"])
     if args.matrix:
         for policy in ("expert", args.runs[0], *args.matrix):
             source = "(scripted expert)" if policy == "expert" else trained_on(policy)
             for target, kwargs in TESTED.items():
-                cell("matrix", {"trained_on": source, "tested_on": target}, policy, **kwargs)
+                cell("matrix", args.matrix_episodes, {"trained_on": source, "tested_on": target}, policy, **kwargs)
         draw(results["matrix"])
 
 

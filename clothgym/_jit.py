@@ -5,7 +5,8 @@ One policy for the whole project, so that the promises made about bits and about
 * plain IEEE arithmetic (no fast-math): an environment's bits do not depend on who else is in its batch;
 * compiled code is kept on disk in a folder whose name is a digest of the core's sources.  numba's own cache does not
   notice an edit in a callee that lives in another file; this key does;
-* a file lock around each compilation: processes that start together on a cold cache compile each kernel once;
+* a file lock for each kernel while it is compiled: processes that start together on a cold cache compile each one once, and
+  different ones at the same time;
 * threads are plain Python threads running kernels that do not hold the GIL.  Unlike numba's threading layers they may be
   used from several threads at once, survive a fork, and cost no parallel compilation.
 """
@@ -23,7 +24,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from types import FunctionType
-from typing import Any
+from typing import Any, cast
 
 import numba
 from numba.core import caching
@@ -58,18 +59,19 @@ def _default_root() -> Path:
 
 
 class _CacheFolder:
-    """The folder of compiled kernels, found once, with the lock that guards it."""
+    """The folder of compiled kernels, found once, with the locks that guard it."""
 
     def __init__(self) -> None:
-        self.depth = 0  # nested compilations that hold the lock; guarded by numba's own compiler lock
-        self._file: int | None = None  # a bare descriptor: held for the life of the process
+        # locks of kernels that this process compiles now, a caller before its callees: bare descriptors.  Guarded by numba's own
+        # compiler lock.  Processes cannot wait for each other in a ring, as no kernel calls itself by way of others
+        self.held: dict[str, int] = {}
         self._announced = False
         self.writable = True
         self.path = Path(os.devnull) / "none"
         try:
             self.path = _default_root() / _source_digest()
             self.path.mkdir(parents=True, exist_ok=True)
-            self._file = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT)
+            os.close(os.open(self.path / "lock", os.O_RDWR | os.O_CREAT))
         except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
             self.give_up(error)
 
@@ -83,18 +85,20 @@ class _CacheFolder:
                 stacklevel=2,
             )
 
-    def acquire(self) -> None:
-        if self._file is not None and self.depth == 0:
-            try:
-                _lock_file(self._file)
-                self.depth = 1
-            except OSError as error:  # a file system without locks
-                self.give_up(error)
+    def acquire(self, name: str) -> None:
+        """Wait until no other process compiles the kernel of that name."""
+        try:
+            file = os.open(self.path / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.lock", os.O_RDWR | os.O_CREAT)
+            _lock_file(file)
+            self.held[name] = file
+        except OSError as error:  # the folder has vanished, or its file system has no locks
+            self.give_up(error)
 
-    def release(self) -> None:
-        if self._file is not None and self.depth == 1:
-            self.depth = 0
-            _unlock_file(self._file)
+    def release(self, name: str) -> None:
+        file = self.held.pop(name, None)
+        if file is not None:
+            _unlock_file(file)
+            os.close(file)
 
     def announce(self) -> None:
         if not self._announced:
@@ -155,15 +159,19 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _Cache(caching.FunctionCache):  # type: ignore[misc]
-    """numba's disk cache with a lock: on a miss it waits for other processes, looks again, and keeps the lock."""
+    """numba's disk cache with locks: on a miss it waits for other processes, looks again, and keeps the kernel's lock."""
 
     _impl_class = _Impl
+
+    def __init__(self, py_func: FunctionType) -> None:
+        super().__init__(py_func)
+        self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}"
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         folder = cache_folder()
         found = self._load(sig, target_context)
-        if found is None and folder.writable and folder.depth == 0:
-            folder.acquire()
+        if found is None and folder.writable and self.lock_name not in folder.held:
+            folder.acquire(self.lock_name)
             found = self._load(sig, target_context)
         if found is None:
             target_context.refresh()
@@ -199,17 +207,18 @@ def kernel(function: Callable[..., Any]) -> Any:
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return function
     dispatcher = numba.njit(**OPTIONS)(function)
-    dispatcher._cache = _Cache(function)
+    dispatcher._cache = _Cache(cast(FunctionType, function))
     compile_or_load = dispatcher.compile
 
     def compile_locked(signature: Any) -> Any:
         with global_compiler_lock:  # numba's own, taken before we look whether this thread holds the file's
-            held = cache_folder().depth > 0
+            name = dispatcher._cache.lock_name
+            held = name in cache_folder().held
             try:
                 return compile_or_load(signature)
             finally:
                 if not held:
-                    cache_folder().release()
+                    cache_folder().release(name)
 
     dispatcher.compile = compile_locked
     return dispatcher

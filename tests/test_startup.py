@@ -85,7 +85,7 @@ def run(name):
 threads = [threading.Thread(target=run, args=(name,)) for name in ("semi_implicit_euler", "xpbd")]
 [t.start() for t in threads]
 [t.join() for t in threads]
-print(_jit.cache_folder().depth)
+print(len(_jit.cache_folder().held))
 """
 
 
