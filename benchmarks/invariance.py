@@ -3,8 +3,9 @@
     python benchmarks/invariance.py --runs runs/ClothDrape-v0_0                     # substeps doubled and quadrupled: minutes
     python benchmarks/invariance.py --runs runs/ClothDrape-v0_0 --matrix A B ...    # and runs trained elsewhere, on every method
 
-Episodes are paired: episode ``i`` is that of seed ``HELD_OUT + i`` for each policy and each setting, 500 of them (200 in
-the matrix).  Success may not move by more than 5 points when the substeps are doubled and quadrupled.  The runs of the matrix were trained with
+Episodes are paired: episode ``i`` is that of seed ``HELD_OUT + i`` for each policy and each setting, 500 of them (200 in the
+matrix).  Success may not move by more than 5 points when the substeps are doubled and quadrupled.  The runs of the matrix were
+trained with
 
     python training/train.py --timesteps 1024000 --run FOLDER --env-kwargs '{"integrator": "xpbd", "substeps": 100}'
 
