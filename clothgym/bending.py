@@ -91,6 +91,7 @@ def add_quadratic_forces(x, v, f, bends, rigidity, damping_time, scratch):
 
 @kernel
 def add_quadratic_products(x, p, y, bends, scale, scratch):
+    """The matrix of the energy itself, which is constant."""
     members, _, _, curves = bends
     curve = scratch[0]
     for s in range(members.shape[0]):
@@ -236,6 +237,7 @@ def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
 
 @kernel
 def add_hinge_products(x, p, y, bends, scale, scratch):
+    """The part of the energy's matrix that is never negative: the derivatives' outer product (Gauss and Newton)."""
     members, weight, _, _ = bends
     angle, rate, slopes, geometry, _, _ = _hinge_rows(scratch)
     for s in range(members.shape[0]):

@@ -58,10 +58,11 @@ def _list() -> None:
 def _warm_up(everything: bool) -> None:
     import gymnasium as gym
 
-    from clothgym import Simulation, grid
     from clothgym.bending import BENDING
     from clothgym.integrators import INTEGRATORS
+    from clothgym.mesh import grid
     from clothgym.registration import ENVIRONMENTS
+    from clothgym.simulation import Simulation
 
     begun = time.perf_counter()
     # wind and slipping have kernels of their own

@@ -18,6 +18,7 @@ from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.state import Elements, State
 
 POWER_STEPS = 16
+TINY = 1e-30  # [m^2]: a spring of no length, as in a sheet that is folded on itself, has no direction to pull in
 
 
 @kernel
@@ -32,7 +33,7 @@ def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
         _add_spring_forces_of_one(x[:, :, 0], v[:, :, 0], f[:, :, 0], springs, stiffness[:, 0], damping_time[0])
         return
     ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
+    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     lanes = x.shape[2]
     # components and lanes of a particle lie side by side: one loop adds all three
     flat = f.reshape((x.shape[0], 3 * lanes))
@@ -51,7 +52,7 @@ def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
             ux = vj[0, l] - vi[0, l]
             uy = vj[1, l] - vi[1, l]
             uz = vj[2, l] - vi[2, l]
-            q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+            q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
             g = share * k[l] * ((one - r * q) + damping_time[l] * (ux * dx + uy * dy + uz * dz) * q * q)
             row[0, l] = g * dx
             row[1, l] = g * dy
@@ -66,14 +67,14 @@ def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
 def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
     """The same arithmetic on a single environment, (particles, 3), in less than half the time: no loops of one round."""
     ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
+    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         r = rest_length[s]
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         ux, uy, uz = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
-        q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         g = weight[s] * stiffness[kind[s]] * ((one - r * q) + damping_time * (ux * dx + uy * dy + uz * dz) * q * q)
         fx, fy, fz = g * dx, g * dy, g * dz
         f[i, 0] += fx
@@ -96,7 +97,7 @@ def add_spring_products(x, p, y, springs, along, across, row):
         _add_spring_products_of_one(x[:, :, 0], p[:, :, 0], y[:, :, 0], springs, along[:, 0], across[:, 0])
         return
     ends, rest_length, kind, weight = springs
-    one, zero = x.dtype.type(1), x.dtype.type(0)
+    one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
     lanes = x.shape[2]
     flat = y.reshape((x.shape[0], 3 * lanes))
     product = row.reshape(3 * lanes)
@@ -114,7 +115,7 @@ def add_spring_products(x, p, y, springs, along, across, row):
             ux = pj[0, l] - pi[0, l]
             uy = pj[1, l] - pi[1, l]
             uz = pj[2, l] - pi[2, l]
-            q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+            q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
             stretched = one - r * q
             aside = share * kt[l] * (stretched if stretched > zero else zero)
             g = (share * kn[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
@@ -131,13 +132,13 @@ def add_spring_products(x, p, y, springs, along, across, row):
 def _add_spring_products_of_one(x, p, y, springs, along, across):
     """The same arithmetic on a single environment, (particles, 3)."""
     ends, rest_length, kind, weight = springs
-    one, zero = x.dtype.type(1), x.dtype.type(0)
+    one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
         ux, uy, uz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
-        q = one / np.sqrt(dx * dx + dy * dy + dz * dz)
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         stretched = one - rest_length[s] * q
         aside = weight[s] * across[kind[s]] * (stretched if stretched > zero else zero)
         g = (weight[s] * along[kind[s]] - aside) * (ux * dx + uy * dy + uz * dz) * q * q

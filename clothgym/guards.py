@@ -80,12 +80,18 @@ def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_ste
             return
 
 
-def refuse_figures(integrator: Integrator, before: NDArray, after: NDArray) -> None:
-    """Refuse material figures that an integrator cannot have; before, after: (num_envs, figures).
+def refuse_figures(integrator: Integrator, mesh: ClothMesh, before: NDArray, after: NDArray) -> None:
+    """Refuse material figures that an integrator or a mesh cannot have; before, after: (num_envs, figures).
 
     Raises:
-        ValueError: a figure that means nothing to it has changed, or one that enters its matrix differs between environments.
+        ValueError: a figure that means nothing to them has changed, or one that enters a matrix differs between environments.
     """
+    shear = FIGURES.index("shear_stiffness")
+    if mesh.shape is None and not np.array_equal(after[:, shear], before[:, shear]):
+        raise ValueError(
+            "shear_stiffness means nothing on a triangle mesh: its edges have one stiffness, and its shear modulus follows from "
+            "stretch_stiffness and Poisson's ratio 1/3; change that, or take a grid"
+        )
     for column, name in enumerate(FIGURES):
         if name in integrator.ignored and not np.array_equal(after[:, column], before[:, column]):
             raise ValueError(refusal(integrator, name))

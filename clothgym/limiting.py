@@ -2,8 +2,12 @@
 
 A sweep goes over the springs: of one that is too long, two free ends move equally, one free end moves alone, and two held ones
 stay.  One sweep is not enough, for each correction stretches the neighbours: sweeps go on until no spring is ``TOLERANCE`` beyond
-the threshold, or ``SWEEPS`` are done; what is then left is reported.  In the same visit, the ends of a spring at its limit lose the
-velocity with which they part, by an impulse between their masses: that takes kinetic energy and can never add any.
+the threshold, or ``SWEEPS`` are done; what is left at the end of the control step, after contact has had its say, is reported.  In
+the same visit, the ends of a spring at its limit lose the velocity with which they part, by an impulse between their masses: that
+takes kinetic energy and can never add any.
+
+Equal moves of unequal masses, as a sheet's border has, shift the centre of mass and take spin from a free sheet: that is Provot's
+rule, not a law of mechanics.
 """
 
 from __future__ import annotations
@@ -14,11 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
+from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
 TOLERANCE = 0.005
 SWEEPS = 100
 BEFORE, AFTER, USED = 0, 1, 2
+
+
+def checked_limit(value: float | None) -> float | None:
+    """A limit on strain, or None.
+
+    Raises:
+        ValueError: a value that is not positive, or so large that per cent were meant.
+    """
+    if value is None:
+        return None
+    if isinstance(value, (bool, np.bool_)) or positive("strain_limit", value) > 1:
+        raise ValueError(f"strain_limit={value!r}: must be above 0 and at most 1; a tenth is 0.1")
+    return float(value)
 
 
 class Limiting(NamedTuple):
@@ -57,8 +75,9 @@ def limit_strain(x, v, w, springs, limit, report):
 
 
 @kernel
-def no_limit(x, v, w, springs, limit, report):
-    """Leave the springs as they are."""
+def measure_strain(x, springs, report):
+    """What is left at the end of a control step, after contact, which knows nothing of the limit."""
+    _largest_strain(x, springs, report[AFTER])
 
 
 @kernel
@@ -113,3 +132,20 @@ def _sweep(x, v, w, springs, limit, enough, largest):
                 vj[0, l] -= wj[l] * impulse * nx
                 vj[1, l] -= wj[l] * impulse * ny
                 vj[2, l] -= wj[l] * impulse * nz
+
+
+@kernel
+def no_limit(x, v, w, springs, limit, report):
+    """Leave the springs as they are."""
+
+
+@kernel
+def no_measure(x, springs, report):
+    """Nothing to measure."""
+
+
+# the names that the main loop calls, without a limit and with one
+KERNELS = {
+    False: {"restrain": no_limit, "remeasure": no_measure},
+    True: {"restrain": limit_strain, "remeasure": measure_strain},
+}

@@ -57,10 +57,14 @@ class Material:
     @staticmethod
     def preset(name: str, **changes: float) -> Material:
         """A measured fabric by name, with some figures changed if wanted: ``Material.preset("cotton", density=0.2)``."""
-        if name not in PRESETS:
+        if not isinstance(name, str) or name not in PRESETS:
             near = difflib.get_close_matches(str(name), PRESETS, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"no material preset {name!r}{hint} (there are: {', '.join(PRESETS)})")
+        known = [field.name for field in fields(Material)]
+        for figure in changes:
+            if figure not in known:
+                raise ValueError(f"no material figure {figure!r} (there are: {', '.join(known)})")
         return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
 
 
@@ -139,7 +143,7 @@ def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: ND
     k[SHEAR] = shear * d2 / (2 * a * b)
     c11 = (stretch + np.sqrt(stretch**2 + 4 * shear**2)) / 2
     for structural, skip, along, across in ((STRUCTURAL_X, BEND_X, a, b), (STRUCTURAL_Y, BEND_Y, b, a)):
-        # energy of skip springs per area, k kappa^4 along^3 / (32 across), equals B kappa^2 / 2 at kappa = 1 / (2 along)
+        # energy of skip springs per area, k kappa^4 along^5 / (32 across), equals B kappa^2 / 2 at kappa = 1 / (2 along)
         k[skip] = 64 * bend * across / along**3
         k[structural] = (c11 - 2 * k[SHEAR] * along**3 / (across * d2)) * across / along - 4 * k[skip]
     if np.any(k < 0):

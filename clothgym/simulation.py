@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit, guards, integrators
+from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, spread, vector
@@ -22,11 +22,11 @@ from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
-from clothgym.limiting import Limiting, limit_strain, no_limit
+from clothgym.limiting import Limiting, checked_limit
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
-from clothgym.state import Elastic, Fabric, Layout, State, View, at_rest, element_arrays, surface_arrays
+from clothgym.state import Elastic, Fabric, Layout, State, View, at_rest, check_fits, digest_of, element_arrays, surface_arrays
 
 GRAVITY = 9.81
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
@@ -51,6 +51,7 @@ def advance(
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
             resolve(x[b], v[b], w[b], kinds, colliders[b], h, carried, contact)
+        remeasure(x[b], elements.springs, limited[b])  # noqa: F821
         mark_diverged(x[b], v[b], diverged[b])
 
 
@@ -58,8 +59,7 @@ def advance(
 def _compiled(substep: Any, name: str, model: Bending, limits: bool) -> Any:
     """The main loop around an integrator's substep, in which the model's kernels bend."""
     bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", **model.kernels)
-    restrain = limit_strain if limits else no_limit
-    return specialize(advance, f"advance_{name}_{model.name}_{limits}", substep=bound, restrain=restrain)
+    return specialize(advance, f"advance_{name}_{model.name}_{limits}", substep=bound, **limiting.KERNELS[limits])
 
 
 class Simulation:
@@ -120,7 +120,7 @@ class Simulation:
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
         self.threads = count("threads", threads) if threads is not None else _jit.default_threads()
-        self.strain_limit = positive("strain_limit", strain_limit) if strain_limit is not None else None
+        self.strain_limit = checked_limit(strain_limit)
         self.on_divergence = on_divergence
         self.bending = model_of(bending, mesh)
         self.mesh = mesh
@@ -134,16 +134,14 @@ class Simulation:
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
-        self.colliders = tuple(colliders)
-        self._kinds = np.array([c.kind for c in self.colliders], np.int64)
+        self.colliders, self._kinds = tuple(colliders), np.array([c.kind for c in colliders], np.int64)
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
-        self._surface = surface_arrays(mesh, self.dtype)
+        self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged)
         self._advance = _compiled(self.integrator.substep, self.integrator.name, self.bending, strain_limit is not None)
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
         self._planned_substeps = 0
-
         self.set_state(
             at_rest(
                 mesh,
@@ -154,15 +152,16 @@ class Simulation:
                 gravity=vector("gravity", gravity),
                 wind=vector("wind", wind),
                 colliders=np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS),
+                sheet=self._sheet,
             )
         )
         self._apply_parameters(np.arange(self.num_envs))
         self.reset()
         if substeps == "auto":
             self.substeps = guards.automatic_substeps(self.integrator, self._oscillators(0), self.time_step)
-        else:
-            self.substeps = count("substeps", substeps, "'auto' or ")
-            self._warn_if_beyond_bound(np.arange(1))
+            return
+        self.substeps = count("substeps", substeps, "'auto' or ")
+        self._warn_if_beyond_bound(np.arange(1))
 
     # --- time -----------------------------------------------------------------------------------------------------------
 
@@ -207,8 +206,8 @@ class Simulation:
 
     def _oscillators(self, env: int) -> Oscillators:
         """What decides on an environment's substep."""
-        place = divmod(env, self.layout.lanes)
-        return guards.oscillators(self.mesh, self._exact_elements, self.bending, self._fabric, self._free_w, *place)
+        sheet = self.mesh, self._exact_elements, self.bending
+        return guards.oscillators(*sheet, self._fabric, self._free_w, *divmod(env, self.layout.lanes))
 
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
@@ -338,6 +337,7 @@ class Simulation:
         self._hands.begin(block, lane, self._x[block, :, :, lane])
         self._steps[env] = 0
         self._diverged[block, lane] = False
+        self._limited[block, :, lane] = 0
         self._reported[env] = False
         self._apply_masses(block, lane)
 
@@ -354,7 +354,7 @@ class Simulation:
         after = self._parameters.copy()
         after[env], fields = changed(self.material, after[env], figures)
         fabric_rows(self.mesh, after[env], self.bending.hinged, self.air_density)
-        guards.refuse_figures(self.integrator, self._parameters, after)
+        guards.refuse_figures(self.integrator, self.mesh, self._parameters, after)
         self._parameters = after
         for name, value in fields.items():
             getattr(self._fabric, name)[block, :, lane] = value
@@ -393,6 +393,8 @@ class Simulation:
             colliders=public(self._colliders),
             collider_homes=public(self._collider_homes),
             steps=self._steps.copy(),
+            diverged=self.diverged,
+            sheet=self._sheet,
         )
 
     def set_state(self, state: State) -> None:
@@ -401,9 +403,9 @@ class Simulation:
         Raises:
             ValueError: the state does not fit; nothing is changed then.
         """
-        state.check_fits(
-            self.num_envs, self.mesh.num_particles, self._hands.members, len(self.anchors), len(self.grippers), len(self.colliders)
-        )
+        counts = len(self.anchors), len(self.grippers), len(self.colliders)
+        check_fits(state, self.num_envs, self.mesh.num_particles, self._hands.members, *counts, self._sheet)
+        guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
@@ -417,8 +419,8 @@ class Simulation:
         self._w = self._free_w.copy()
         self._planned_substeps = 0
         self._limited = np.zeros((self.layout.blocks, 3, self.layout.lanes), dtype)
-        self._diverged = np.zeros((self.layout.blocks, self.layout.lanes), bool)
-        self._reported = np.zeros(self.num_envs, bool)
+        self._diverged = blocks(state.diverged, np.dtype(bool))
+        self._reported = self.diverged
         self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------

@@ -7,6 +7,8 @@ rest length shared by all of them, so that nothing is gathered and any integrato
 
 from __future__ import annotations
 
+import hashlib
+import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -143,6 +145,8 @@ class State:
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
         steps: control steps since the environment's reset, (num_envs,).
+        diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
+        sheet: digest of the mesh and of what bends, the same for all, ().
     """
 
     positions: NDArray
@@ -165,40 +169,54 @@ class State:
     colliders: NDArray
     collider_homes: NDArray
     steps: NDArray
+    diverged: NDArray
+    sheet: NDArray
 
     def save(self, path: str | Path) -> None:
         """Write as ``npz`` without pickle."""
         np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
-
-    def check_fits(self, num_envs: int, particles: int, held: NDArray, anchors: int, grippers: int, colliders: int) -> None:
-        """Refuse to go on in a simulation of another size; held: its anchored particles.
-
-        Raises:
-            ValueError: what differs.
-        """
-        if self.positions.shape != (num_envs, particles, 3):
-            here = f"this simulation (num_envs, particles, 3) = {(num_envs, particles, 3)}"
-            raise ValueError(f"the state holds positions of shape {self.positions.shape}, {here}")
-        if not np.array_equal(self.anchors, np.tile(held, (num_envs, 1))):
-            raise ValueError(f"the state has anchors {self.anchors[0].tolist()}, this simulation {held.tolist()}")
-        if self.hand_positions.shape[1] != anchors + grippers:
-            here = f"{anchors} anchors and {grippers} grippers"
-            raise ValueError(f"the state has {self.hand_positions.shape[1]} hands, this simulation {here}")
-        if self.colliders.shape[1] != colliders:
-            raise ValueError(f"the state has {self.colliders.shape[1]} colliders, this simulation {colliders}")
 
     @staticmethod
     def load(path: str | Path) -> State:
         """Read what ``save`` wrote.
 
         Raises:
-            ValueError: the file misses arrays, for instance because another version wrote it.
+            ValueError: the file is no state, or misses arrays, for instance because another version wrote it.
         """
-        with np.load(path, allow_pickle=False) as file:
+        try:
+            loaded = np.load(path, allow_pickle=False)
+            loaded.files  # noqa: B018 - a single array has none
+        except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+            raise ValueError(f"{str(path)!r} is not a state: give a file that State.save wrote") from error
+        with loaded as file:
             missing = [field.name for field in fields(State) if field.name not in file]
             if missing:
                 raise ValueError(f"{str(path)!r} is not a state of this version of clothgym: it lacks {', '.join(missing)}")
             return State(**{field.name: file[field.name] for field in fields(State)})
+
+
+def check_fits(
+    state: State, num_envs: int, particles: int, held: NDArray, anchors: int, grippers: int, colliders: int, sheet: NDArray
+) -> None:
+    """Refuse to go on in another simulation; held: its anchored particles.
+
+    Raises:
+        ValueError: what differs.
+    """
+    if not isinstance(state, State):
+        raise ValueError(f"state={state!r}: must be what get_state() gave, or State.load(path)")
+    if state.positions.shape != (num_envs, particles, 3):
+        here = f"this simulation (num_envs, particles, 3) = {(num_envs, particles, 3)}"
+        raise ValueError(f"the state holds positions of shape {state.positions.shape}, {here}")
+    if not np.array_equal(state.anchors, np.tile(held, (num_envs, 1))):
+        raise ValueError(f"the state has anchors {state.anchors[0].tolist()}, this simulation {held.tolist()}")
+    if state.hand_positions.shape[1] != anchors + grippers:
+        here = f"{anchors} anchors and {grippers} grippers"
+        raise ValueError(f"the state has {state.hand_positions.shape[1]} hands, this simulation {here}")
+    if state.colliders.shape[1] != colliders:
+        raise ValueError(f"the state has {state.colliders.shape[1]} colliders, this simulation {colliders}")
+    if not np.array_equal(state.sheet, sheet):
+        raise ValueError("the state is of a sheet of another shape or size, or of another bending model than this simulation's")
 
 
 def at_rest(
@@ -210,6 +228,7 @@ def at_rest(
     gravity: NDArray,
     wind: NDArray,
     colliders: NDArray,
+    sheet: NDArray,
 ) -> State:
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
@@ -241,6 +260,8 @@ def at_rest(
         colliders=each(colliders),
         collider_homes=each(colliders),
         steps=np.zeros(num_envs, np.int64),
+        diverged=np.zeros(num_envs, bool),
+        sheet=sheet,
     )
 
 
@@ -260,6 +281,14 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, by_particle: 
     curves = np.sqrt(h.weight)[used, None] * h.slopes[used]
     bends = BendArrays(h.particles[used], h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype), curves.astype(dtype))
     return Elements(springs, bends)
+
+
+def digest_of(mesh: ClothMesh, hinged: bool) -> NDArray[np.uint64]:
+    """What tells one sheet, with what bends it, from another."""
+    digest = hashlib.sha256(bytes([hinged]))
+    for array in (mesh.rest_positions, mesh.triangles, *mesh.springs, *mesh.hinges):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return np.frombuffer(digest.digest()[:8], np.uint64)[0].reshape(())
 
 
 def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:

@@ -180,6 +180,41 @@ def test_core_lanes_of_different_fabrics(name, dtype):
         assert np.array_equal(alone.positions[0], batch.positions[lane])
 
 
+@pytest.mark.parametrize(
+    ("name", "bending", "limit"),
+    [
+        ("semi_implicit_euler", "hinge", 0.02),
+        ("implicit_euler", "quadratic", None),
+        ("projective_dynamics", "quadratic", None),
+        ("xpbd", "hinge", None),
+    ],
+)
+def test_lanes_that_bend_and_are_limited(name, bending, limit):
+    """Each lane has another start, so that it needs other sweeps and iterations than its neighbours; restored in mid-run, too."""
+    mesh = grid(6, 6, 0.3, 0.3)
+    world = {
+        "integrator": name, "bending": bending, "strain_limit": limit, "anchors": [0],
+        "substeps": CORE_SUBSTEPS.get(name, 150),
+    }  # fmt: skip
+    starts = mesh.rest_positions * np.linspace(0.9, 1.1, 7)[:, None, None]
+    starts = starts + np.random.default_rng(0).normal(scale=1e-3, size=(7, 36, 3))
+    batch = Simulation(mesh, num_envs=7, threads=1, **world)
+    batch.reset(positions=starts)
+    batch.step(4)
+    middle = batch.get_state()
+    batch.step(4)
+    other = Simulation(mesh, num_envs=7, threads=1, **world)
+    other.set_state(middle)
+    other.step(4)
+    assert np.array_equal(other.positions, batch.positions) and not batch.diverged.any()
+    for lane in (0, 6):
+        alone = Simulation(mesh, **world)
+        alone.reset(positions=starts[lane])
+        alone.step(8)
+        assert np.array_equal(alone.positions[0], batch.positions[lane])
+        assert limit is None or np.array_equal(np.array(alone.limiting)[:, 0], np.array(batch.limiting)[:, lane])
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_core_state_and_threads(name):
     """Saved in mid-run and restored elsewhere, with an anchor let go; on one thread and on two."""

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from clothgym import Material, Plane, Simulation, disc, grid
+from clothgym import INTEGRATORS, Material, Plane, Simulation, State, disc, grid
 from clothgym.forces import frequency_bound, largest_frequency
 
 MESH = grid(5, 5, 0.2, 0.2)
@@ -156,3 +156,63 @@ def test_too_few_substeps_for_a_triangle_mesh_warn_with_the_number_that_would_do
     enough = Simulation(mesh, bending="hinge").substeps
     with pytest.warns(UserWarning, match=f"substeps={enough}"):
         Simulation(mesh, bending="hinge", substeps=2)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_a_sheet_may_begin_folded_on_itself(name):
+    """Springs of no length have no direction: they must not pull anywhere, and above all not make numbers that are none."""
+    sheet = grid(5, 5, 0.2, 0.2)
+    folded = sheet.rest_positions * (1, 1, 1)
+    folded[:, 0] = -np.abs(folded[:, 0])
+    simulation = Simulation(sheet, integrator=name, anchors=[0], substeps=200, on_divergence="raise")
+    simulation.reset(positions=folded)
+    simulation.step(10)
+    assert simulation.strain().max() < 0.2
+
+
+def test_forces_that_are_not_finite_are_seen_through_conjugate_gradients():
+    simulation = Simulation(MESH, num_envs=2, integrator="implicit_euler", anchors=[0], on_divergence="ignore")
+    simulation._fabric.stiffness[0, :, 1] = np.nan
+    simulation.step()
+    assert simulation.diverged.tolist() == [False, True]
+
+
+def test_divergence_is_part_of_the_state():
+    simulation = batch(factor=1000.0, on_divergence="ignore")
+    simulation.step(5)
+    other = Simulation(MESH, num_envs=5, anchors=[0, 4], on_divergence="raise")
+    other.set_state(simulation.get_state())
+    assert other.diverged.tolist() == [False, False, True, False, False]
+    other.step()  # what was known before is not told again
+
+
+@pytest.mark.parametrize(
+    ("state", "told"),
+    [
+        (lambda: Simulation(grid(5, 5, 2.0, 2.0), anchors=[0]).get_state(), "another shape or size"),
+        (lambda: Simulation(MESH, anchors=[0], bending="hinge").get_state(), "another bending model"),
+        (lambda: None, "must be what get_state"),
+    ],
+)
+def test_a_state_of_another_sheet_is_refused(state, told):
+    with pytest.raises(ValueError, match=told):
+        Simulation(MESH, anchors=[0]).set_state(state())
+
+
+def test_a_matrix_for_all_refuses_a_state_of_many_fabrics():
+    many = Simulation(MESH, num_envs=2)
+    many.set_parameters(stretch_stiffness=[100.0, 200.0])
+    with pytest.raises(ValueError, match="factorises one matrix"):
+        Simulation(MESH, num_envs=2, integrator="projective_dynamics").set_state(many.get_state())
+
+
+def test_a_file_that_is_no_state_is_named(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("not arrays")
+    with pytest.raises(ValueError, match="notes.txt.*State.save"):
+        State.load(path)
+
+
+def test_shear_means_nothing_on_triangles():
+    with pytest.raises(ValueError, match="stretch_stiffness and Poisson's ratio"):
+        Simulation(disc(0.1, 2)).set_parameters(shear_stiffness=3.0)

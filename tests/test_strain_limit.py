@@ -7,7 +7,7 @@ import pytest
 from conftest import line_mesh
 from equilibria import G, sheet_network, strains
 
-from clothgym import Material, Simulation, grid
+from clothgym import Material, Simulation, Sphere, grid
 from clothgym.limiting import AFTER, BEFORE, TOLERANCE, USED, limit_strain
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y
 from clothgym.state import element_arrays
@@ -150,3 +150,28 @@ def test_a_limited_sheet_s_energy_never_exceeds_what_it_began_with(integrator):
         simulation.step()
         totals.append(simulation.energy().total[0] - start)
     assert max(totals) < 1e-4 * 0.1 * G
+
+
+def test_what_contact_leaves_is_what_is_reported():
+    """Contact comes after limiting and knows nothing of it: the report is of the strain that everybody can see."""
+    mesh = grid(9, 9, 0.3, 0.3)
+    solids = [Sphere(center=(0, 0, -0.2), radius=0.1)]
+    simulation = Simulation(mesh, strain_limit=0.05, colliders=solids, substeps=20, dtype="float64")
+    simulation.reset(velocities=(0, 0, -6.0))
+    worst = 0.0
+    for _ in range(3):
+        simulation.step()
+        x, springs = simulation.positions[0], mesh.springs
+        ends = x[springs.particles[springs.kind <= SHEAR]]
+        seen = np.max(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / springs.rest_length[springs.kind <= SHEAR]) - 1
+        assert simulation.limiting.after[0] == pytest.approx(seen, rel=1e-9)
+        worst = max(worst, seen)
+    assert worst > 0.05 + 2 * TOLERANCE  # or contact had nothing to say
+    simulation.reset()
+    assert not np.any(simulation.limiting)
+
+
+@pytest.mark.parametrize("limit", [0, -0.1, 10, True, np.nan])
+def test_limits_that_make_no_sense_are_named(limit):
+    with pytest.raises(ValueError, match="strain_limit"):
+        Simulation(grid(3, 3, 0.1, 0.1), strain_limit=limit)

@@ -106,8 +106,9 @@ class Integrator:
                 known = f"has only {', '.join(self.options)}" if self.options else "has none"
                 raise ValueError(f"{self.name} has no option {name!r}: it {known}")
             whole = isinstance(self.options[name], int)
-            if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-                raise ValueError(f"{self.name}: {name}={value!r} must be a number")
+            numeric = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, (bool, np.bool_))
+            if not numeric or not np.isfinite(value):
+                raise ValueError(f"{self.name}: {name}={value!r} must be a finite number")
             if whole and (value != int(value) or value < 1):
                 raise ValueError(f"{self.name}: {name}={value!r} must be an integer of at least 1")
             if not whole and not 0 <= value <= 1:
@@ -173,3 +174,25 @@ def move_on(x, v, start, h):
             xc, vc, sc = x[p, c], v[p, c], start[p, c]
             for l in range(x.shape[2]):
                 xc[l] = sc[l] + h * vc[l]
+
+
+@kernel
+def weigh(w, total, r, h):
+    """``r <- h r - M total`` for free particles and zero for held ones: what is left of the backward Euler equations [N s]."""
+    zero = r.dtype.type(0)
+    for p in range(r.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            rc, tc = r[p, c], total[p, c]
+            for l in range(r.shape[2]):
+                rc[l] = h * rc[l] - tc[l] / wp[l] if wp[l] > zero else zero
+
+
+@kernel
+def add_to(a, b):
+    """``a <- a + b``."""
+    for p in range(a.shape[0]):
+        for c in range(3):
+            ac, bc = a[p, c], b[p, c]
+            for l in range(a.shape[2]):
+                ac[l] += bc[l]

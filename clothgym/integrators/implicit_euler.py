@@ -25,7 +25,7 @@ import numpy as np
 from clothgym._jit import kernel
 from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
-from clothgym.integrators.base import SCRATCH, Integrator, move_on, predict_velocities
+from clothgym.integrators.base import SCRATCH, Integrator, add_to, move_on, predict_velocities, weigh
 
 GRAVITY = 9.81
 LOST = 0.02
@@ -43,28 +43,6 @@ def largest_substep(o: Oscillators) -> tuple[float, str]:
 def surely_allowed(o: Oscillators) -> float:
     """Any: it is taken for its large steps, and nobody need be warned of them."""
     return float("inf")
-
-
-@kernel
-def weigh(w, total, r, h):
-    """``r <- h r - M total`` for free particles and zero for held ones: what is left of the backward Euler equations [N s]."""
-    zero = r.dtype.type(0)
-    for p in range(r.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            rc, tc = r[p, c], total[p, c]
-            for l in range(r.shape[2]):
-                rc[l] = h * rc[l] - tc[l] / wp[l] if wp[l] > zero else zero
-
-
-@kernel
-def add_to(a, b):
-    """``a <- a + b``."""
-    for p in range(a.shape[0]):
-        for c in range(3):
-            ac, bc = a[p, c], b[p, c]
-            for l in range(a.shape[2]):
-                ac[l] += bc[l]
 
 
 @kernel
@@ -163,6 +141,9 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
             step[l] = zero
         d[:] = 0
         p[:] = 0
+        for l in range(lanes):
+            if not rho[l] < np.inf:
+                d[0, 0, l] = rho[l]  # forces that are not finite must be seen: the loop below would take them for solved
         for _ in range(iterations):
             going = False
             for l in range(lanes):

@@ -26,8 +26,7 @@ from clothgym._jit import kernel
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
-from clothgym.integrators.base import SCRATCH, Integrator, Preparation, move_on, predict_velocities
-from clothgym.integrators.implicit_euler import add_to, weigh
+from clothgym.integrators.base import SCRATCH, Integrator, Preparation, add_to, move_on, predict_velocities, weigh
 
 # h w of the stiffest mode up to which ten iterations come near enough to the fixed point (see docs/physics.md)
 STIFFEST = 4.0
@@ -39,7 +38,7 @@ def largest_substep(o: Oscillators) -> tuple[float, str]:
     stiff = STIFFEST / largest_frequency(o)
     if swinging < stiff:
         return swinging, why
-    return stiff, "beyond it ten iterations leave the sheet sluggish (it is never unstable)"
+    return stiff, "beyond it some ten iterations leave the sheet sluggish (it is never unstable)"
 
 
 def surely_allowed(o: Oscillators) -> float:
