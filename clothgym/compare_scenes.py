@@ -200,7 +200,6 @@ SCENES: dict[str, Scene] = {
             altitude=0.32,
             bending="hinge",
             variants={"skip springs": {"bending": "springs"}},
-            settled=True,
         ),
         Scene(
             name="free_spin",
