@@ -45,6 +45,9 @@ def project_springs(x, start, w, springs, compliance, damping, row):
     the substep, whose difference to ``x`` is the velocity that the damper sees.  row: scratch, (3, lanes): with as many rows to
     read as here, simple loops are faster than one that writes where it reads.
     """
+    if x.shape[2] == 1:
+        _project_springs_of_one(x[:, :, 0], start[:, :, 0], w[:, 0], springs, compliance[:, 0], damping[0])
+        return
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
@@ -70,6 +73,30 @@ def project_springs(x, start, w, springs, compliance, damping, row):
                 xi[c, l] += wi[l] * row[c, l]
             for l in range(x.shape[2]):
                 xj[c, l] -= wj[l] * row[c, l]
+
+
+@kernel
+def _project_springs_of_one(x, start, w, springs, compliance, damping):
+    """The same arithmetic on a single environment, (particles, 3)."""
+    ends, rest_length, kind, weight = springs
+    one = x.dtype.type(1)
+    tiny = x.dtype.type(1e-12)
+    for s in range(ends.shape[0]):
+        i = ends[s, 0]
+        j = ends[s, 1]
+        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+        ux, uy, uz = dx - (start[j, 0] - start[i, 0]), dy - (start[j, 1] - start[i, 1]), dz - (start[j, 2] - start[i, 2])
+        d2 = dx * dx + dy * dy + dz * dz + tiny
+        flexible = one / weight[s]
+        push = d2 - rest_length[s] * np.sqrt(d2) + damping * (ux * dx + uy * dy + uz * dz)
+        lam = push / (d2 * ((one + damping) * (w[i] + w[j]) + flexible * compliance[kind[s]]))
+        fx, fy, fz = lam * dx, lam * dy, lam * dz
+        x[i, 0] += w[i] * fx
+        x[i, 1] += w[i] * fy
+        x[i, 2] += w[i] * fz
+        x[j, 0] -= w[j] * fx
+        x[j, 1] -= w[j] * fy
+        x[j, 2] -= w[j] * fz
 
 
 @kernel
