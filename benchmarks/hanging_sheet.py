@@ -5,7 +5,6 @@
     python benchmarks/hanging_sheet.py --only ours        # one section only: ours, mujoco, static or drape
     python benchmarks/hanging_sheet.py --again            # times once more and keeps the faster time, on a machine that is shared
     python benchmarks/hanging_sheet.py --fresh            # measures anew, about six minutes
-    python benchmarks/hanging_sheet.py --only yardstick --yardstick PATH/spring_loop.py
 
 A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighbouring corners are held; there is
 neither contact nor air.  The error is the rms distance over particles, at the end, from the same simulator's converged run, so
@@ -14,21 +13,19 @@ batch are summed over its environments.  Sections of ``results/hanging_sheet.jso
 
 * ours, mujoco: error [mm] and frames/s; claim: beside each setting of MuJoCo, our fastest setting that errs no more;
 * static: stretch under its own weight of a sheet held along one edge, over that of the converged run, minus one;
-* drape: error of ClothDrape-v0's sheet and control step, by substeps; it should not exceed 5 mm per metre of sheet;
-* yardstick: cost of a control step over that of bare spring passes (springs x substeps), timed in turns.
+* drape: error of ClothDrape-v0's sheet and control step, by substeps; it should not exceed 5 mm per metre of sheet.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import statistics
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -48,7 +45,7 @@ from matplotlib import pyplot as plt
 Row = dict[str, Any]
 
 RESULT = Path(__file__).parent / "results" / "hanging_sheet.json"
-SECTIONS = ("ours", "mujoco", "static", "drape", "yardstick")
+SECTIONS = ("ours", "mujoco", "static", "drape")
 ROWS, SIDE, FRAME, FRAMES = 25, 1.0, 1 / 60, 30  # [m], [s]
 ENOUGH = 1.5  # seconds of frames whose median counts
 SHEET = grid(ROWS, ROWS, SIDE, SIDE)
@@ -212,40 +209,6 @@ def measure_drape(substeps: int) -> Row:
     return {"error_mm": error, "error_mm_per_m": error / DrapeTask.physics.mesh.size[0]}
 
 
-def load(path: Path) -> Any:
-    """The yardstick's file as a module."""
-    spec = importlib.util.spec_from_file_location("yardstick", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def against_yardstick(loop: Any, method: str, damping_time: float, lanes: int, substeps: int = 40, rounds: int = 40) -> Row:
-    """Cost of a control step, and of the yardstick's pass that fits the method, per spring and environment [ns]."""
-    f4 = np.float32
-    x, ends = loop.sheet(ROWS)
-    rest = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1).astype(f4)
-    x = np.repeat(x[:, :, None], lanes, 2) + np.random.default_rng(0).normal(scale=1e-3, size=(len(x), 3, lanes)).astype(f4)
-    row = np.ones(lanes, f4)
-    if method == EULER:
-        line, fn = "force and damping", loop.force_pass
-        args = (x, np.zeros_like(x), np.zeros_like(x), ends, rest, f4(1e-6), f4(1e-6), np.zeros((3, lanes), f4))
-    else:
-        line, fn = "xpbd, own parameters", loop.project_own
-        args = (x, np.ones((len(x), lanes), f4), ends, rest, row, row * f4(0.05))
-    s = simulation(method, damping_time, substeps, num_envs=lanes)
-    s.step()
-    fn(*args)
-    passes, steps = [], []
-    for _ in range(rounds):
-        passes.append(sum(timed(lambda: fn(*args), substeps)) / substeps)
-        steps += timed(s.step, 1)
-    springs = lanes * len(SHEET.springs.kind)
-    ours, bare = statistics.median(steps) / (substeps * springs) * 1e9, statistics.median(passes) / (lanes * len(ends)) * 1e9
-    return {"line": line, "step_ns": ours, "pass_ns": bare, "ratio": ours / bare}
-
-
 def claims(results: Row) -> list[Row]:
     """For each of MuJoCo's settings our fastest that errs no more, in a batch and alone."""
     rows = []
@@ -308,7 +271,6 @@ def main() -> None:
     parser.add_argument("--only", choices=SECTIONS, help="one section")
     parser.add_argument("--fresh", action="store_true", help="measure again what is there")
     parser.add_argument("--again", action="store_true", help="time again, and keep the faster time of each case")
-    parser.add_argument("--yardstick", type=Path, help="a spring_loop.py with bare spring passes; no such section without it")
     args = parser.parse_args()
     RESULT.parent.mkdir(exist_ok=True)
     about = machine()
@@ -323,10 +285,6 @@ def main() -> None:
         "static": [(measure_static, setting) for setting in OURS],
         "drape": [(measure_drape, {"substeps": substeps}) for substeps in DRAPE_SUBSTEPS],
     }
-    if args.yardstick:
-        measure = partial(against_yardstick, load(args.yardstick))
-        kinds = ((EULER, DAMPED), (XPBD, 0.0), (XPBD, DAMPED))
-        cases["yardstick"] = [(measure, {"method": m, "damping_time": d, "lanes": lanes}) for lanes in LANES for m, d in kinds]
     for name in cases if args.only is None else cases.keys() & {args.only}:
         rows = results[name] = [] if args.fresh else results.get(name, [])
         for measure, key in cases[name]:
