@@ -79,6 +79,14 @@ def spread(name: str, value: NDArray, shape: tuple[int, ...]) -> NDArray:
         raise ValueError(f"{name} has shape {value.shape}: must be one value for all, or {shape}") from None
 
 
+def sheets(name: str, value: ArrayLike, shape: tuple[int, ...], *others: tuple[int, ...]) -> NDArray:
+    """Finite numbers of ``shape``, (envs, particles, 3), of its last two axes, or of one of the other shapes."""
+    array = finite(name, value)
+    if array.shape not in (shape, shape[1:], *others):
+        raise ValueError(f"{name} has shape {array.shape}: must be {shape} or {shape[1:]}")
+    return array
+
+
 def indices(name: str, value: ArrayLike, end: int, what: str) -> NDArray:
     """Integers from 0 to ``end - 1``, as a flat array."""
     array = np.atleast_1d(np.asarray(value))

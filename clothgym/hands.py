@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import kernel, specialize
+from clothgym._jit import kernel, run_spans, specialize
 from clothgym.bending import BEND_SCRATCH, Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.forces import add_air_forces, add_spring_forces
-from clothgym.state import Elements, Fabric, Layout, SurfaceArrays
+from clothgym.state import Elements, Fabric, Layout, State, SurfaceArrays
 
 # columns of what a kernel must know of each hand
 SPEED, FINGER_STEP, REACH2, SLIP2 = 0, 1, 2, 3
@@ -94,12 +94,24 @@ class Hands:
         self.can_slip = bool(np.isfinite(self.limits[:, SLIP2]).any())
         self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
 
-    def restore(self, x: NDArray, targets: NDArray, opening: NDArray, wanted: NDArray, holder: NDArray) -> None:
-        """Take over public arrays, (num_envs, ...)."""
+    def restore(self, state: State) -> None:
+        """Take over a state's part."""
         blocks, dtype = self.layout.to_blocks, self.limits.dtype
-        self.x, self.targets = blocks(x, dtype), blocks(targets, dtype)
-        self.opening, self.wanted = blocks(opening, dtype), blocks(wanted, dtype)
-        self.holder = blocks(holder, np.dtype(np.int16))
+        self.x, self.targets = blocks(state.hand_positions, dtype), blocks(state.hand_targets, dtype)
+        self.opening, self.wanted = blocks(state.openings, dtype), blocks(state.wanted_openings, dtype)
+        self.holder = blocks(state.holder, np.dtype(np.int16))
+
+    def public(self) -> dict[str, NDArray]:
+        """A state's part, as fresh copies."""
+        public = self.layout.to_public
+        return {
+            "anchors": np.repeat(self.members[None], self.layout.num_envs, axis=0),
+            "holder": public(self.holder),
+            "hand_positions": public(self.x),
+            "hand_targets": public(self.targets),
+            "openings": public(self.opening),
+            "wanted_openings": public(self.wanted),
+        }
 
     def begin(self, block: NDArray, lane: NDArray, particles: NDArray) -> None:
         """Put hands back: anchors hold their particles where these are, grippers are open and at home.
@@ -154,8 +166,6 @@ class Hands:
 
     def pulls(
         self,
-        first: int,
-        last: int,
         x: NDArray,
         v: NDArray,
         free_w: NDArray,
@@ -163,10 +173,16 @@ class Hands:
         bending: Bending,
         surface: SurfaceArrays,
         fabric: Fabric,
-        out: NDArray,
-    ) -> None:
-        """Force of the cloth on each hand [N], into (blocks, hands, 3, lanes)."""
-        _pulls_with(bending)(first, last, x, v, free_w, elements, surface, fabric, self.holder, out)
+        threads: int,
+    ) -> NDArray:
+        """Force of the cloth on each hand [N], (blocks, hands, 3, lanes)."""
+        out, add = np.empty_like(self.x), _pulls_with(bending)
+
+        def work(first: int, last: int) -> None:
+            add(first, last, x, v, free_w, elements, surface, fabric, self.holder, out)
+
+        run_spans(work, self.layout.blocks, threads)
+        return out
 
     def slip(self, pull: NDArray, w: NDArray, free_w: NDArray) -> None:
         """Let go of what pulls harder than its gripper can hold."""

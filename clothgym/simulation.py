@@ -15,18 +15,19 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
-from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, spread, vector
-from clothgym.collisions import ROWS, Collider, Contacts, check_replacement, contacts, resolve
-from clothgym.forces import Energy, Oscillators, add_air_forces, energy, structural_strain
+from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
+from clothgym.collisions import Collider, Solids, resolve
+from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
-from clothgym.limiting import Limiting, checked_limit
+from clothgym.limiting import checked_limit
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
+from clothgym.observed import Observed
 from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
-from clothgym.state import Elastic, Fabric, Layout, State, View, at_rest, check_fits, digest_of, element_arrays, surface_arrays
+from clothgym.state import Elastic, Fabric, Layout, State, at_rest, check_fits, digest_of, element_arrays, surface_arrays
 
 GRAVITY = 9.81
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
@@ -62,7 +63,7 @@ def _compiled(substep: Any, name: str, model: Bending, limits: bool) -> Any:
     return specialize(advance, f"advance_{name}_{model.name}_{limits}", substep=bound, **limiting.KERNELS[limits])
 
 
-class Simulation:
+class Simulation(Observed):
     """A batch of sheets of one mesh, each in a world of its own.
 
     Args:
@@ -134,7 +135,8 @@ class Simulation:
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
-        self.colliders, self._kinds = tuple(colliders), np.array([c.kind for c in colliders], np.int64)
+        self._solids = Solids(self.layout, colliders)
+        self.colliders = self._solids.colliders
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged)
@@ -151,7 +153,7 @@ class Simulation:
                 parameters=of_material(self.material),
                 gravity=vector("gravity", gravity),
                 wind=vector("wind", wind),
-                colliders=np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS),
+                colliders=self._solids.described(),
                 sheet=self._sheet,
             )
         )
@@ -178,8 +180,9 @@ class Simulation:
         def work(first: int, last: int) -> None:
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
-                first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric, self._kinds, self._colliders,
-                h, carried, self.substeps, air_every, options, self._plan, rows, limit, self._limited, self._diverged,
+                first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
+                self._solids.kinds, self._solids.rows, h, carried, self.substeps, air_every, options, self._plan, rows, limit,
+                self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
@@ -212,76 +215,6 @@ class Simulation:
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
 
-    # --- what can be seen -----------------------------------------------------------------------------------------------
-
-    @property
-    def positions(self) -> NDArray:
-        """[m], (num_envs, particles, 3); a fresh copy."""
-        return self.layout.to_public(self._x)
-
-    @property
-    def velocities(self) -> NDArray:
-        """[m/s], (num_envs, particles, 3); a fresh copy."""
-        return self.layout.to_public(self._v)
-
-    @property
-    def view(self) -> View:
-        """Positions, velocities and springs as the kernels see them; not a copy, and not to be written to."""
-        return View(self._x, self._v, self._elements.springs)
-
-    @property
-    def parameters(self) -> NDArray:
-        """Material figures of each environment, in the order of ``parameters.FIGURES``, (num_envs, figures); a fresh copy."""
-        return self._parameters.copy()
-
-    @property
-    def diverged(self) -> NDArray:
-        """Environments in which something was not finite, or faster than cloth can be, since their reset, (num_envs,)."""
-        return self.layout.to_public(self._diverged)
-
-    @property
-    def limiting(self) -> Limiting | None:
-        """What strain limiting did in the last control step; None without a ``strain_limit``."""
-        return None if self.strain_limit is None else Limiting(*self.layout.to_public(self._limited).T)
-
-    @property
-    def attached(self) -> NDArray:
-        """Whether each anchor holds its particle, (num_envs, anchors); a fresh copy."""
-        return self._hands.attached()
-
-    @property
-    def hand_positions(self) -> NDArray:
-        """Where each anchor and then each gripper is [m], (num_envs, hands, 3); a fresh copy."""
-        return self.layout.to_public(self._hands.x)
-
-    def pulls(self) -> NDArray:
-        """Force with which the cloth pulls at each anchor and then each gripper [N], (num_envs, hands, 3): the springs',
-        the weight's and the air's on the particles that it holds; not what accelerates these."""
-        return self.layout.to_public(self._pulls())
-
-    def _pulls(self) -> NDArray:
-        out = np.empty_like(self._hands.x)
-
-        def work(first: int, last: int) -> None:
-            self._hands.pulls(
-                first, last, self._x, self._v, self._free_w, self._elements, self.bending, self._surface, self._fabric, out
-            )
-
-        _jit.run_spans(work, self.layout.blocks, self.threads)
-        return out
-
-    def strain(self) -> NDArray:
-        """Stretch over rest length, minus one, of the structural springs (threads or edges), (num_envs, those springs)."""
-        return structural_strain(self.mesh, self.positions)
-
-    def energy(self) -> Energy:
-        """Kinetic, elastic and gravitational energy [J], in float64."""
-        return energy(self._exact_elements, self.bending, self.get_state())
-
-    def contacts(self) -> Contacts:
-        """Signed distance of each particle to the nearest collider; negative would be inside."""
-        return contacts(self.layout, self._x, self._kinds, self._colliders)
-
     # --- what can be done -----------------------------------------------------------------------------------------------
 
     def move_anchors(self, targets: ArrayLike) -> None:
@@ -303,17 +236,15 @@ class Simulation:
 
     def _pairs(self, envs: ArrayLike | None, anchors: ArrayLike | None) -> tuple[NDArray, NDArray, NDArray]:
         """Block, lane and anchor of each pair."""
-        env = self._env_indices(envs)
+        env, count = self.layout.chosen(envs), self.anchors.size
         if anchors is None:
-            which = np.tile(np.arange(self.anchors.size), len(env))
-            env = np.repeat(env, self.anchors.size)
-        else:
-            which = spread("anchors", indices("anchors", anchors, self.anchors.size, "this simulation's anchors"), env.shape)
+            return (*self.layout.place(np.repeat(env, count)), np.tile(np.arange(count), len(env)))
+        which = spread("anchors", indices("anchors", anchors, count, "this simulation's anchors"), env.shape)
         return (*self.layout.place(env), which)
 
     def set_wind(self, wind: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Velocity of the air from now on [m/s], (len(envs), 3) or (3,)."""
-        env = self._env_indices(envs)
+        env = self.layout.chosen(envs)
         block, lane = self.layout.place(env)
         self._fabric.wind[block, :, lane] = spread("wind", finite("wind", wind), (len(env), 3))
 
@@ -323,17 +254,14 @@ class Simulation:
 
         positions, velocities: (len(envs), particles, 3), or one sheet for all, (particles, 3).
         """
-        env = self._env_indices(envs)
+        env = self.layout.chosen(envs)
         shape = (len(env), self.mesh.num_particles, 3)
-        x = self.mesh.rest_positions if positions is None else finite("positions", positions)
-        v = np.zeros(3) if velocities is None else finite("velocities", velocities)
-        for name, value in (("positions", x), ("velocities", v)):
-            if value.shape not in (shape, shape[1:], (3,)) or (name == "positions" and value.ndim < 2):
-                raise ValueError(f"{name} has shape {value.shape}: must be {shape} or {shape[1:]}")
+        x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
+        v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
         block, lane = self.layout.place(env)
         self._x[block, :, :, lane] = np.broadcast_to(x, shape)
         self._v[block, :, :, lane] = np.broadcast_to(v, shape)
-        self._colliders[block, :, :, lane] = self._collider_homes[block, :, :, lane]
+        self._solids.begin(block, lane)
         self._hands.begin(block, lane, self._x[block, :, :, lane])
         self._steps[env] = 0
         self._diverged[block, lane] = False
@@ -349,7 +277,7 @@ class Simulation:
         Raises:
             ValueError: an unknown name, or a value that ``Material`` would not take; nothing is changed then.
         """
-        env = self._env_indices(envs)
+        env = self.layout.chosen(envs)
         block, lane = self.layout.place(env)
         after = self._parameters.copy()
         after[env], fields = changed(self.material, after[env], figures)
@@ -366,32 +294,21 @@ class Simulation:
 
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
         """Put other solids of the same family (a plane, or any other) in place of collider ``index``, one an environment."""
-        env = self._env_indices(envs)
-        check_replacement(self.colliders, index, colliders, len(env))
-        block, lane = self.layout.place(env)
-        self._colliders[block, index, :, lane] = self._collider_homes[block, index, :, lane] = np.array(
-            [c.rows() for c in colliders]
-        )
+        self._solids.replace(index, colliders, *self.layout.place(self.layout.chosen(envs)))
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
     def get_state(self) -> State:
         """All that is needed to go on bit for bit, as fresh copies."""
-        public, hands = self.layout.to_public, self._hands
+        public = self.layout.to_public
         return State(
             positions=self.positions,
             velocities=self.velocities,
             free_inverse_mass=public(self._free_w),
-            anchors=np.repeat(hands.members[None], self.num_envs, axis=0),
-            holder=public(hands.holder),
-            hand_positions=public(hands.x),
-            hand_targets=public(hands.targets),
-            openings=public(hands.opening),
-            wanted_openings=public(hands.wanted),
+            **self._hands.public(),
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
-            colliders=public(self._colliders),
-            collider_homes=public(self._collider_homes),
+            **self._solids.public(),
             steps=self._steps.copy(),
             diverged=self.diverged,
             sheet=self._sheet,
@@ -410,11 +327,10 @@ class Simulation:
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
-        self._hands.restore(state.hand_positions, state.hand_targets, state.openings, state.wanted_openings, state.holder)
+        self._hands.restore(state)
+        self._solids.restore(state, dtype)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
-        self._colliders = blocks(state.colliders, dtype)
-        self._collider_homes = blocks(state.collider_homes, dtype)
         self._steps = np.array(state.steps, np.int64)
         self._w = self._free_w.copy()
         self._planned_substeps = 0
@@ -438,13 +354,3 @@ class Simulation:
     def _apply_masses(self, block: NDArray, lane: NDArray) -> None:
         """A held particle has no inverse mass: nothing but its hand moves it."""
         self._w[block, :, lane] = np.where(self._hands.holder[block, :, lane] >= 0, 0, self._free_w[block, :, lane])
-
-    def _env_indices(self, envs: ArrayLike | None) -> NDArray:
-        if envs is None:
-            return np.arange(self.num_envs)
-        index = np.atleast_1d(np.asarray(envs))
-        if index.dtype == bool:
-            if index.shape != (self.num_envs,):
-                raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
-            return np.flatnonzero(index)
-        return indices("envs", envs, self.num_envs, "this batch's environments")

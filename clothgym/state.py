@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from clothgym.checks import indices
 from clothgym.mesh import NUM_KINDS, SHEAR, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
@@ -127,6 +128,21 @@ class Layout(NamedTuple):
     def place(self, envs: NDArray) -> tuple[NDArray, NDArray]:
         """Block and lane of each environment."""
         return np.divmod(envs, self.lanes)
+
+    def chosen(self, envs: ArrayLike | None) -> NDArray:
+        """The environments that someone names: all of them, those of a mask, or by index.
+
+        Raises:
+            ValueError: there is no such environment, or the mask is not one of this batch.
+        """
+        if envs is None:
+            return np.arange(self.num_envs)
+        index = np.atleast_1d(np.asarray(envs))
+        if index.dtype == bool:
+            if index.shape != (self.num_envs,):
+                raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
+            return np.flatnonzero(index)
+        return indices("envs", envs, self.num_envs, "this batch's environments")
 
 
 @dataclass

@@ -22,6 +22,7 @@ FLOORS = {
     "clothgym.hands": 4,
     "clothgym.guards": 4,
     "clothgym.limiting": 4,
+    "clothgym.observed": 5,
     "clothgym.simulation": 5,
     "clothgym.render": 6,
     "clothgym.scenes": 6,

@@ -1,6 +1,7 @@
 """Floor 4: solids that the cloth touches, and what happens there."""
 
-from clothgym.collisions.response import Contacts, contacts, resolve
-from clothgym.collisions.shapes import ROWS, Box, Capsule, Collider, Plane, Sphere, check_replacement
+from clothgym.collisions.response import Contacts, resolve
+from clothgym.collisions.shapes import Box, Capsule, Collider, Plane, Sphere
+from clothgym.collisions.solids import Solids
 
-__all__ = ["ROWS", "Box", "Capsule", "Collider", "Contacts", "Plane", "Sphere", "check_replacement", "contacts", "resolve"]
+__all__ = ["Box", "Capsule", "Collider", "Contacts", "Plane", "Solids", "Sphere", "resolve"]

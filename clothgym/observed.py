@@ -1,0 +1,100 @@
+"""Floor 5: what can be seen of a simulation while it runs."""
+
+from __future__ import annotations
+
+from numpy.typing import NDArray
+
+from clothgym.bending import Bending
+from clothgym.collisions import Contacts, Solids
+from clothgym.forces import Energy, energy, structural_strain
+from clothgym.hands import Hands
+from clothgym.limiting import Limiting
+from clothgym.mesh import ClothMesh
+from clothgym.state import Elements, Fabric, Layout, State, SurfaceArrays, View
+
+
+class Observed:
+    """The properties and measurements of a ``Simulation``: fresh copies, but for ``view``."""
+
+    mesh: ClothMesh
+    layout: Layout
+    bending: Bending
+    strain_limit: float | None
+    threads: int
+    _hands: Hands
+    _solids: Solids
+    _x: NDArray
+    _v: NDArray
+    _free_w: NDArray
+    _elements: Elements
+    _exact_elements: Elements
+    _surface: SurfaceArrays
+    _fabric: Fabric
+    _parameters: NDArray
+    _diverged: NDArray
+    _limited: NDArray
+
+    def get_state(self) -> State:
+        """All that is needed to go on bit for bit."""
+        raise NotImplementedError
+
+    @property
+    def positions(self) -> NDArray:
+        """[m], (num_envs, particles, 3); a fresh copy."""
+        return self.layout.to_public(self._x)
+
+    @property
+    def velocities(self) -> NDArray:
+        """[m/s], (num_envs, particles, 3); a fresh copy."""
+        return self.layout.to_public(self._v)
+
+    @property
+    def view(self) -> View:
+        """Positions, velocities and springs as the kernels see them; not a copy, and not to be written to."""
+        return View(self._x, self._v, self._elements.springs)
+
+    @property
+    def parameters(self) -> NDArray:
+        """Material figures of each environment, in the order of ``parameters.FIGURES``, (num_envs, figures); a fresh copy."""
+        return self._parameters.copy()
+
+    @property
+    def diverged(self) -> NDArray:
+        """Environments in which something was not finite, or faster than cloth can be, since their reset, (num_envs,)."""
+        return self.layout.to_public(self._diverged)
+
+    @property
+    def limiting(self) -> Limiting | None:
+        """What strain limiting did in the last control step; None without a ``strain_limit``."""
+        return None if self.strain_limit is None else Limiting(*self.layout.to_public(self._limited).T)
+
+    @property
+    def attached(self) -> NDArray:
+        """Whether each anchor holds its particle, (num_envs, anchors); a fresh copy."""
+        return self._hands.attached()
+
+    @property
+    def hand_positions(self) -> NDArray:
+        """Where each anchor and then each gripper is [m], (num_envs, hands, 3); a fresh copy."""
+        return self.layout.to_public(self._hands.x)
+
+    def pulls(self) -> NDArray:
+        """Force with which the cloth pulls at each anchor and then each gripper [N], (num_envs, hands, 3): the springs',
+        the weight's and the air's on the particles that it holds; not what accelerates these."""
+        return self.layout.to_public(self._pulls())
+
+    def _pulls(self) -> NDArray:
+        sheet = self._elements, self.bending, self._surface, self._fabric
+        return self._hands.pulls(self._x, self._v, self._free_w, *sheet, self.threads)
+
+    def strain(self) -> NDArray:
+        """Stretch over rest length, minus one, of the structural springs (threads or edges), (num_envs, those springs)."""
+        return structural_strain(self.mesh, self.positions)
+
+    def energy(self) -> Energy:
+        """Kinetic, elastic and gravitational energy [J], in float64."""
+        return energy(self._exact_elements, self.bending, self.get_state())
+
+    def contacts(self) -> Contacts:
+        """Signed distance of each particle to the nearest collider; negative would be inside."""
+        return self._solids.contacts(self._x)
