@@ -13,6 +13,7 @@ from clothgym.registration import register
 if TYPE_CHECKING:
     from clothgym.collisions import Box as Box
     from clothgym.collisions import Capsule as Capsule
+    from clothgym.collisions import MeshCollider as MeshCollider
     from clothgym.collisions import Plane as Plane
     from clothgym.collisions import Sphere as Sphere
     from clothgym.hands import Gripper as Gripper
@@ -36,6 +37,7 @@ _HOMES = {
     "Gripper": "clothgym.hands",
     "INTEGRATORS": "clothgym.integrators",
     "Material": "clothgym.material",
+    "MeshCollider": "clothgym.collisions",
     "Plane": "clothgym.collisions",
     "Simulation": "clothgym.simulation",
     "Sphere": "clothgym.collisions",

@@ -98,3 +98,13 @@ class Observed:
     def contacts(self) -> Contacts:
         """Signed distance of each particle to the nearest collider; negative would be inside."""
         return self._solids.contacts(self._x)
+
+    @property
+    def collider_positions(self) -> NDArray:
+        """Where the centre of each collider is, or a plane's point [m], (num_envs, colliders, 3); a fresh copy."""
+        return self._solids.positions()
+
+    def penetration(self) -> NDArray:
+        """How deep the deepest point of the sheet, on its triangles too, is in the colliders' surface [m], (num_envs,); 0 if it
+        is in none.  The thickness that contact keeps does not count as part of a collider."""
+        return self._solids.penetration(self._x, self._surface)

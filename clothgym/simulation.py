@@ -16,7 +16,7 @@ from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
-from clothgym.collisions import Collider, Solids, resolve
+from clothgym.collisions import DESK, Collider, Solids, resolve
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
@@ -30,19 +30,20 @@ from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masse
 from clothgym.state import Elastic, Fabric, Layout, State, at_rest, check_fits, digest_of, element_arrays, surface_arrays
 
 GRAVITY = 9.81
+SURFACE_INTERVAL = 2e-3  # solids touch the sheet between its particles at least this often [s]
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
 
 
 def advance(
-    first, last, x, v, w, elements, surface, fabric, kinds, colliders, h, carried, substeps, air_every, options, plan, rows, limit,
-    limited, diverged,
+    first, last, x, v, w, elements, surface, fabric, shapes, colliders, h, carried, substeps, air_every, touch_every, options, plan,
+    rows, limit, limited, diverged,
 ):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
     for b in range(first, last):
         work = np.empty((rows, 3, x.shape[3]), x.dtype)
         push = np.zeros(x.shape[1:], x.dtype)
-        contact = np.empty((4, x.shape[3]), x.dtype)
+        desk = np.empty((DESK, x.shape[3]), x.dtype)
         elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
         limited[b] = 0
         for step in range(substeps):
@@ -51,7 +52,9 @@ def advance(
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
-            resolve(x[b], v[b], w[b], kinds, colliders[b], h, carried, contact)
+            since = step % touch_every + 1
+            interval = since if since == touch_every or step + 1 == substeps else 0
+            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, interval, desk)
         remeasure(x[b], elements.springs, limited[b])  # noqa: F821
         mark_diverged(x[b], v[b], diverged[b])
 
@@ -115,7 +118,7 @@ class Simulation(Observed):
             raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
         if not isinstance(material, Material | None):
             raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
-        members("colliders", colliders, Collider, "Plane, Sphere, Capsule or Box")
+        members("colliders", colliders, Collider, "Plane, Sphere, Capsule, Box or MeshCollider")
         members("grippers", grippers, Gripper, "Gripper")
         self.num_envs = count("num_envs", num_envs)
         one_of("dtype", dtype, "float32", "float64")
@@ -135,7 +138,7 @@ class Simulation(Observed):
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
-        self._solids = Solids(self.layout, colliders)
+        self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self.colliders = self._solids.colliders
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
@@ -175,18 +178,20 @@ class Simulation(Observed):
         self._prepare()
         rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
+        touch_every = max(1, int(SURFACE_INTERVAL / h))
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
-                self._solids.kinds, self._solids.rows, h, carried, self.substeps, air_every, options, self._plan, rows, limit,
-                self._limited, self._diverged,
+                self._solids.shapes, self._solids.rows, h, carried, self.substeps, air_every, touch_every, options, self._plan,
+                rows, limit, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
             _jit.run_spans(work, self.layout.blocks, self.threads)
+            self._solids.end_step()
             if self._hands.can_slip:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
             self._steps += 1
@@ -293,8 +298,22 @@ class Simulation(Observed):
                 self._warn_if_beyond_bound(env[first])
 
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
-        """Put other solids of the same family (a plane, or any other) in place of collider ``index``, one an environment."""
+        """Put other solids of the same family (a plane, the same mesh, or any other) in place of collider ``index``, one an
+        environment."""
         self._solids.replace(index, colliders, *self.layout.place(self.layout.chosen(envs)))
+
+    def move_colliders(
+        self, index: int, targets: ArrayLike | None = None, velocities: ArrayLike | None = None, envs: ArrayLike | None = None
+    ) -> None:
+        """Move collider ``index``; it drags the cloth.
+
+        With ``targets``, where its centre, or a plane's point, is to be at the end of the next step [m], (len(envs), 3): it goes
+        there evenly, and then on with ``velocities``, or rests.  With ``velocities`` alone, from now on [m/s], (len(envs), 3).
+
+        Raises:
+            ValueError: no such collider, neither of both, a wrong shape, or a value that is not finite; nothing is changed then.
+        """
+        self._solids.move(index, targets, velocities, self.layout.chosen(envs))
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
@@ -328,7 +347,7 @@ class Simulation(Observed):
         self._v = blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
         self._hands.restore(state)
-        self._solids.restore(state, dtype)
+        self._solids.restore(state)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
         self._steps = np.array(state.steps, np.int64)

@@ -30,7 +30,7 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
     """
     x = finite("vertices", vertices)
     corners = _checked(x, triangles)
-    edges, inverse = np.unique(np.sort(_edges(corners), axis=1), axis=0, return_inverse=True)
+    edges, inverse = np.unique(np.sort(directed_edges(corners), axis=1), axis=0, return_inverse=True)
     twice = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1)
     beside = np.bincount(inverse, weights=np.tile(twice / 2, 3))
     hinges = _calibrated(coloured_hinges(x, corners), x)
@@ -85,14 +85,28 @@ def load_mesh(path: str | Path) -> ClothMesh:
         ImportError: trimesh is not there: ``pip install clothgym[mesh]``.
         ValueError: the file is none, holds no triangles, or is no sheet (see ``triangle_mesh``).
     """
+    vertices, triangles = read_triangles(path, "load_mesh", "sheet")
+    try:
+        return triangle_mesh(vertices, triangles)
+    except ValueError as error:
+        raise ValueError(f"{str(path)!r} is no sheet: {error}") from error
+
+
+def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDArray]:
+    """Vertices [m] and triangles of a mesh file, those at the very same place merged; who reads, and what, for the sentences.
+
+    Raises:
+        ImportError: trimesh is not there.
+        ValueError: the file is none, holds no triangles, or vertices that are nowhere or in no triangle.
+    """
     try:
         import trimesh
     except ImportError:
-        raise ImportError("load_mesh reads files with trimesh: pip install 'clothgym[mesh]'") from None
+        raise ImportError(f"{who} reads files with trimesh: pip install 'clothgym[mesh]'") from None
     if not Path(path).is_file():
-        what = "it is a folder: name a file in it" if Path(path).is_dir() else "there is no such file: check the path"
-        raise ValueError(f"{str(path)!r}: {what}")
-    advice = "export the sheet as a triangle mesh, for instance obj or ply"
+        problem = "it is a folder: name a file in it" if Path(path).is_dir() else "there is no such file: check the path"
+        raise ValueError(f"{str(path)!r}: {problem}")
+    advice = f"export the {what} as a triangle mesh, for instance obj or ply"
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # trimesh's readers raise whatever their parsers do
@@ -104,9 +118,9 @@ def load_mesh(path: str | Path) -> ClothMesh:
         nowhere = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if len(nowhere):
             raise ValueError(f"vertex {nowhere[0]} is at {x[nowhere[0]].tolist()}: give it a finite place")
-        return triangle_mesh(*_merged(x, _indices(x, np.array(loaded.faces))))
+        return _merged(x, corners_of(x, np.array(loaded.faces)))
     except ValueError as error:
-        raise ValueError(f"{str(path)!r} is no sheet: {error}") from error
+        raise ValueError(f"{str(path)!r} is no {what}: {error}") from error
 
 
 def _merged(x: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
@@ -144,7 +158,7 @@ def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
     return hinges._replace(weight=frozen(hinges.weight * (area / max((hinges.weight * square).sum(), 1e-300))))
 
 
-def _edges(triangles: NDArray) -> NDArray:
+def directed_edges(triangles: NDArray) -> NDArray:
     """Directed edges, (3 triangles, 2)."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
@@ -156,7 +170,7 @@ def _beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
     return area[np.searchsorted(edges[:, 0] * size + edges[:, 1], ends[:, 0] * size + ends[:, 1])]
 
 
-def _indices(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+def corners_of(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
     """Triangles between those vertices, which are all in use."""
     if x.ndim != 2 or x.shape[1] != 3 or not len(x):
         raise ValueError(f"vertices have shape {x.shape}: must be (particles, 3)")
@@ -172,9 +186,8 @@ def _indices(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
     return corners.astype(np.int64)
 
 
-def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
-    """Triangles that make a sheet."""
-    corners = _indices(x, triangles)
+def refuse_degenerate(x: NDArray, corners: NDArray) -> None:
+    """Refuse triangles without area."""
     sides = [x[corners[:, b]] - x[corners[:, a]] for a, b in ((0, 1), (1, 2), (2, 0))]
     twice = np.linalg.norm(np.cross(sides[0], sides[2]), axis=1)
     longest = np.max([np.sum(side**2, axis=1) for side in sides], axis=0)
@@ -182,14 +195,20 @@ def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
     if np.any(flat):
         worst = int(np.flatnonzero(flat)[0])
         raise ValueError(f"triangle {worst}, {corners[worst].tolist()}, is degenerate (no area): remove it, or merge its corners")
+
+
+def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+    """Triangles that make a sheet."""
+    corners = corners_of(x, triangles)
+    refuse_degenerate(x, corners)
     _, first, again = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
     if np.any(again > 1):
         twin = corners[first[np.argmax(again > 1)]].tolist()
         raise ValueError(f"triangle {twin} is there {again.max()} times: remove it but for one")
-    directed, times = np.unique(_edges(corners), axis=0, return_counts=True)
+    directed, times = np.unique(directed_edges(corners), axis=0, return_counts=True)
     if np.any(times > 1):
         a, b = directed[np.argmax(times > 1)].tolist()
-        total = int(np.sum(np.all(np.sort(_edges(corners), axis=1) == sorted((a, b)), axis=1)))
+        total = int(np.sum(np.all(np.sort(directed_edges(corners), axis=1) == sorted((a, b)), axis=1)))
         if total > 2:
             raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two, remove the others")
         raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: turn one round")

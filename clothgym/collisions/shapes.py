@@ -2,7 +2,7 @@
 
 Sphere, capsule and box are one shape: a box with half sides b, swept by a ball of radius r.  A sphere has b = 0, a capsule
 b = (0, 0, half its straight part), a box r = 0.  One distance function serves them all without a branch, and each lane of a
-batch may have another shape in the same slot.
+batch may have another shape in the same slot.  Thickness adds to r.
 """
 
 from __future__ import annotations
@@ -12,18 +12,21 @@ from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import number, vector
+from clothgym.checks import finite, number, vector
 
-# rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r, friction, velocity, and the
-# square of |b| + r, beyond which nothing can touch it
-POINT, AXES, HALF, RADIUS, FRICTION, VELOCITY, REACH2 = 0, 3, 12, 15, 16, 17, 20
-ROWS = 21
+# rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r with the thickness in it, friction,
+# velocity, the square of the distance from the point beyond which nothing can touch it, thickness, and the velocity that it will
+# have after the next control step
+POINT, AXES, HALF, RADIUS, FRICTION, VELOCITY, REACH2, THICKNESS, AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
+ROWS = 25
 
-PLANE, ROUNDED_BOX = 0, 1
+PLANE, ROUNDED_BOX, MESH = 0, 1, 2
 
 Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,11 +36,11 @@ class Collider:
     Attributes:
         friction: Coulomb's coefficient between cloth and solid.
         thickness: distance at which the cloth rests on the surface [m].
-        velocity: of the solid [m/s]; it moves, and drags the cloth.
+        velocity: of the solid [m/s]; it moves, and drags the cloth.  ``Simulation.move_colliders`` changes it.
 
     Raises:
         ValueError: a size that is not positive, a friction or thickness below zero, a vector that is not three finite
-            numbers, or a direction of length zero.
+            numbers, or a direction or rotation of length zero.
     """
 
     kind: ClassVar[int]
@@ -48,7 +51,9 @@ class Collider:
     def __post_init__(self) -> None:
         for item in fields(self):
             name, value = f"{type(self).__name__} {item.name}", getattr(self, item.name)
-            if isinstance(item.default, tuple):
+            if item.name == "rotation":
+                turned(name, value)
+            elif isinstance(item.default, tuple):
                 vector(name, value)
             elif number(name, value) < 0 and item.name in ("friction", "thickness"):
                 raise ValueError(f"{name}={value!r}: must be zero or positive")
@@ -63,10 +68,15 @@ class Collider:
         rows = np.zeros(ROWS)
         rows[AXES : AXES + 9] = np.eye(3).ravel()
         rows[FRICTION] = self.friction
-        rows[VELOCITY : VELOCITY + 3] = self.velocity
+        rows[VELOCITY : VELOCITY + 3] = rows[AFTER : AFTER + 3] = self.velocity
+        rows[RADIUS] = rows[THICKNESS] = self.thickness
         self._shape(rows)
         rows[REACH2] = (np.linalg.norm(rows[HALF : HALF + 3]) + rows[RADIUS]) ** 2
         return rows
+
+    def fits(self, other: Collider) -> bool:
+        """Whether the other can take its place in some environments of a batch."""
+        return other.kind == self.kind
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         """Write the rows that are the shape's own."""
@@ -88,8 +98,8 @@ class Plane(Collider):
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
-        rows[POINT : POINT + 3] = np.asarray(self.point) + normal * self.thickness
-        rows[AXES + 6 : AXES + 9] = normal
+        rows[POINT : POINT + 3] = self.point
+        rows[AXES : AXES + 9] = _axes_along(normal).ravel()
 
 
 @dataclass(frozen=True)
@@ -129,22 +139,23 @@ class Capsule(Collider):
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         rows[POINT : POINT + 3] = self.center
-        z = np.asarray(self.axis) / np.linalg.norm(self.axis)
-        x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-        x /= np.linalg.norm(x)
-        rows[AXES : AXES + 9] = np.concatenate([x, np.cross(z, x), z])
+        rows[AXES : AXES + 9] = _axes_along(np.asarray(self.axis) / np.linalg.norm(self.axis)).ravel()
         rows[HALF + 2] = self.height / 2 - self.radius
         rows[RADIUS] = self.radius + self.thickness
 
 
 @dataclass(frozen=True)
 class Box(Collider):
-    """A box, turned by ``yaw`` about z [rad] if wanted; its thickness rounds the edges."""
+    """A box; its thickness rounds the edges.
+
+    It is turned by ``yaw`` about z [rad], and then by ``rotation``, a quaternion (w, x, y, z) of any length.
+    """
 
     kind: ClassVar[int] = ROUNDED_BOX
     center: Vector = (0.0, 0.0, 0.0)
     half_sides: Vector = (0.1, 0.1, 0.1)
     yaw: float = 0.0
+    rotation: Quaternion = UNTURNED
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -153,9 +164,41 @@ class Box(Collider):
     def _shape(self, rows: NDArray[np.float64]) -> None:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         rows[POINT : POINT + 3] = self.center
-        rows[AXES : AXES + 9] = (c, s, 0, -s, c, 0, 0, 0, 1)
+        about_z = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
+        rows[AXES : AXES + 9] = (about_z @ turned("rotation", self.rotation)).ravel()
         rows[HALF : HALF + 3] = self.half_sides
-        rows[RADIUS] = self.thickness
+
+
+def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:
+    """The axes of a solid that a quaternion (w, x, y, z) of any length has turned, (3, 3), an axis a row.
+
+    Raises:
+        ValueError: not four finite numbers, or all zero.
+    """
+    q = finite(name, quaternion)
+    if q.shape != (4,) or not np.linalg.norm(q) > 0:
+        raise ValueError(f"{name}={quaternion!r}: must be a quaternion, four numbers (w, x, y, z) that are not all zero")
+    w, x, y, z = q / np.linalg.norm(q)
+    return np.array(
+        [
+            (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+            (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+            (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+        ]
+    )
+
+
+def _axes_along(z: NDArray) -> NDArray[np.float64]:
+    """Axes of which the third is the given unit vector, (3, 3), an axis a row."""
+    x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def check_index(colliders: Sequence[Collider], index: int) -> None:
+    """Refuse an index that no collider has."""
+    if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(colliders):
+        raise ValueError(f"index={index!r}: this simulation has {len(colliders)} colliders")
 
 
 def check_replacement(colliders: Sequence[Collider], index: int, others: Sequence[Collider], envs: int) -> None:
@@ -164,11 +207,11 @@ def check_replacement(colliders: Sequence[Collider], index: int, others: Sequenc
     Raises:
         ValueError: there is no such collider, the number is wrong, or they are of another family.
     """
-    if not 0 <= index < len(colliders):
-        raise ValueError(f"index={index!r}: this simulation has {len(colliders)} colliders")
+    check_index(colliders, index)
     if isinstance(others, Collider) or len(others) != envs:
         raise ValueError(f"colliders={others!r}: give a sequence of {envs}, one for each environment")
     for other in others:
-        if other.kind != colliders[index].kind:
+        if not colliders[index].fits(other):
             here, there = type(colliders[index]).__name__, type(other).__name__
+            there = "MeshCollider of another mesh" if here == there else there
             raise ValueError(f"collider {index} is a {here}: a {there} cannot take its place")

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from clothgym.checks import finite, spread
+from clothgym.collisions.distance import Shapes
+from clothgym.collisions.mesh_collider import MeshCollider
+from clothgym.collisions.penetration import deepest
 from clothgym.collisions.response import Contacts, contacts
-from clothgym.collisions.shapes import ROWS, Collider, check_replacement
-from clothgym.state import Layout, State
+from clothgym.collisions.shapes import AFTER, POINT, ROWS, VELOCITY, Collider, check_index, check_replacement
+from clothgym.state import Layout, State, SurfaceArrays
 
 
 class Solids:
@@ -17,13 +21,13 @@ class Solids:
 
     Attributes:
         colliders: as they were given.
-        kinds: of each, (colliders,).
+        shapes: what all environments share.
         rows, homes: what the kernels know of each now, and at a reset, (block, colliders, ROWS, lane).
     """
 
-    def __init__(self, layout: Layout, colliders: Sequence[Collider]) -> None:
-        self.layout, self.colliders = layout, tuple(colliders)
-        self.kinds = np.array([c.kind for c in colliders], np.int64)
+    def __init__(self, layout: Layout, colliders: Sequence[Collider], time_step: float, dtype: np.dtype) -> None:
+        self.layout, self.colliders, self.time_step, self.dtype = layout, tuple(colliders), time_step, dtype
+        self.shapes = _shapes(self.colliders, dtype)
         self.rows: NDArray
         self.homes: NDArray
 
@@ -31,9 +35,10 @@ class Solids:
         """The rows of the colliders as they were given, (colliders, ROWS)."""
         return np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS)
 
-    def restore(self, state: State, dtype: np.dtype) -> None:
+    def restore(self, state: State) -> None:
         """Take over a state's part."""
-        self.rows, self.homes = (self.layout.to_blocks(part, dtype) for part in (state.colliders, state.collider_homes))
+        self.rows = self.layout.to_blocks(state.colliders, self.dtype)
+        self.homes = self.layout.to_blocks(state.collider_homes, self.dtype)
 
     def public(self) -> dict[str, NDArray]:
         """A state's part, as fresh copies."""
@@ -48,6 +53,58 @@ class Solids:
         check_replacement(self.colliders, index, others, len(block))
         self.rows[block, index, :, lane] = self.homes[block, index, :, lane] = np.array([c.rows() for c in others])
 
+    def move(self, index: int, targets: ArrayLike | None, velocities: ArrayLike | None, env: NDArray) -> None:
+        """See ``Simulation.move_colliders``."""
+        check_index(self.colliders, index)
+        if targets is None and velocities is None:
+            raise ValueError("move_colliders: give targets, velocities, or both")
+        shape = (len(env), 3)
+        after = np.zeros(shape) if velocities is None else spread("velocities", finite("velocities", velocities), shape)
+        block, lane = self.layout.place(env)
+        now = after
+        if targets is not None:
+            x = spread("targets", finite("targets", targets), shape)
+            now = (x - self.rows[block, index, POINT : POINT + 3, lane]) / self.time_step
+        self.rows[block, index, VELOCITY : VELOCITY + 3, lane] = now
+        self.rows[block, index, AFTER : AFTER + 3, lane] = after
+
+    def end_step(self) -> None:
+        """What was on its way to a target has arrived, and goes on as it was told."""
+        self.rows[:, :, VELOCITY : VELOCITY + 3] = self.rows[:, :, AFTER : AFTER + 3]
+
+    def positions(self) -> NDArray:
+        """Where each is [m]: the centre, or a plane's point, (num_envs, colliders, 3)."""
+        return self.layout.to_public(self.rows[:, :, POINT : POINT + 3])
+
     def contacts(self, x: NDArray) -> Contacts:
         """Signed distance of each particle to the nearest collider [m], and which it is; x in blocks."""
-        return contacts(self.layout, x, self.kinds, self.rows)
+        return contacts(self.layout, x, self.shapes, self.rows)
+
+    def penetration(self, x: NDArray, surface: SurfaceArrays) -> NDArray:
+        """How deep the deepest point of the sheet's triangles is in the colliders' surface [m], (num_envs,); x in blocks."""
+        out = np.zeros((self.layout.blocks, self.layout.lanes), x.dtype)
+        deepest(0, self.layout.blocks, x, surface.triangles, self.shapes, self.rows, out)
+        return self.layout.to_public(out)
+
+
+def _shapes(colliders: Sequence[Collider], dtype: np.dtype) -> Shapes:
+    nodes: list[NDArray] = [np.zeros((0, 4))]
+    first, sizes, corners, cells = [], [], [], []
+    count = 0
+    for collider in colliders:
+        first.append(count)
+        grid = collider.grid if isinstance(collider, MeshCollider) else None
+        sizes.append(grid.nodes.shape[:3] if grid is not None else (0, 0, 0))
+        corners.append(grid.corner if grid is not None else np.zeros(3))
+        cells.append(grid.cell if grid is not None else 1.0)
+        if grid is not None:
+            nodes.append(grid.nodes.reshape(-1, 4))
+            count += len(nodes[-1])
+    return Shapes(
+        np.array([c.kind for c in colliders], np.int64),
+        np.concatenate(nodes).astype(dtype),
+        np.array(first, np.int64),
+        np.array(sizes, np.int64).reshape(-1, 3),
+        np.array(corners, dtype).reshape(-1, 3),
+        np.array(cells, dtype),
+    )

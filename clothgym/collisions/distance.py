@@ -1,0 +1,204 @@
+"""Signed distance to one solid and its outward normal, in lanes.
+
+A solid is known by rows of numbers that each lane has for itself (``shapes``), and a mesh also by a grid of distances that all
+lanes share (``distance_grid``).
+
+The kernels work at a desk: one array, (DESK, lanes), that begins with a copy of the solid's rows and goes on with points, normals
+and what else they need.  Loops over rows of one array are vectorised; over those of many, LLVM would have to test too many pairs
+for overlap at run time, and gives up.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.collisions.shapes import AXES, HALF, PLANE, POINT, RADIUS, REACH2, ROUNDED_BOX, ROWS
+
+# the desk's rows after the solid's: a triangle's corners, a point, and one of the solid's core, all in its axes; barycentric
+# weights; signed distance and normal of contact; depth of the core; a velocity with its inverse mass; what surely does not touch
+CORNERS, SPOT, CORE, WEIGHTS = ROWS, ROWS + 9, ROWS + 12, ROWS + 15
+CONTACT, RHO, MOTION, YIELDING, CLEAR = ROWS + 18, ROWS + 22, ROWS + 23, ROWS + 26, ROWS + 27
+BEFORE, BETWEEN = ROWS + 28, ROWS + 31
+DESK = ROWS + 34
+
+FAINT = 1e-3  # a gradient of the grid that is shorter than this has no direction to speak of
+
+
+class Shapes(NamedTuple):
+    """What the kernels must know of the colliders beside their rows.
+
+    kinds: the family of each, (colliders,).
+    nodes: distance [m] and gradient at the nodes of all grids, (nodes, 4), and each grid's first one, (colliders,).
+    sizes: nodes of each grid along x, y, z, (colliders, 3).  corners: its lowest corner in the solid's axes [m], (colliders, 3).
+    cells: its spacing [m], (colliders,).
+    """
+
+    kinds: NDArray
+    nodes: NDArray
+    first: NDArray
+    sizes: NDArray
+    corners: NDArray
+    cells: NDArray
+
+
+@kernel
+def may_touch(x, collider, kind):
+    """Whether any lane's particle is inside the solid's bound.  It only decides whether work can be skipped."""
+    zero = x.dtype.type(0)
+    near = False
+    if kind == PLANE:
+        for l in range(x.shape[1]):
+            height = zero
+            for c in range(3):
+                height += (x[c, l] - collider[POINT + c, l]) * collider[AXES + 6 + c, l]
+            near |= height < collider[RADIUS, l]
+    else:
+        for l in range(x.shape[1]):
+            dx = x[0, l] - collider[POINT, l]
+            dy = x[1, l] - collider[POINT + 1, l]
+            dz = x[2, l] - collider[POINT + 2, l]
+            near |= dx * dx + dy * dy + dz * dz < collider[REACH2, l]
+    return near
+
+
+@kernel
+def lay_out(collider, desk):
+    """Copy a solid's rows to the desk, which is clear of nothing."""
+    for r in range(collider.shape[0]):
+        for l in range(desk.shape[1]):
+            desk[r, l] = collider[r, l]
+    for l in range(desk.shape[1]):
+        desk[CLEAR, l] = 0
+
+
+@kernel
+def to_axes(x, desk, at):
+    """Write a point in the world, (3, lanes), to three rows of the desk, in the solid's axes."""
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            desk[at + c, l] = x[c, l] - desk[POINT + c, l]
+    for l in range(desk.shape[1]):
+        dx, dy, dz = desk[at, l], desk[at + 1, l], desk[at + 2, l]
+        desk[at, l] = dx * desk[AXES, l] + dy * desk[AXES + 1, l] + dz * desk[AXES + 2, l]
+        desk[at + 1, l] = dx * desk[AXES + 3, l] + dy * desk[AXES + 4, l] + dz * desk[AXES + 5, l]
+        desk[at + 2, l] = dx * desk[AXES + 6, l] + dy * desk[AXES + 7, l] + dz * desk[AXES + 8, l]
+
+
+@kernel
+def normal_to_world(desk):
+    """Turn the normal of contact from the solid's axes to the world's."""
+    for l in range(desk.shape[1]):
+        nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+        desk[CONTACT + 1, l] = nx * desk[AXES, l] + ny * desk[AXES + 3, l] + nz * desk[AXES + 6, l]
+        desk[CONTACT + 2, l] = nx * desk[AXES + 1, l] + ny * desk[AXES + 4, l] + nz * desk[AXES + 7, l]
+        desk[CONTACT + 3, l] = nx * desk[AXES + 2, l] + ny * desk[AXES + 5, l] + nz * desk[AXES + 8, l]
+
+
+@kernel
+def measure(desk, at, shapes, k, within):
+    """Write signed distance [m] and outward unit normal, in the solid's axes, of the point in three rows of the desk to CONTACT.
+
+    A mesh leaves out the normal where the distance is not less than ``within``, and lanes that are clear.
+    """
+    kinds, nodes, first, sizes, corners, cells = shapes
+    if kinds[k] == PLANE:
+        for l in range(desk.shape[1]):
+            desk[CONTACT, l] = desk[at + 2, l] - desk[RADIUS, l]
+            desk[CONTACT + 1, l] = 0
+            desk[CONTACT + 2, l] = 0
+            desk[CONTACT + 3, l] = 1
+    elif kinds[k] == ROUNDED_BOX:
+        _measure_rounded_box(desk, at)
+    else:
+        _measure_in_grid(desk, at, nodes[first[k] :], sizes[k], corners[k], cells[k], within)
+
+
+@kernel
+def _measure_rounded_box(desk, at):
+    """With a = |q| - b: outside the inner box the distance is ``|max(a, 0)| - r``, inside it ``max(a) - r``."""
+    zero = desk.dtype.type(0)
+    one = desk.dtype.type(1)
+    for l in range(desk.shape[1]):
+        qx, qy, qz = desk[at, l], desk[at + 1, l], desk[at + 2, l]
+        ax, ay, az = abs(qx) - desk[HALF, l], abs(qy) - desk[HALF + 1, l], abs(qz) - desk[HALF + 2, l]
+        ox, oy, oz = max(ax, zero), max(ay, zero), max(az, zero)
+        outside = np.sqrt(ox * ox + oy * oy + oz * oz)
+        deepest = max(ax, max(ay, az))
+        beyond = outside > zero
+        scale = one / outside if beyond else one
+        # inside, the normal is that of the nearest face
+        fx = one if ax >= deepest else zero
+        fy = one if (ay >= deepest and ax < deepest) else zero
+        fz = one - fx - fy
+        desk[CONTACT, l] = (outside if beyond else deepest) - desk[RADIUS, l]
+        desk[CONTACT + 1, l] = (ox * scale if beyond else fx) * (one if qx >= zero else -one)
+        desk[CONTACT + 2, l] = (oy * scale if beyond else fy) * (one if qy >= zero else -one)
+        desk[CONTACT + 3, l] = (oz * scale if beyond else fz) * (one if qz >= zero else -one)
+
+
+@kernel
+def _between(grid, node, ny, nz, tx, ty, tz, c):
+    """Trilinear value of column ``c`` in the cell above ``node``."""
+    low = grid[node, c] + tz * (grid[node + 1, c] - grid[node, c])
+    high = grid[node + nz, c] + tz * (grid[node + nz + 1, c] - grid[node + nz, c])
+    near = low + ty * (high - low)
+    far = node + ny * nz
+    low = grid[far, c] + tz * (grid[far + 1, c] - grid[far, c])
+    high = grid[far + nz, c] + tz * (grid[far + nz + 1, c] - grid[far + nz, c])
+    return near + tx * ((low + ty * (high - low)) - near)
+
+
+@kernel
+def _measure_in_grid(desk, at, grid, size, corner, cell, within):
+    """Trilinear distance and, where that is less than ``within``, gradient; lanes that are clear are passed over.
+
+    Beyond the grid, with c the nearest point of it, ``sqrt(d(c)^2 + |q - c|^2)``, which is never more than the distance: the
+    angle at c between q and the surface is at least a right one.
+    """
+    zero, one, faint = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(FAINT)
+    nx, ny, nz = size[0], size[1], size[2]
+    last_x, last_y, last_z = desk.dtype.type(nx - 1), desk.dtype.type(ny - 1), desk.dtype.type(nz - 1)
+    per_cell = one / cell
+    for l in range(desk.shape[1]):
+        if desk[CLEAR, l] != zero:
+            continue
+        gx, gy = (desk[at, l] - corner[0]) * per_cell, (desk[at + 1, l] - corner[1]) * per_cell
+        gz = (desk[at + 2, l] - corner[2]) * per_cell
+        # what is not finite ends at zero
+        cx, cy, cz = gx if gx > zero else zero, gy if gy > zero else zero, gz if gz > zero else zero
+        cx, cy, cz = cx if cx < last_x else last_x, cy if cy < last_y else last_y, cz if cz < last_z else last_z
+        i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
+        tx, ty, tz = cx - desk.dtype.type(i), cy - desk.dtype.type(j), cz - desk.dtype.type(k)
+        node = (i * ny + j) * nz + k
+        distance = _between(grid, node, ny, nz, tx, ty, tz, 0)
+        dx, dy, dz = (gx - cx) * cell, (gy - cy) * cell, (gz - cz) * cell
+        beyond = dx * dx + dy * dy + dz * dz
+        if beyond > zero:
+            inner = max(distance, zero)
+            distance = np.sqrt(inner * inner + beyond)
+        desk[CONTACT, l] = distance - desk[RADIUS, l]
+        ux, uy, uz = zero, zero, one
+        if desk[CONTACT, l] < within:
+            ux = _between(grid, node, ny, nz, tx, ty, tz, 1)
+            uy = _between(grid, node, ny, nz, tx, ty, tz, 2)
+            uz = _between(grid, node, ny, nz, tx, ty, tz, 3)
+            if beyond > zero:
+                ux, uy, uz = inner * ux + dx, inner * uy + dy, inner * uz + dz
+            length = np.sqrt(ux * ux + uy * uy + uz * uz)
+            scale = one / length if length > faint else zero
+            ux, uy, uz = ux * scale, uy * scale, uz * scale if length > faint else one
+        desk[CONTACT + 1, l] = ux
+        desk[CONTACT + 2, l] = uy
+        desk[CONTACT + 3, l] = uz
+
+
+@kernel
+def measure_in_world(x, desk, shapes, k):
+    """Write signed distance [m], and outward unit normal where it is negative, of points in the world, (3, lanes), to CONTACT."""
+    to_axes(x, desk, SPOT)
+    measure(desk, SPOT, shapes, k, x.dtype.type(0))
+    normal_to_world(desk)

@@ -1,0 +1,151 @@
+"""Signed distances to a closed mesh, on a grid.
+
+Exact distances to the triangles in a band around the surface; from there the nearest triangle is handed on from node to node in
+sweeps (Bridson, SDFGen; Zhao 2005).  The sign is the winding number along lines parallel to x, counted where they pass through the
+triangles' shadows; ties on shared edges and vertices are broken by a shear that is infinitely small (simulation of simplicity,
+Edelsbrunner and Muecke 1990), so that none is counted twice or missed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+
+BAND = 2  # cells around a triangle's bounds in which distances to it are exact
+MARGIN = 3  # cells around the mesh's bounds
+SWEEPS = 2  # of all eight directions
+
+
+class DistanceGrid(NamedTuple):
+    """nodes: distance [m] and its gradient, (x, y, z, 4); corner: lowest node [m], (3,); cell: spacing [m]."""
+
+    nodes: NDArray[np.float32]
+    corner: NDArray[np.float64]
+    cell: float
+
+
+def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> DistanceGrid:
+    """Of a closed surface, with ``resolution`` cells along its longest side.
+
+    Raises:
+        ValueError: a part of the surface is inside out.
+    """
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    cell = float((high - low).max()) / resolution
+    corner = low - MARGIN * cell
+    sizes = np.ceil((high - low) / cell).astype(np.int64) + 1 + 2 * MARGIN
+    distance = np.full(sizes, 1e30)
+    nearest = np.full(sizes, -1, np.int32)
+    winding = np.zeros(sizes, np.int32)
+    fill_band((vertices - corner) / cell, triangles, distance, nearest)
+    for _ in range(SWEEPS):
+        sweep_all((vertices - corner) / cell, triangles, distance, nearest)
+    count_passages((vertices - corner) / cell, triangles, winding)
+    winding = np.cumsum(winding, axis=0)
+    if winding.min() < 0:
+        where = corner + cell * np.array(np.unravel_index(np.argmin(winding), winding.shape))
+        raise ValueError(f"a part of the mesh near {np.round(where, 4).tolist()} is inside out: turn its triangles round")
+    signed = np.where(winding > 0, -distance, distance)
+    nodes = np.stack([cell * signed, *np.gradient(signed)], axis=-1).astype(np.float32)
+    return DistanceGrid(np.ascontiguousarray(nodes), corner, cell)
+
+
+@kernel
+def distance_to_triangle(px, py, pz, a, b, c):
+    """Distance of a point to a triangle (Ericson 2005, 5.1.5)."""
+    bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    qx, qy, qz = px - a[0], py - a[1], pz - a[2]
+    bb, bc, cc = bx * bx + by * by + bz * bz, bx * cx + by * cy + bz * cz, cx * cx + cy * cy + cz * cz
+    qb, qc = qx * bx + qy * by + qz * bz, qx * cx + qy * cy + qz * cz
+    scale = 1 / (bb * cc - bc * bc)
+    s, t = (cc * qb - bc * qc) * scale, (bb * qc - bc * qb) * scale
+    if s < 0 or t < 0 or s + t > 1:
+        best = 1e300
+        on_b, on_c = min(max(qb / bb, 0.0), 1.0), min(max(qc / cc, 0.0), 1.0)
+        on_s = min(max((qc - qb - bc + bb) / (bb - 2 * bc + cc), 0.0), 1.0)
+        for u, v in ((on_b, 0.0), (0.0, on_c), (1 - on_s, on_s)):
+            dx, dy, dz = qx - u * bx - v * cx, qy - u * by - v * cy, qz - u * bz - v * cz
+            best = min(best, dx * dx + dy * dy + dz * dz)
+        return np.sqrt(best)
+    dx, dy, dz = qx - s * bx - t * cx, qy - s * by - t * cy, qz - s * bz - t * cz
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@kernel
+def fill_band(x, triangles, distance, nearest):
+    """Exact distances near each triangle; x: vertices in cells from the grid's corner."""
+    for t in range(len(triangles)):
+        a, b, c = x[triangles[t, 0]], x[triangles[t, 1]], x[triangles[t, 2]]
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for d in range(3):
+            low[d] = max(int(np.floor(min(a[d], min(b[d], c[d])))) - BAND, 0)
+            high[d] = min(int(np.floor(max(a[d], max(b[d], c[d])))) + 1 + BAND, distance.shape[d] - 1)
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    found = distance_to_triangle(float(i), float(j), float(k), a, b, c)
+                    if found < distance[i, j, k]:
+                        distance[i, j, k] = found
+                        nearest[i, j, k] = t
+
+
+@kernel
+def sweep_all(x, triangles, distance, nearest):
+    """Hand each node's nearest triangle on to the next, in all eight directions."""
+    nx, ny, nz = distance.shape
+    for direction in range(8):
+        di, dj, dk = 1 - 2 * (direction & 1), 1 - (direction & 2), 1 - (direction & 4) // 2
+        for i in range(1, nx):
+            p = i if di > 0 else nx - 1 - i
+            for j in range(1, ny):
+                q = j if dj > 0 else ny - 1 - j
+                for k in range(1, nz):
+                    r = k if dk > 0 else nz - 1 - k
+                    for step in range(1, 8):
+                        t = nearest[p - di * (step & 1), q - dj * ((step >> 1) & 1), r - dk * (step >> 2)]
+                        if t >= 0 and t != nearest[p, q, r]:
+                            a, b, c = x[triangles[t, 0]], x[triangles[t, 1]], x[triangles[t, 2]]
+                            found = distance_to_triangle(float(p), float(q), float(r), a, b, c)
+                            if found < distance[p, q, r]:
+                                distance[p, q, r] = found
+                                nearest[p, q, r] = t
+
+
+@kernel
+def _side(ax, ay, bx, by):
+    """Sign of the cross product of two vectors, never zero unless they are the same, by a shear that is infinitely small."""
+    area = ay * bx - ax * by
+    if area != 0:
+        return 1 if area > 0 else -1
+    if by != ay:
+        return 1 if by > ay else -1
+    if ax != bx:
+        return 1 if ax > bx else -1
+    return 0
+
+
+@kernel
+def count_passages(x, triangles, winding):
+    """Where lines along x pass through triangles: +1 at the first node inside, -1 at the first one outside again."""
+    nx, ny, nz = winding.shape
+    for t in range(len(triangles)):
+        a, b, c = x[triangles[t, 0]], x[triangles[t, 1]], x[triangles[t, 2]]
+        for j in range(max(int(np.floor(min(a[1], min(b[1], c[1])))), 0), min(int(max(a[1], max(b[1], c[1]))) + 1, ny - 1) + 1):
+            for k in range(max(int(np.floor(min(a[2], min(b[2], c[2])))), 0), min(int(max(a[2], max(b[2], c[2]))) + 1, nz - 1) + 1):
+                ay, az, by, bz, cy, cz = a[1] - j, a[2] - k, b[1] - j, b[2] - k, c[1] - j, c[2] - k
+                one, two, three = _side(by, bz, cy, cz), _side(cy, cz, ay, az), _side(ay, az, by, bz)
+                if one == 0 or one != two or two != three:
+                    continue
+                u, v, w = bz * cy - by * cz, cz * ay - cy * az, az * by - ay * bz
+                total = u + v + w
+                if total == 0:
+                    continue
+                at = int(np.ceil((u * a[0] + v * b[0] + w * c[0]) / total))
+                if at < nx:
+                    # the outward normal's x component is minus the shadow's turning sense
+                    winding[max(at, 0), j, k] += one

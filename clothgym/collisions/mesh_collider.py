@@ -1,0 +1,123 @@
+"""A collider of any closed shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym.checks import count, finite, not_negative, positive, vector
+from clothgym.collisions.closed import checked_solid
+from clothgym.collisions.distance_grid import DistanceGrid, distance_grid
+from clothgym.collisions.shapes import AXES, HALF, MESH, POINT, UNTURNED, Collider, Quaternion, Vector, turned
+from clothgym.triangles import read_triangles
+
+
+@dataclass(frozen=True, eq=False)
+class MeshCollider(Collider):
+    """A solid whose surface is a closed mesh of triangles, from a file or from arrays.
+
+    The cloth feels a grid of signed distances that is made once: edges are rounded, and details are lost, at the size of its cells,
+    which have the mesh's longest side divided by ``resolution``.  Walls should be at least two cells thick.
+
+    Attributes:
+        path: a mesh file in metres, which trimesh reads.
+        vertices: [m], (vertices, 3), and triangles between them, (triangles, 3), counter-clockwise seen from outside.
+        center: where the mesh's origin is [m].
+        rotation: a quaternion (w, x, y, z) of any length.
+        scale: the mesh is this many times as large.
+        resolution: cells along the longest side.
+
+    Raises:
+        ImportError: a path without trimesh: ``pip install clothgym[mesh]``.
+        ValueError: what ``Collider`` refuses, neither or both of path and arrays, or no closed surface (see ``checked_solid``).
+    """
+
+    kind: ClassVar[int] = MESH
+    path: str | Path | None = None
+    vertices: ArrayLike | None = None
+    triangles: ArrayLike | None = None
+    center: Vector = (0.0, 0.0, 0.0)
+    rotation: Quaternion = UNTURNED
+    scale: float = 1.0
+    resolution: int = 64
+
+    def __post_init__(self) -> None:
+        for name in ("friction", "thickness"):
+            not_negative(f"MeshCollider {name}", getattr(self, name))
+        for name in ("center", "velocity"):
+            vector(f"MeshCollider {name}", getattr(self, name))
+        turned("MeshCollider rotation", self.rotation)
+        positive("MeshCollider scale", self.scale)
+        count("MeshCollider resolution", self.resolution)
+        if (self.path is None) == (self.vertices is None or self.triangles is None) or (
+            self.path is not None and (self.vertices is not None or self.triangles is not None)
+        ):
+            raise ValueError("MeshCollider: give the path of a file, or vertices and triangles")
+        self.surface  # noqa: B018 - a mesh that is no solid is refused here
+
+    def __repr__(self) -> str:
+        shown = (f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if f.name not in ("vertices", "triangles"))
+        return f"MeshCollider({', '.join(shown)})"
+
+    @cached_property
+    def surface(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Vertices in the solid's own axes, scaled [m], and triangles."""
+        if self.path is not None:
+            x, triangles = read_triangles(self.path, "MeshCollider", "solid")
+            try:
+                return _solid(*_frozen(x * self.scale, triangles))
+            except ValueError as error:
+                raise ValueError(f"{str(self.path)!r} is no solid: {error}") from error
+        assert self.vertices is not None and self.triangles is not None
+        return _solid(*_frozen(finite("vertices", self.vertices) * self.scale, np.asarray(self.triangles)))
+
+    @cached_property
+    def grid(self) -> DistanceGrid:
+        x, triangles = self.surface
+        return _grid(*_frozen(x, triangles), self.resolution)
+
+    def world_vertices(self) -> NDArray[np.float64]:
+        """Where the vertices are as long as the solid has not moved [m], (vertices, 3)."""
+        return self.surface[0] @ turned("rotation", self.rotation) + np.asarray(self.center)
+
+    def fits(self, other: Collider) -> bool:
+        """Whether it is of the same mesh: all environments share one grid of distances."""
+        return isinstance(other, MeshCollider) and other.grid is self.grid
+
+    def _shape(self, rows: NDArray[np.float64]) -> None:
+        rows[POINT : POINT + 3] = self.center
+        rows[AXES : AXES + 9] = turned("rotation", self.rotation).ravel()
+        rows[HALF : HALF + 3] = np.abs(self.surface[0]).max(axis=0)
+
+
+class _Bytes:
+    """An array that a cache can look up by what it holds."""
+
+    def __init__(self, array: NDArray) -> None:
+        self.array = np.ascontiguousarray(array)
+        self._key = (self.array.shape, self.array.dtype.str, self.array.tobytes())
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Bytes) and self._key == other._key
+
+
+def _frozen(*arrays: NDArray) -> tuple[_Bytes, ...]:
+    return tuple(map(_Bytes, arrays))
+
+
+@lru_cache(maxsize=16)
+def _solid(vertices: _Bytes, triangles: _Bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    return checked_solid(vertices.array, triangles.array)
+
+
+@lru_cache(maxsize=16)
+def _grid(vertices: _Bytes, triangles: _Bytes, resolution: int) -> DistanceGrid:
+    return distance_grid(vertices.array, triangles.array, resolution)

@@ -1,0 +1,382 @@
+"""Contact of the sheet between its particles: a small sphere, or a box's edge, does not come through a triangle.
+
+For each triangle near a solid the point is sought that lies deepest in it, by alternating projections (von Neumann; Bauschke and
+Borwein 1996): from the point to the solid's core, which is what is left of it below a depth ``rho``, and from there back to the
+triangle.  They end at the shortest way between triangle and core, which is where the triangle is deepest, and whose direction is
+the normal of contact: along the triangle's own normal where an edge or a corner of the solid pokes into it, across both edges where
+two of them cross.  The core of a sphere is its centre and one round is exact; that of a capsule is its segment.
+
+The core must lie deeper than any point of the triangle: where one turns out to lie deeper than half of ``rho``, this is doubled.
+But on a solid with sharp edges a point of the triangle that is nearest to the core is not quite the deepest one: the difference is
+up to a fifth of ``rho``.  So ``rho`` begins at four thicknesses, which keeps that error within the thickness.
+
+The corners of the triangle take what its point needs by their barycentric weights over their masses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.collisions.distance import (
+    BEFORE,
+    BETWEEN,
+    CLEAR,
+    CONTACT,
+    CORE,
+    CORNERS,
+    MOTION,
+    RHO,
+    SPOT,
+    WEIGHTS,
+    YIELDING,
+    measure,
+    normal_to_world,
+    to_axes,
+)
+from clothgym.collisions.shapes import FRICTION, HALF, MESH, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
+
+MESH_ROUNDS = 3
+MOST = 0.98  # of the distance is left after a round, where a leap trusts the rounds
+DEPTH = 4.0  # rho over the thickness, at first
+CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid
+TOUCHING = 1e-3  # share of the radius by which cloth may be in it and yet count as lying on it
+SLANT = 0.5  # the least cosine between the normals of contact and of the solid: at a box's corner it is 0.58
+
+
+@kernel
+def any_near(x, collider, desk):
+    """Whether any lane's sheet comes near the solid at all.  It only decides whether desk can be skipped."""
+    low, high = desk[0:3], desk[3:6]
+    low[:] = x[0]
+    high[:] = x[0]
+    for p in range(x.shape[0]):
+        for c in range(3):
+            for l in range(x.shape[2]):
+                low[c, l] = min(low[c, l], x[p, c, l])
+                high[c, l] = max(high[c, l], x[p, c, l])
+    zero = x.dtype.type(0)
+    near = False
+    for l in range(x.shape[2]):
+        beyond = zero
+        for c in range(3):
+            at = collider[POINT + c, l]
+            gap = max(max(low[c, l] - at, at - high[c, l]), zero)
+            beyond += gap * gap
+        near |= beyond < collider[REACH2, l]
+    return near
+
+
+@kernel
+def _may_touch_triangle(desk):
+    """Whether any lane's triangle comes near the solid; its centre goes to SPOT, its radius to RHO, and to CLEAR whether it surely
+    does not touch: its corners lie beyond one face of the box of half sides b + r, as those of cloth that lies on a box do.
+
+    Near is the box of half sides b, all around which the distance is at most the radius.
+    """
+    third, zero, one = desk.dtype.type(1 / 3), desk.dtype.type(0), desk.dtype.type(1)
+    for l in range(desk.shape[1]):
+        ax, ay, az = desk[CORNERS, l], desk[CORNERS + 1, l], desk[CORNERS + 2, l]
+        bx, by, bz = desk[CORNERS + 3, l], desk[CORNERS + 4, l], desk[CORNERS + 5, l]
+        cx, cy, cz = desk[CORNERS + 6, l], desk[CORNERS + 7, l], desk[CORNERS + 8, l]
+        mx, my, mz = (ax + bx + cx) * third, (ay + by + cy) * third, (az + bz + cz) * third
+        hx, hy, hz = desk[HALF, l], desk[HALF + 1, l], desk[HALF + 2, l]
+        radius = desk[RADIUS, l]
+        shrunk = radius * desk.dtype.type(1 - TOUCHING)
+        beyond_x = max(min(ax, min(bx, cx)), -max(ax, max(bx, cx))) - hx
+        beyond_y = max(min(ay, min(by, cy)), -max(ay, max(by, cy))) - hy
+        beyond_z = max(min(az, min(bz, cz)), -max(az, max(bz, cz))) - hz
+        clear = max(beyond_x, max(beyond_y, beyond_z)) >= shrunk
+        ax, ay, az, bx, by, bz, cx, cy, cz = ax - mx, ay - my, az - mz, bx - mx, by - my, bz - mz, cx - mx, cy - my, cz - mz
+        a2, b2, c2 = ax * ax + ay * ay + az * az, bx * bx + by * by + bz * bz, cx * cx + cy * cy + cz * cz
+        wide = np.sqrt(max(a2, max(b2, c2)))
+        ox, oy, oz = max(abs(mx) - hx, zero), max(abs(my) - hy, zero), max(abs(mz) - hz, zero)
+        reach = radius + wide
+        clear |= ox * ox + oy * oy + oz * oz >= reach * reach
+        desk[SPOT, l] = mx
+        desk[SPOT + 1, l] = my
+        desk[SPOT + 2, l] = mz
+        desk[RHO, l] = wide
+        desk[CLEAR, l] = one if clear else zero
+    near = False
+    for l in range(desk.shape[1]):
+        near |= desk[CLEAR, l] == zero
+    return near
+
+
+@kernel
+def to_triangle(desk):
+    """Move SPOT to the point of the triangle that is nearest to CORE; its barycentric weights go to WEIGHTS."""
+    zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-30)
+    for l in range(desk.shape[1]):
+        ax, ay, az = desk[CORNERS, l], desk[CORNERS + 1, l], desk[CORNERS + 2, l]
+        bx, by, bz = desk[CORNERS + 3, l] - ax, desk[CORNERS + 4, l] - ay, desk[CORNERS + 5, l] - az
+        cx, cy, cz = desk[CORNERS + 6, l] - ax, desk[CORNERS + 7, l] - ay, desk[CORNERS + 8, l] - az
+        qx, qy, qz = desk[CORE, l] - ax, desk[CORE + 1, l] - ay, desk[CORE + 2, l] - az
+        bb, bc, cc = bx * bx + by * by + bz * bz, bx * cx + by * cy + bz * cz, cx * cx + cy * cy + cz * cz
+        qb, qc = qx * bx + qy * by + qz * bz, qx * cx + qy * cy + qz * cz
+        area2 = bb * cc - bc * bc
+        scale = one / max(area2, tiny)
+        s, t = (cc * qb - bc * qc) * scale, (bb * qc - bc * qb) * scale
+        within = s >= zero and t >= zero and s + t <= one
+        # the nearest points of the sides, and how much less than |q|^2 their squared distances are
+        on_b = min(max(qb / max(bb, tiny), zero), one)
+        on_c = min(max(qc / max(cc, tiny), zero), one)
+        side = bb - bc - bc + cc
+        along = qc - qb - bc + bb
+        on_s = min(max(along / max(side, tiny), zero), one)
+        gain_b = on_b * (qb + qb - on_b * bb)
+        gain_c = on_c * (qc + qc - on_c * cc)
+        gain_s = qb + qb - bb + on_s * (along + along - on_s * side)
+        first = gain_b >= gain_c and gain_b >= gain_s
+        second = gain_c >= gain_s
+        es = on_b if first else (zero if second else one - on_s)
+        et = zero if first else (on_c if second else on_s)
+        s = s if within else es
+        t = t if within else et
+        desk[WEIGHTS, l] = one - s - t
+        desk[WEIGHTS + 1, l] = s
+        desk[WEIGHTS + 2, l] = t
+        desk[SPOT, l] = ax + s * bx + t * cx
+        desk[SPOT + 1, l] = ay + s * by + t * cy
+        desk[SPOT + 2, l] = az + s * bz + t * cz
+
+
+@kernel
+def _to_core_of_box(desk):
+    """Move CORE to the core's point nearest to SPOT: the half sides of a rounded box, less by what rho exceeds its radius."""
+    zero = desk.dtype.type(0)
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            half = max(desk[HALF + c, l] - max(desk[RHO, l] - desk[RADIUS, l], zero), zero)
+            desk[CORE + c, l] = min(max(desk[SPOT + c, l], -half), half)
+
+
+@kernel
+def _to_core_of_mesh(desk, shapes, k):
+    """Move CORE to where the distance is -rho, from SPOT along the normal, twice: behind an edge the normals are two."""
+    zero = desk.dtype.type(0)
+    desk[CORE : CORE + 3] = desk[SPOT : SPOT + 3]
+    for _ in range(2):
+        measure(desk, CORE, shapes, k, desk.dtype.type(np.inf))
+        for c in range(3):
+            for l in range(desk.shape[1]):
+                desk[CORE + c, l] -= max(desk[CONTACT, l] + desk[RHO, l], zero) * desk[CONTACT + 1 + c, l]
+
+
+@kernel
+def _some_may_touch(desk):
+    """Whether any lane's triangle may touch its rounded box; CLEAR learns which surely do not.
+
+    The plane through the box's furthest point along the way from CORE to SPOT parts it from a triangle that is all beyond.
+    """
+    one, tiny = desk.dtype.type(1), desk.dtype.type(1e-18)
+    for l in range(desk.shape[1]):
+        nx, ny, nz = desk[SPOT, l] - desk[CORE, l], desk[SPOT + 1, l] - desk[CORE + 1, l], desk[SPOT + 2, l] - desk[CORE + 2, l]
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        a = desk[CORNERS, l] * nx + desk[CORNERS + 1, l] * ny + desk[CORNERS + 2, l] * nz
+        b = desk[CORNERS + 3, l] * nx + desk[CORNERS + 4, l] * ny + desk[CORNERS + 5, l] * nz
+        c = desk[CORNERS + 6, l] * nx + desk[CORNERS + 7, l] * ny + desk[CORNERS + 8, l] * nz
+        shrunk = desk[RADIUS, l] * desk.dtype.type(1 - TOUCHING)
+        furthest = desk[HALF, l] * abs(nx) + desk[HALF + 1, l] * abs(ny) + desk[HALF + 2, l] * abs(nz) + shrunk * length
+        desk[CLEAR, l] = one if min(a, min(b, c)) >= furthest + tiny else desk[CLEAR, l]
+    some = False
+    for l in range(desk.shape[1]):
+        some |= desk[CLEAR, l] == 0
+    return some
+
+
+@kernel
+def _keep(desk, at):
+    """Remember SPOT in three other rows."""
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            desk[at + c, l] = desk[SPOT + c, l]
+
+
+@kernel
+def _two_rounds_and_a_leap(desk):
+    """Two rounds with a rounded box, and from there to where the rounds lead (Aitken's extrapolation).
+
+    Where a long edge of the solid runs at a small angle to the triangle, rounds alone come nearer by little each.
+    """
+    zero, tiny, most = desk.dtype.type(0), desk.dtype.type(1e-18), desk.dtype.type(MOST)
+    _keep(desk, BEFORE)
+    _to_core_of_box(desk)
+    to_triangle(desk)
+    _keep(desk, BETWEEN)
+    _to_core_of_box(desk)
+    to_triangle(desk)
+    for l in range(desk.shape[1]):
+        fx, fy, fz = desk[BETWEEN, l], desk[BETWEEN + 1, l], desk[BETWEEN + 2, l]
+        px, py, pz = fx - desk[BEFORE, l], fy - desk[BEFORE + 1, l], fz - desk[BEFORE + 2, l]
+        fx, fy, fz = desk[SPOT, l] - fx, desk[SPOT + 1, l] - fy, desk[SPOT + 2, l] - fz
+        ratio = (fx * px + fy * py + fz * pz) / max(px * px + py * py + pz * pz, tiny)
+        ratio = min(max(ratio, zero), most)
+        leap = ratio / (desk.dtype.type(1) - ratio)
+        desk[CORE, l] = desk[SPOT, l] + leap * fx
+        desk[CORE + 1, l] = desk[SPOT + 1, l] + leap * fy
+        desk[CORE + 2, l] = desk[SPOT + 2, l] + leap * fz
+    to_triangle(desk)
+
+
+@kernel
+def find_deepest(desk, shapes, k):
+    """Find the deepest point of the triangle in CORNERS, from SPOT on, all in the solid's axes; return whether any lane may touch.
+
+    It is left in SPOT with its weights, and the core's in CORE; CONTACT has its signed distance and the solid's normal there.
+    """
+    if shapes.kinds[k] == MESH:
+        beyond = shapes.cells[k] * desk.dtype.type(CELLS)
+        for l in range(desk.shape[1]):
+            desk[RHO, l] = desk[THICKNESS, l] + beyond
+        for _ in range(MESH_ROUNDS):
+            _to_core_of_mesh(desk, shapes, k)
+            to_triangle(desk)
+        measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
+        return True
+    boxes = False
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            boxes |= desk[HALF + c, l] > 0
+    for l in range(desk.shape[1]):
+        desk[RHO, l] = desk.dtype.type(DEPTH) * desk[THICKNESS, l]
+    _to_core_of_box(desk)
+    to_triangle(desk)
+    if boxes:  # the core of a sphere is a point, for which one round is all there is to do
+        if not _some_may_touch(desk):
+            return False
+        _two_rounds_and_a_leap(desk)
+        measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
+        for l in range(desk.shape[1]):
+            desk[RHO, l] = max(desk[RHO, l], desk.dtype.type(-2) * desk[CONTACT, l])
+        _two_rounds_and_a_leap(desk)
+        _to_core_of_box(desk)
+        to_triangle(desk)
+    measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
+    return True
+
+
+@kernel
+def _turn_normal(desk):
+    """Turn CONTACT's normal into that of contact, and its distance into the way out along it."""
+    zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-18)
+    slant = desk.dtype.type(SLANT)
+    for l in range(desk.shape[1]):
+        nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+        dx = desk[SPOT, l] - desk[CORE, l]
+        dy = desk[SPOT + 1, l] - desk[CORE + 1, l]
+        dz = desk[SPOT + 2, l] - desk[CORE + 2, l]
+        scale = one / np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
+        dx, dy, dz = dx * scale, dy * scale, dz * scale
+        cosine = dx * nx + dy * ny + dz * nz
+        usable = cosine >= slant
+        desk[CONTACT + 1, l] = dx if usable else nx
+        desk[CONTACT + 2, l] = dy if usable else ny
+        desk[CONTACT + 3, l] = dz if usable else nz
+        way = max(-desk[CONTACT, l], zero)
+        way = way / cosine if usable else way
+        desk[CONTACT, l] = way if desk[CLEAR, l] == zero else zero
+
+
+@kernel
+def _add_corner(v, w, corner, desk):
+    """Add a corner's share to the velocity of the point and to its inverse mass."""
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            desk[MOTION + c, l] += desk[WEIGHTS + corner, l] * v[c, l]
+    for l in range(desk.shape[1]):
+        desk[YIELDING, l] += w[l] * desk[WEIGHTS + corner, l] * desk[WEIGHTS + corner, l]
+
+
+@kernel
+def _push_out(carried, desk):
+    """What the contact changes, per inverse mass and weight of a corner: of positions to SPOT, of velocities to MOTION."""
+    zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12)
+    for l in range(desk.shape[1]):
+        depth, nx, ny, nz = desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+        yielding = desk[YIELDING, l]
+        share = one / yielding if depth > zero and yielding > zero else zero
+        ux = desk[MOTION, l] - desk[VELOCITY, l]
+        uy = desk[MOTION + 1, l] - desk[VELOCITY + 1, l]
+        uz = desk[MOTION + 2, l] - desk[VELOCITY + 2, l]
+        un = ux * nx + uy * ny + uz * nz
+        tx, ty, tz = ux - un * nx, uy - un * ny, uz - un * nz
+        stopped = max(-un, zero)
+        speed = np.sqrt(tx * tx + ty * ty + tz * tz) + tiny
+        lost = min(desk[FRICTION, l] * stopped / speed, one)
+        desk[SPOT, l] = share * (depth * nx - carried * lost * tx)
+        desk[SPOT + 1, l] = share * (depth * ny - carried * lost * ty)
+        desk[SPOT + 2, l] = share * (depth * nz - carried * lost * tz)
+        desk[MOTION, l] = share * (stopped * nx - lost * tx)
+        desk[MOTION + 1, l] = share * (stopped * ny - lost * ty)
+        desk[MOTION + 2, l] = share * (stopped * nz - lost * tz)
+
+
+@kernel
+def _move_corner(x, v, w, corner, desk):
+    for l in range(desk.shape[1]):
+        desk[YIELDING, l] = w[l] * desk[WEIGHTS + corner, l]
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            x[c, l] += desk[YIELDING, l] * desk[SPOT + c, l]
+        for l in range(desk.shape[1]):
+            v[c, l] += desk[YIELDING, l] * desk[MOTION + c, l]
+
+
+@kernel
+def _place(x, desk, local):
+    """A particle's place in the solid's axes."""
+    to_axes(x, desk, CORE)
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            local[c, l] = desk[CORE + c, l]
+
+
+@kernel
+def _fetch(local, desk, at):
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            desk[at + c, l] = local[c, l]
+
+
+@kernel
+def touch_surface(x, v, w, triangles, shapes, k, carried, desk):
+    """Resolve the contacts of one block's triangles with the solid on the desk, which is no plane.
+
+    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); carried: how long the velocity that friction takes has
+    moved the positions already [s]; desk: (DESK, lanes).
+    """
+    local = np.empty(x.shape, x.dtype)
+    for p in range(x.shape[0]):
+        _place(x[p], desk, local[p])
+    for t in range(triangles.shape[0]):
+        for c in range(3):
+            _fetch(local[triangles[t, c]], desk, CORNERS + 3 * c)
+        if not _may_touch_triangle(desk):
+            continue
+        if shapes.kinds[k] == MESH:
+            measure(desk, SPOT, shapes, k, desk.dtype.type(0))
+            near = False
+            for l in range(desk.shape[1]):
+                if desk[CONTACT, l] >= desk[RHO, l]:
+                    desk[CLEAR, l] = 1
+                near |= desk[CLEAR, l] == 0
+            if not near:
+                continue
+        if not find_deepest(desk, shapes, k):
+            continue
+        touching = False
+        for l in range(desk.shape[1]):
+            touching |= (desk[CONTACT, l] < 0) & (desk[CLEAR, l] == 0)
+        if touching:
+            _turn_normal(desk)
+            normal_to_world(desk)
+            desk[MOTION : YIELDING + 1] = 0
+            for c in range(3):
+                _add_corner(v[triangles[t, c]], w[triangles[t, c]], c, desk)
+            _push_out(carried, desk)
+            for c in range(3):
+                _move_corner(x[triangles[t, c]], v[triangles[t, c]], w[triangles[t, c]], c, desk)
+            for c in range(3):
+                _place(x[triangles[t, c]], desk, local[triangles[t, c]])
