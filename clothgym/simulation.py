@@ -16,7 +16,7 @@ from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
-from clothgym.collisions import DESK, Collider, Solids, resolve
+from clothgym.collisions import DESK, Collider, Solids, resolve, room_for_touches
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
@@ -30,12 +30,12 @@ from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masse
 from clothgym.state import Elastic, Fabric, Layout, State, at_rest, check_fits, digest_of, element_arrays, surface_arrays
 
 GRAVITY = 9.81
-SURFACE_INTERVAL = 2e-3  # solids touch the sheet between its particles at least this often [s]
+SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
 
 
 def advance(
-    first, last, x, v, w, elements, surface, fabric, shapes, colliders, h, carried, substeps, air_every, touch_every, options, plan,
+    first, last, x, v, w, elements, surface, fabric, shapes, colliders, h, carried, substeps, air_every, look_every, options, plan,
     rows, limit, limited, diverged,
 ):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
@@ -43,6 +43,7 @@ def advance(
     for b in range(first, last):
         work = np.empty((rows, 3, x.shape[3]), x.dtype)
         push = np.zeros(x.shape[1:], x.dtype)
+        touches = room_for_touches(x[b], surface.triangles, shapes)
         desk = np.empty((DESK, x.shape[3]), x.dtype)
         elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
         limited[b] = 0
@@ -52,9 +53,8 @@ def advance(
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
-            since = step % touch_every + 1
-            interval = since if since == touch_every or step + 1 == substeps else 0
-            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, interval, desk)
+            look = step % look_every == 0
+            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)
         remeasure(x[b], elements.springs, limited[b])  # noqa: F821
         mark_diverged(x[b], v[b], diverged[b])
 
@@ -178,14 +178,14 @@ class Simulation(Observed):
         self._prepare()
         rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
-        touch_every = max(1, int(SURFACE_INTERVAL / h))
+        look_every = max(1, int(SURFACE_INTERVAL / h))
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
-                self._solids.shapes, self._solids.rows, h, carried, self.substeps, air_every, touch_every, options, self._plan,
+                self._solids.shapes, self._solids.rows, h, carried, self.substeps, air_every, look_every, options, self._plan,
                 rows, limit, self._limited, self._diverged,
             )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """Contact of a sheet with solids: no penetration, no inward velocity, Coulomb friction.
 
-Applied to the positions and velocities that the integrator left: after each substep to the particles, and from time to time to the
-sheet between them (``surface``).  The normal impulse is the inward velocity that is taken away; friction takes at most ``mu`` times
+Applied after each substep to the positions and velocities that the integrator left, of the particles and of the sheet between them
+(``surface``).  The normal impulse is the inward velocity that is taken away; friction takes at most ``mu`` times
 as much from the tangential velocity (Bridson, Fedkiw and Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction
 takes from the velocity is taken from the displacement too, as far as the integrator has moved by it, or a sheet at rest on a slope
 would creep by ``h^2 g sin`` a substep.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.collisions.distance import CONTACT, DESK, MOTION, SPOT, YIELDING, Shapes, lay_out, may_touch, measure_in_world
 from clothgym.collisions.shapes import FRICTION, PLANE, POINT, VELOCITY
-from clothgym.collisions.surface import any_near, touch_surface
+from clothgym.collisions.surface import any_near, find_touches, press
 from clothgym.state import Layout
 
 
@@ -61,13 +61,12 @@ def _push_out(x, v, w, carried, desk):
 
 
 @kernel
-def resolve(x, v, w, triangles, shapes, colliders, h, carried, interval, desk):
+def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
     """Resolve the contacts of one block after a substep of ``h`` [s], and move the solids on by their velocity.
 
     x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
     ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the positions already [s];
-    interval: substeps since the sheet between the particles had its turn, if it has one now, or 0; desk: scratch, (DESK,
-    lanes).
+    look: whether to look anew where the sheet touches between its particles, to ``touches``; desk: scratch, (DESK, lanes).
     """
     kinds = shapes.kinds
     for k in range(kinds.shape[0]):
@@ -80,13 +79,13 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, interval, desk):
             if may_touch(x[p], collider, kinds[k]):
                 measure_in_world(x[p], desk, shapes, k)
                 _push_out(x[p], v[p], w[p], carried, desk)
-    if interval > 0:
-        # a velocity that has grown evenly since then has moved the positions for half of the time
-        carried += h * x.dtype.type(interval - 1) / x.dtype.type(2)
+    if look:
+        touches[2][0] = 0
         for k in range(kinds.shape[0]):
             if kinds[k] != PLANE and any_near(x, colliders[k], desk):
                 lay_out(colliders[k], desk)
-                touch_surface(x, v, w, triangles, shapes, k, carried, desk)
+                find_touches(x, triangles, shapes, k, touches, desk)
+    press(x, v, w, triangles, colliders, touches, carried, desk)
 
 
 @kernel

@@ -8,9 +8,15 @@ two of them cross.  The core of a sphere is its centre and one round is exact; t
 
 The core must lie deeper than any point of the triangle: where one turns out to lie deeper than half of ``rho``, this is doubled.
 But on a solid with sharp edges a point of the triangle that is nearest to the core is not quite the deepest one: the difference is
-up to a fifth of ``rho``.  So ``rho`` begins at four thicknesses, which keeps that error within the thickness.
+up to a fifth of ``rho``.  So ``rho`` begins at two thicknesses, which keeps that error below half of one.
 
-The corners of the triangle take what its point needs by their barycentric weights over their masses.
+Points are looked for from time to time (``simulation.SURFACE_INTERVAL``).  Until the next time each stands for a plane that moves
+with the solid, and in every substep what has gone through its plane is pushed back, loses its inward velocity, and feels friction;
+the corners of the triangle take it by their barycentric weights over their masses.  Friction must come in every substep: a sheet
+that is left to itself for three creeps off a capsule within seconds, even if all that it moved is taken back on average.
+
+Particles keep the whole thickness, the sheet between them a quarter of it: where it is fine enough for a solid, the particles carry
+it alone, and the points are there for what they miss.
 """
 
 from __future__ import annotations
@@ -30,15 +36,20 @@ from clothgym.collisions.distance import (
     SPOT,
     WEIGHTS,
     YIELDING,
+    lay_out,
     measure,
     normal_to_world,
     to_axes,
 )
-from clothgym.collisions.shapes import FRICTION, HALF, MESH, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
+from clothgym.collisions.shapes import FRICTION, HALF, MESH, PLANE, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
 
+TOUCH = 13  # rows of a touch: weights, each three times; gap, from the solid's point along the normal; normal
+NONE = 1e9  # [m], the gap of a lane that does not touch
 MESH_ROUNDS = 3
 MOST = 0.98  # of the distance is left after a round, where a leap trusts the rounds
-DEPTH = 4.0  # rho over the thickness, at first
+DEPTH = 2.0  # rho over the thickness, at first
+SOON = 0.25  # gap over the thickness within which a triangle may touch before the next look
+KEPT = 0.25  # share of the thickness that the sheet between its particles keeps
 CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid
 TOUCHING = 1e-3  # share of the radius by which cloth may be in it and yet count as lying on it
 SLANT = 0.5  # the least cosine between the normals of contact and of the solid: at a box's corner it is 0.58
@@ -259,9 +270,12 @@ def find_deepest(desk, shapes, k):
 
 @kernel
 def _turn_normal(desk):
-    """Turn CONTACT's normal into that of contact, and its distance into the way out along it."""
-    zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-18)
-    slant = desk.dtype.type(SLANT)
+    """Turn CONTACT's normal into that of contact, and its distance into the gap along it; return whether any lane needs it.
+
+    A lane whose gap is wider than a part of the thickness, or which surely does not touch, has none.
+    """
+    zero, one, tiny, none = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-18), desk.dtype.type(NONE)
+    slant, soon = desk.dtype.type(SLANT), desk.dtype.type(SOON)
     for l in range(desk.shape[1]):
         nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         dx = desk[SPOT, l] - desk[CORE, l]
@@ -274,19 +288,12 @@ def _turn_normal(desk):
         desk[CONTACT + 1, l] = dx if usable else nx
         desk[CONTACT + 2, l] = dy if usable else ny
         desk[CONTACT + 3, l] = dz if usable else nz
-        way = max(-desk[CONTACT, l], zero)
-        way = way / cosine if usable else way
-        desk[CONTACT, l] = way if desk[CLEAR, l] == zero else zero
-
-
-@kernel
-def _add_corner(v, w, corner, desk):
-    """Add a corner's share to the velocity of the point and to its inverse mass."""
-    for c in range(3):
-        for l in range(desk.shape[1]):
-            desk[MOTION + c, l] += desk[WEIGHTS + corner, l] * v[c, l]
+        gap = desk[CONTACT, l] / cosine if usable else desk[CONTACT, l]
+        desk[CONTACT, l] = gap if (desk[CLEAR, l] == zero) & (gap < soon * desk[THICKNESS, l]) else none
+    some = False
     for l in range(desk.shape[1]):
-        desk[YIELDING, l] += w[l] * desk[WEIGHTS + corner, l] * desk[WEIGHTS + corner, l]
+        some |= desk[CONTACT, l] < none
+    return some
 
 
 @kernel
@@ -294,9 +301,9 @@ def _push_out(carried, desk):
     """What the contact changes, per inverse mass and weight of a corner: of positions to SPOT, of velocities to MOTION."""
     zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12)
     for l in range(desk.shape[1]):
-        depth, nx, ny, nz = desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+        depth, nx, ny, nz = -desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         yielding = desk[YIELDING, l]
-        share = one / yielding if depth > zero and yielding > zero else zero
+        share = one / yielding if (depth > zero) & (yielding > zero) else zero
         ux = desk[MOTION, l] - desk[VELOCITY, l]
         uy = desk[MOTION + 1, l] - desk[VELOCITY + 1, l]
         uz = desk[MOTION + 2, l] - desk[VELOCITY + 2, l]
@@ -314,14 +321,12 @@ def _push_out(carried, desk):
 
 
 @kernel
-def _move_corner(x, v, w, corner, desk):
-    for l in range(desk.shape[1]):
-        desk[YIELDING, l] = w[l] * desk[WEIGHTS + corner, l]
+def _move_corner(x, v, w, weight, desk):
     for c in range(3):
         for l in range(desk.shape[1]):
-            x[c, l] += desk[YIELDING, l] * desk[SPOT + c, l]
+            x[c, l] += w[l] * weight[l] * desk[SPOT + c, l]
         for l in range(desk.shape[1]):
-            v[c, l] += desk[YIELDING, l] * desk[MOTION + c, l]
+            v[c, l] += w[l] * weight[l] * desk[MOTION + c, l]
 
 
 @kernel
@@ -334,20 +339,46 @@ def _place(x, desk, local):
 
 
 @kernel
-def _fetch(local, desk, at):
-    for c in range(3):
-        for l in range(desk.shape[1]):
-            desk[at + c, l] = local[c, l]
+def _fetch(rows, desk, at):
+    """Copy rows to the desk; they lie side by side, so that one loop will do."""
+    size = rows.shape[0] * rows.shape[1]
+    source, target = rows.reshape(size), desk[at : at + rows.shape[0]].reshape(size)
+    for e in range(size):
+        target[e] = source[e]
 
 
 @kernel
-def touch_surface(x, v, w, triangles, shapes, k, carried, desk):
-    """Resolve the contacts of one block's triangles with the solid on the desk, which is no plane.
+def _near_in_grid(desk, shapes, k):
+    """Whether any lane's triangle can reach a mesh, judged at its centre; CLEAR learns whose cannot."""
+    measure(desk, SPOT, shapes, k, desk.dtype.type(0))
+    near = False
+    for l in range(desk.shape[1]):
+        if desk[CONTACT, l] >= desk[RHO, l]:
+            desk[CLEAR, l] = 1
+        near |= desk[CLEAR, l] == 0
+    return near
 
-    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); carried: how long the velocity that friction takes has
-    moved the positions already [s]; desk: (DESK, lanes).
+
+@kernel
+def room_for_touches(x, triangles, shapes):
+    """Where ``find_touches`` writes, for one block: rows of each touch, its triangle and solid, how many there are, and scratch."""
+    solids = 0
+    for k in range(shapes.kinds.shape[0]):
+        solids += shapes.kinds[k] != PLANE
+    most = triangles.shape[0] * solids
+    rows, scratch = np.empty((most, TOUCH, x.shape[2]), x.dtype), np.empty(x.shape, x.dtype)
+    return rows, np.empty((most, 2), np.int64), np.zeros(1, np.int64), scratch
+
+
+@kernel
+def find_touches(x, triangles, shapes, k, touches, desk):
+    """Find where one block's triangles touch the solid on the desk, which is no plane, or soon may.
+
+    x [m]: (particles, 3, lanes); touches: as ``room_for_touches`` made them; desk: (DESK, lanes).
     """
-    local = np.empty(x.shape, x.dtype)
+    rows, which, count, local = touches
+    for l in range(desk.shape[1]):
+        desk[RADIUS, l] -= desk.dtype.type(1 - KEPT) * desk[THICKNESS, l]
     for p in range(x.shape[0]):
         _place(x[p], desk, local[p])
     for t in range(triangles.shape[0]):
@@ -355,28 +386,63 @@ def touch_surface(x, v, w, triangles, shapes, k, carried, desk):
             _fetch(local[triangles[t, c]], desk, CORNERS + 3 * c)
         if not _may_touch_triangle(desk):
             continue
-        if shapes.kinds[k] == MESH:
-            measure(desk, SPOT, shapes, k, desk.dtype.type(0))
-            near = False
-            for l in range(desk.shape[1]):
-                if desk[CONTACT, l] >= desk[RHO, l]:
-                    desk[CLEAR, l] = 1
-                near |= desk[CLEAR, l] == 0
-            if not near:
-                continue
-        if not find_deepest(desk, shapes, k):
+        if shapes.kinds[k] == MESH and not _near_in_grid(desk, shapes, k):
             continue
+        if find_deepest(desk, shapes, k) and _turn_normal(desk):
+            # the plane, as how far it is from the solid's point along the normal
+            for l in range(desk.shape[1]):
+                nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+                desk[CONTACT, l] -= nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
+            normal_to_world(desk)
+            touch = rows[count[0]]
+            for c in range(9):
+                for l in range(desk.shape[1]):
+                    touch[c, l] = desk[WEIGHTS + c // 3, l]
+            for c in range(4):
+                for l in range(desk.shape[1]):
+                    touch[9 + c, l] = desk[CONTACT + c, l]
+            which[count[0], 0] = t
+            which[count[0], 1] = k
+            count[0] += 1
+
+
+@kernel
+def press(x, v, w, triangles, colliders, touches, carried, desk):
+    """Resolve the touches of one block.
+
+    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); carried: how long the velocity that friction takes has
+    moved the positions already [s]; desk: (DESK, lanes).
+    """
+    rows, which, count, _ = touches
+    size = 3 * desk.shape[1]
+    spot, motion = desk[SPOT : SPOT + 3].reshape(size), desk[MOTION : MOTION + 3].reshape(size)
+    point = desk[POINT : POINT + 3].reshape(size)
+    flat_x, flat_v = x.reshape((x.shape[0], size)), v.reshape((x.shape[0], size))
+    solid = -1
+    for n in range(count[0]):
+        if which[n, 1] != solid:
+            solid = which[n, 1]
+            lay_out(colliders[solid], desk)
+        i, j, m = triangles[which[n, 0], 0], triangles[which[n, 0], 1], triangles[which[n, 0], 2]
+        touch = rows[n]
+        _fetch(touch[9:TOUCH], desk, CONTACT)
+        a, b, c = touch[0:3].reshape(size), touch[3:6].reshape(size), touch[6:9].reshape(size)
+        xi, xj, xm = flat_x[i], flat_x[j], flat_x[m]
+        for e in range(size):
+            spot[e] = a[e] * xi[e] + b[e] * xj[e] + c[e] * xm[e] - point[e]
+        for l in range(desk.shape[1]):
+            nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+            desk[CONTACT, l] += nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
         touching = False
         for l in range(desk.shape[1]):
-            touching |= (desk[CONTACT, l] < 0) & (desk[CLEAR, l] == 0)
+            touching |= desk[CONTACT, l] < 0
         if touching:
-            _turn_normal(desk)
-            normal_to_world(desk)
-            desk[MOTION : YIELDING + 1] = 0
-            for c in range(3):
-                _add_corner(v[triangles[t, c]], w[triangles[t, c]], c, desk)
+            vi, vj, vm, wi, wj, wm = flat_v[i], flat_v[j], flat_v[m], w[i], w[j], w[m]
+            for e in range(size):
+                motion[e] = a[e] * vi[e] + b[e] * vj[e] + c[e] * vm[e]
+            for l in range(desk.shape[1]):
+                desk[YIELDING, l] = wi[l] * a[l] * a[l] + wj[l] * b[l] * b[l] + wm[l] * c[l] * c[l]
             _push_out(carried, desk)
-            for c in range(3):
-                _move_corner(x[triangles[t, c]], v[triangles[t, c]], w[triangles[t, c]], c, desk)
-            for c in range(3):
-                _place(x[triangles[t, c]], desk, local[triangles[t, c]])
+            _move_corner(x[i], v[i], wi, a, desk)
+            _move_corner(x[j], v[j], wj, b, desk)
+            _move_corner(x[m], v[m], wm, c, desk)
