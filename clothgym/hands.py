@@ -2,7 +2,8 @@
 
 A hand is a point that moves at a bounded speed and carries the particles that it holds.  An anchor is a hand bound to one
 particle, or to a patch of them, as a clip is; a gripper takes what lies between its fingers when they close.  Held particles
-have no inverse mass: nothing but their hand moves them.
+have no inverse mass: nothing but their hand moves them.  A hand does not enter solids, nor does it take what it holds into them: it
+stops at the surface, and slides along it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym._jit import kernel, run_spans, specialize
 from clothgym.bending import BEND_SCRATCH, Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
+from clothgym.collisions import DESK, ROWS, Solids, keep_out, stop_at_solids
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.state import Elements, Fabric, Layout, State, SurfaceArrays
 
@@ -28,7 +30,7 @@ FREE = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Gripper:
-    """A gripper with two fingers, a kinematic body: it moves as it is told, and its fingers do not push the cloth.
+    """A gripper with two fingers, a kinematic body: it moves as it is told, stopped by solids only; its fingers do not push the cloth.
 
     Attributes:
         position: of its tip, where it begins [m].
@@ -66,6 +68,7 @@ class Hands:
         x, targets: where each hand is, and is to be [m], (block, hands, 3, lane).
         opening, wanted: of the fingers, from 0 (closed) to 1, (block, hands, lane); an anchor's is 0.
         holder: which hand holds each particle, or FREE, (block, particles, lane).
+        blocked: which hands solids have stopped or turned aside in the last control step, (block, hands, lane).
     """
 
     def __init__(
@@ -92,6 +95,7 @@ class Hands:
             rows.append((g.speed, time_step / g.closing_time, g.reach**2, slip))
         self.limits = np.array(rows, dtype).reshape(-1, 4)
         self.can_slip = bool(np.isfinite(self.limits[:, SLIP2]).any())
+        self.blocked = np.zeros((layout.blocks, self.count, layout.lanes), bool)
         self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
 
     def restore(self, state: State) -> None:
@@ -123,6 +127,7 @@ class Hands:
         self.holder[block[:, None], self.members, lane[:, None]] = self.member_of
         for array in (self.x, self.targets):
             array[block, :count, :, lane] = particles[..., self.anchors, :]
+        self.blocked[block, :, lane] = False
         self.place(block, lane, self.homes)
         self.opening[block, count:, lane] = self.wanted[block, count:, lane] = 1
 
@@ -157,11 +162,11 @@ class Hands:
         """Whether each anchor holds its particle, (num_envs, anchors)."""
         return self.layout.to_public(self.holder[:, self.anchors] == np.arange(len(self.anchors))[:, None])
 
-    def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray) -> None:
+    def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids) -> None:
         """Begin a control step of blocks ``first`` to ``last``."""
         steer_blocks(
             first, last, x, v, w, free_w, self.x, self.targets, self.opening, self.wanted, self.holder, self.limits,
-            self.anchors, x.dtype.type(self.time_step),
+            self.anchors, x.dtype.type(self.time_step), solids.rows, solids.shapes, self.blocked,
         )  # fmt: skip
 
     def pulls(
@@ -270,9 +275,10 @@ def count_held(holder, anchors, out):
 
 
 @kernel
-def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step, colliders, shapes, blocked):
     """Begin a control step of one block: move fingers, take hold or let go, and set the velocity of what is held.
 
+    colliders, shapes: what hands cannot go through.  blocked: which hands that has changed the way of, (hands, lanes).
     hand: moved on to where it is at the end of the step.  limits: (hands, 4).  anchors: where an anchor is, (anchors,) particles;
     its position is taken from there, so that rounding in the substeps does not add up.
     """
@@ -309,6 +315,10 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
             speed = np.sqrt(dx * dx + dy * dy + dz * dz) / time_step
             slow = one / (max(speed / limits[k, SPEED], one) * time_step)
             move[0, l], move[1, l], move[2, l] = dx * slow, dy * slow, dz * slow
+        for l in range(lanes):
+            blocked[k, l] = False
+        if colliders.shape[0] > 0:
+            bar(x, hand[k], k, move, holder, colliders, shapes, time_step, blocked[k])
         for c in range(3):
             for l in range(lanes):
                 hand[k, c, l] += move[c, l] * time_step
@@ -320,9 +330,38 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
 
 
 @kernel
-def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+def bar(x, hand, k, move, holder, colliders, shapes, time_step, blocked):
+    """Change the velocity of one hand in ``move``, (3, lanes), so that neither it nor what it holds enters a solid.
+
+    hand: where it is, (3, lanes).  k: which it is.  blocked: in which lanes something was in its way, (lanes,).
+    """
+    point, rows, desk = np.empty((3, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
+    tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
+    for l in range(x.shape[2]):
+        for c in range(3):
+            tip[c] = hand[c, l]
+            way[c] = move[c, l] * time_step
+        changed = stop_at_solids(tip, way, colliders, shapes, l, time_step, point, rows, desk)
+        for p in range(x.shape[0]):
+            if holder[p, l] == k:
+                for c in range(3):
+                    tip[c] = x[p, c, l]
+                changed |= keep_out(tip, way, colliders, shapes, l, time_step, point, rows, desk)
+        if changed:
+            blocked[l] = True
+            for c in range(3):
+                move[c, l] = way[c] / time_step
+
+
+@kernel
+def steer_blocks(
+    first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step, colliders, shapes, blocked
+):  # fmt: skip
     for b in range(first, last):
-        steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
+        steer(
+            x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step,
+            colliders[b], shapes, blocked[b],
+        )  # fmt: skip
 
 
 def add_pulls(first, last, x, v, free_w, elements, surface, fabric, holder, out):

@@ -78,6 +78,11 @@ class Observed:
         """Where each anchor and then each gripper is [m], (num_envs, hands, 3); a fresh copy."""
         return self.layout.to_public(self._hands.x)
 
+    @property
+    def blocked(self) -> NDArray:
+        """Which hands, anchors and then grippers, solids stopped or turned aside in the last control step, (num_envs, hands)."""
+        return self.layout.to_public(self._hands.blocked)
+
     def pulls(self) -> NDArray:
         """Force with which the cloth pulls at each anchor and then each gripper [N], (num_envs, hands, 3): the springs',
         the weight's and the air's on the particles that it holds; not what accelerates these."""

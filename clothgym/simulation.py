@@ -182,7 +182,7 @@ class Simulation(Observed):
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
-            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w)
+            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
                 self._solids.shapes, self._solids.rows, h, carried, self.substeps, air_every, look_every, options, self._plan,
