@@ -30,7 +30,7 @@ FREE = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Gripper:
-    """A gripper with two fingers, a kinematic body: it moves as it is told, stopped by solids only; its fingers do not push the cloth.
+    """A gripper with two fingers, a kinematic body: it moves as told, stopped by solids only; its fingers do not push the cloth.
 
     Attributes:
         position: of its tip, where it begins [m].

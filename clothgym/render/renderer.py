@@ -190,7 +190,7 @@ class Renderer:
         normals = np.empty((first[-1], 3), np.float32)
         place_vertices(x, cloth.index, cloth.weight, vertices)
         lift = min(0.6 * cloth.cell, HIGHEST_LIFT)  # a cell across a sharp edge then just spans it
-        for solid in things.solids if lift > 0 else ():
+        for solid in (solid for solid in things.solids if lift > 0 and solid.upright):
             (half, radius), center = solid.rounded_box(), tuple(map(float, solid.center))
             push_out(vertices, len(cloth.uv), center, math.cos(solid.yaw), math.sin(solid.yaw), half, radius, lift, DEEPEST)
         vertex_normals(vertices[: first[0]], cloth.triangles, normals[: first[0]])

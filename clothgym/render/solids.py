@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-KINDS = {"sphere": ("radius",), "box": ("half_sides",), "capsule": ("radius", "height")}
+from clothgym.collisions.shapes import UNTURNED, Quaternion, turned
+
+KINDS = {"sphere": ("radius",), "box": ("half_sides",), "capsule": ("radius", "height"), "mesh": ("vertices", "triangles")}
 WARM_GREY = (196, 189, 178)
 SMALL = 0.03  # radius of a round solid, a marker say, that is drawn with the fewer segments [m]
 BOX_EDGE = 0.01  # radius to which the edges of a box are rounded [m]
@@ -34,12 +36,14 @@ class Solid:
     """A thing beside the cloth.
 
     Attributes:
-        kind: "sphere" (radius), "box" (half_sides, yaw) or "capsule" (radius, height; upright).
+        kind: "sphere" (radius), "box" (half_sides), "capsule" (radius, height; upright) or "mesh" (vertices, triangles).
         center: its middle [m].
         radius: of a sphere or a capsule [m].
         half_sides: half lengths of a box along its own x, y, z [m].
         height: of a capsule from end to end [m].
-        yaw: of a box about z [rad].
+        vertices: of a mesh in its own axes [m], (vertices, 3), and triangles, (triangles, 3), counter-clockwise from outside.
+        yaw: turn about z [rad], before rotation.
+        rotation: a quaternion (w, x, y, z) of any length.
         color: sRGB, three numbers from 0 to 255.
 
     Raises:
@@ -51,7 +55,10 @@ class Solid:
     radius: float | None = None
     half_sides: Vector | None = None
     height: float | None = None
+    vertices: NDArray | None = field(default=None, compare=False, repr=False)
+    triangles: NDArray | None = field(default=None, compare=False, repr=False)
     yaw: float = 0.0
+    rotation: Quaternion = UNTURNED
     color: Color = WARM_GREY
 
     def __post_init__(self) -> None:
@@ -61,10 +68,13 @@ class Solid:
             raise ValueError(f"{self.kind} center={self.center!r}: must be three finite numbers")
         for name in ("radius", "half_sides", "height"):
             self._check_size(name, getattr(self, name))
+        for name in ("vertices", "triangles"):
+            self._check_corners(name, getattr(self, name))
         if self.kind == "capsule" and self.height < 2 * self.radius:  # type: ignore[operator]
             raise ValueError(f"capsule height={self.height!r}: must be at least twice the radius {self.radius!r}")
         if not math.isfinite(self.yaw):
             raise ValueError(f"{self.kind} yaw={self.yaw!r}: must be finite")
+        turned(f"{self.kind} rotation", self.rotation)
         check_color(f"{self.kind} color", self.color)
 
     def _check_size(self, name: str, size: float | Vector | None) -> None:
@@ -77,6 +87,25 @@ class Solid:
             wanted = "three positive lengths" if shape else "a positive length"
             raise ValueError(f"{self.kind} {name}={size!r}: must be {wanted} in metres")
 
+    def _check_corners(self, name: str, corners: NDArray | None) -> None:
+        if (corners is None) != (name not in KINDS[self.kind]):
+            raise ValueError(
+                f"{self.kind} {name}: " + ("give them" if corners is None else f"a {self.kind} has none, leave them out")
+            )
+        if corners is not None and (np.ndim(corners) != 2 or np.shape(corners)[1] != 3 or not len(corners)):
+            raise ValueError(f"{self.kind} {name} have shape {np.shape(corners)}: must be ({name}, 3)")
+
+    @property
+    def axes(self) -> NDArray[np.float32]:
+        """The solid's own axes in the world, (3, 3), an axis a row."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return (np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) @ turned("rotation", self.rotation)).astype(np.float32)
+
+    @property
+    def upright(self) -> bool:
+        """Whether it is a rounded box that is turned about z alone."""
+        return self.kind != "mesh" and self.rotation[1] == self.rotation[2] == self.rotation[3] == 0
+
     def rounded_box(self) -> tuple[Vector, float]:
         """The half sides of a box and the radius of a ball [m] that together, the ball swept over the box, make the solid."""
         if self.kind == "box":
@@ -86,14 +115,19 @@ class Solid:
 
     def mesh(self) -> Mesh:
         """The solid's surface in the world; a box is drawn with its edges rounded a little."""
+        if self.kind == "mesh":
+            corners = np.asarray(self.vertices, np.float32)[np.asarray(self.triangles)] @ self.axes
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-20))
+            positions = corners.reshape(-1, 3) + np.asarray(self.center, np.float32)
+            return Mesh(positions, np.repeat(normals, 3, axis=0), np.arange(len(positions), dtype=np.int32).reshape(-1, 3))
         half, radius = self.rounded_box()
         if self.kind == "box":
             radius = min(BOX_EDGE, 0.25 * min(half))
             half = (half[0] - radius, half[1] - radius, half[2] - radius)
         ball = _ball_in_parts(FEW_SEGMENTS if radius <= SMALL else SEGMENTS)
         local = ball.octants * np.asarray(half, np.float32) + np.float32(radius) * ball.normals
-        positions = _turned(local, self.yaw) + np.asarray(self.center, np.float32)
-        return Mesh(positions, _turned(ball.normals, self.yaw), ball.triangles)
+        return Mesh(local @ self.axes + np.asarray(self.center, np.float32), ball.normals @ self.axes, ball.triangles)
 
 
 def check_color(name: str, color: Color) -> None:
@@ -106,12 +140,6 @@ def linear_color(color: Sequence[float]) -> NDArray[np.float32]:
     """An sRGB color, 0 to 255, as linear light, 0 to 1, (3,) (IEC 61966-2-1)."""
     c = np.asarray(color, np.float64) / 255
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def _turned(vectors: NDArray[np.float32], yaw: float) -> NDArray[np.float32]:
-    c, s = np.float32(math.cos(yaw)), np.float32(math.sin(yaw))
-    x, y, z = vectors.T
-    return np.stack([c * x - s * y, s * x + c * y, z], axis=1)
 
 
 class _Ball(NamedTuple):
