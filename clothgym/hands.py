@@ -68,6 +68,7 @@ class Hands:
         x, targets: where each hand is, and is to be [m], (block, hands, 3, lane).
         opening, wanted: of the fingers, from 0 (closed) to 1, (block, hands, lane); an anchor's is 0.
         holder: which hand holds each particle, or FREE, (block, particles, lane).
+        allowed: where each may go in this control step [m], (block, hands, 3, lane).
         blocked: which hands solids have stopped or turned aside in the last control step, (block, hands, lane).
     """
 
@@ -95,6 +96,7 @@ class Hands:
             rows.append((g.speed, time_step / g.closing_time, g.reach**2, slip))
         self.limits = np.array(rows, dtype).reshape(-1, 4)
         self.can_slip = bool(np.isfinite(self.limits[:, SLIP2]).any())
+        self.allowed = np.zeros((layout.blocks, self.count, 3, layout.lanes), dtype)
         self.blocked = np.zeros((layout.blocks, self.count, layout.lanes), bool)
         self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
 
@@ -164,9 +166,16 @@ class Hands:
 
     def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids) -> None:
         """Begin a control step of blocks ``first`` to ``last``."""
+        allowed, time_step = self.targets, x.dtype.type(self.time_step)
+        if len(solids.colliders) and self.count:
+            allowed = self.allowed
+            bar_blocks(
+                first, last, x, self.x, self.targets, self.holder, self.limits, self.anchors, time_step, solids.rows, solids.shapes,
+                allowed, self.blocked,
+            )  # fmt: skip
         steer_blocks(
-            first, last, x, v, w, free_w, self.x, self.targets, self.opening, self.wanted, self.holder, self.limits,
-            self.anchors, x.dtype.type(self.time_step), solids.rows, solids.shapes, self.blocked,
+            first, last, x, v, w, free_w, self.x, allowed, self.opening, self.wanted, self.holder, self.limits, self.anchors,
+            time_step,
         )  # fmt: skip
 
     def pulls(
@@ -275,10 +284,9 @@ def count_held(holder, anchors, out):
 
 
 @kernel
-def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step, colliders, shapes, blocked):
+def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
     """Begin a control step of one block: move fingers, take hold or let go, and set the velocity of what is held.
 
-    colliders, shapes: what hands cannot go through.  blocked: which hands that has changed the way of, (hands, lanes).
     hand: moved on to where it is at the end of the step.  limits: (hands, 4).  anchors: where an anchor is, (anchors,) particles;
     its position is taken from there, so that rounding in the substeps does not add up.
     """
@@ -315,10 +323,6 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
             speed = np.sqrt(dx * dx + dy * dy + dz * dz) / time_step
             slow = one / (max(speed / limits[k, SPEED], one) * time_step)
             move[0, l], move[1, l], move[2, l] = dx * slow, dy * slow, dz * slow
-        for l in range(lanes):
-            blocked[k, l] = False
-        if colliders.shape[0] > 0:
-            bar(x, hand[k], k, move, holder, colliders, shapes, time_step, blocked[k])
         for c in range(3):
             for l in range(lanes):
                 hand[k, c, l] += move[c, l] * time_step
@@ -330,38 +334,43 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
 
 
 @kernel
-def bar(x, hand, k, move, holder, colliders, shapes, time_step, blocked):
-    """Change the velocity of one hand in ``move``, (3, lanes), so that neither it nor what it holds enters a solid.
+def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step, colliders, shapes, allowed, blocked):
+    """Write to ``allowed`` where each hand may go in this control step, so that neither it nor what it holds enters a solid.
 
-    hand: where it is, (3, lanes).  k: which it is.  blocked: in which lanes something was in its way, (lanes,).
+    Where nothing is in its way that is its target.  (In ``steer`` it would be compiled once more with each caller.)
     """
+    one = x.dtype.type(1)
     point, rows, desk = np.empty((3, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
     tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
-    for l in range(x.shape[2]):
-        for c in range(3):
-            tip[c] = hand[c, l]
-            way[c] = move[c, l] * time_step
-        changed = stop_at_solids(tip, way, colliders, shapes, l, time_step, point, rows, desk)
-        for p in range(x.shape[0]):
-            if holder[p, l] == k:
+    for b in range(first, last):
+        for k in range(hand.shape[1]):
+            for l in range(x.shape[3]):
+                held = k < anchors.shape[0] and holder[b, anchors[k], l] == k
+                length2 = one - one
                 for c in range(3):
-                    tip[c] = x[p, c, l]
-                changed |= keep_out(tip, way, colliders, shapes, l, time_step, point, rows, desk)
-        if changed:
-            blocked[l] = True
-            for c in range(3):
-                move[c, l] = way[c] / time_step
+                    tip[c] = x[b, anchors[k], c, l] if held else hand[b, k, c, l]
+                    way[c] = targets[b, k, c, l] - tip[c]
+                    length2 += way[c] * way[c]
+                    allowed[b, k, c, l] = targets[b, k, c, l]
+                slow = one / max(np.sqrt(length2) / (time_step * limits[k, SPEED]), one)
+                for c in range(3):
+                    way[c] *= slow
+                changed = stop_at_solids(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
+                for p in range(x.shape[1]):
+                    if holder[b, p, l] == k:
+                        for c in range(3):
+                            tip[c] = x[b, p, c, l]
+                        changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
+                blocked[b, k, l] = changed
+                if changed:
+                    for c in range(3):
+                        allowed[b, k, c, l] = (x[b, anchors[k], c, l] if held else hand[b, k, c, l]) + way[c]
 
 
 @kernel
-def steer_blocks(
-    first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step, colliders, shapes, blocked
-):  # fmt: skip
+def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
     for b in range(first, last):
-        steer(
-            x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step,
-            colliders[b], shapes, blocked[b],
-        )  # fmt: skip
+        steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
 
 
 def add_pulls(first, last, x, v, free_w, elements, surface, fabric, holder, out):

@@ -85,7 +85,7 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, de
             if kinds[k] != PLANE and any_near(x, colliders[k], desk):
                 lay_out(colliders[k], desk)
                 find_touches(x, triangles, shapes, k, touches, desk)
-    press(x, v, w, triangles, colliders, touches, carried, desk)
+    press(x, v, w, triangles, colliders, touches, h, carried, desk)
 
 
 @kernel

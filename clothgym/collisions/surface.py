@@ -15,8 +15,9 @@ with the solid, and in every substep what has gone through its plane is pushed b
 the corners of the triangle take it by their barycentric weights over their masses.  Friction must come in every substep: a sheet
 that is left to itself for three creeps off a capsule within seconds, even if all that it moved is taken back on average.
 
-Particles keep the whole thickness, the sheet between them a quarter of it: where it is fine enough for a solid, the particles carry
-it alone, and the points are there for what they miss.
+Particles keep the whole thickness; the sheet between them may sink into the true surface by ``SINKS`` of the solid's least width.
+Where it is fine enough for a solid its particles carry it alone, as quietly as particles do, and the points are there for what
+these miss: many touches that share corners are solved one after the other, which leaves a jitter of some mm/s to cm/s.
 """
 
 from __future__ import annotations
@@ -44,12 +45,13 @@ from clothgym.collisions.distance import (
 from clothgym.collisions.shapes import FRICTION, HALF, MESH, PLANE, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
 
 TOUCH = 13  # rows of a touch: weights, each three times; gap, from the solid's point along the normal; normal
+RELAXED = 0.05  # of the depth that the last substep's inward motion does not explain is taken back in a substep
 NONE = 1e9  # [m], the gap of a lane that does not touch
-MESH_ROUNDS = 3
+MESH_ROUNDS, BOX_STEPS = 3, 8
 MOST = 0.98  # of the distance is left after a round, where a leap trusts the rounds
 DEPTH = 2.0  # rho over the thickness, at first
 SOON = 0.25  # gap over the thickness within which a triangle may touch before the next look
-KEPT = 0.25  # share of the thickness that the sheet between its particles keeps
+SINKS = 0.003  # of a solid's least width: how deep the sheet between its particles may lie in it
 CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid
 TOUCHING = 1e-3  # share of the radius by which cloth may be in it and yet count as lying on it
 SLANT = 0.5  # the least cosine between the normals of contact and of the solid: at a box's corner it is 0.58
@@ -58,21 +60,22 @@ SLANT = 0.5  # the least cosine between the normals of contact and of the solid:
 @kernel
 def any_near(x, collider, desk):
     """Whether any lane's sheet comes near the solid at all.  It only decides whether desk can be skipped."""
-    low, high = desk[0:3], desk[3:6]
-    low[:] = x[0]
-    high[:] = x[0]
+    zero, none = x.dtype.type(0), x.dtype.type(NONE)
+    for c in range(3):
+        for l in range(x.shape[2]):
+            desk[CORNERS + c, l] = none
+            desk[SPOT + c, l] = -none
     for p in range(x.shape[0]):
         for c in range(3):
             for l in range(x.shape[2]):
-                low[c, l] = min(low[c, l], x[p, c, l])
-                high[c, l] = max(high[c, l], x[p, c, l])
-    zero = x.dtype.type(0)
+                desk[CORNERS + c, l] = min(desk[CORNERS + c, l], x[p, c, l])
+                desk[SPOT + c, l] = max(desk[SPOT + c, l], x[p, c, l])
     near = False
     for l in range(x.shape[2]):
         beyond = zero
         for c in range(3):
             at = collider[POINT + c, l]
-            gap = max(max(low[c, l] - at, at - high[c, l]), zero)
+            gap = max(max(desk[CORNERS + c, l] - at, at - desk[SPOT + c, l]), zero)
             beyond += gap * gap
         near |= beyond < collider[REACH2, l]
     return near
@@ -167,7 +170,9 @@ def _to_core_of_box(desk):
 def _to_core_of_mesh(desk, shapes, k):
     """Move CORE to where the distance is -rho, from SPOT along the normal, twice: behind an edge the normals are two."""
     zero = desk.dtype.type(0)
-    desk[CORE : CORE + 3] = desk[SPOT : SPOT + 3]
+    for c in range(3):
+        for l in range(desk.shape[1]):
+            desk[CORE + c, l] = desk[SPOT + c, l]
     for _ in range(2):
         measure(desk, CORE, shapes, k, desk.dtype.type(np.inf))
         for c in range(3):
@@ -198,37 +203,22 @@ def _some_may_touch(desk):
 
 
 @kernel
-def _keep(desk, at):
-    """Remember SPOT in three other rows."""
-    for c in range(3):
-        for l in range(desk.shape[1]):
-            desk[at + c, l] = desk[SPOT + c, l]
-
-
-@kernel
-def _two_rounds_and_a_leap(desk):
-    """Two rounds with a rounded box, and from there to where the rounds lead (Aitken's extrapolation).
+def _leap(desk):
+    """Write to CORE where the last two rounds lead (Aitken's extrapolation).
 
     Where a long edge of the solid runs at a small angle to the triangle, rounds alone come nearer by little each.
     """
-    zero, tiny, most = desk.dtype.type(0), desk.dtype.type(1e-18), desk.dtype.type(MOST)
-    _keep(desk, BEFORE)
-    _to_core_of_box(desk)
-    to_triangle(desk)
-    _keep(desk, BETWEEN)
-    _to_core_of_box(desk)
-    to_triangle(desk)
+    zero, one, tiny, most = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-18), desk.dtype.type(MOST)
     for l in range(desk.shape[1]):
         fx, fy, fz = desk[BETWEEN, l], desk[BETWEEN + 1, l], desk[BETWEEN + 2, l]
         px, py, pz = fx - desk[BEFORE, l], fy - desk[BEFORE + 1, l], fz - desk[BEFORE + 2, l]
         fx, fy, fz = desk[SPOT, l] - fx, desk[SPOT + 1, l] - fy, desk[SPOT + 2, l] - fz
         ratio = (fx * px + fy * py + fz * pz) / max(px * px + py * py + pz * pz, tiny)
         ratio = min(max(ratio, zero), most)
-        leap = ratio / (desk.dtype.type(1) - ratio)
+        leap = ratio / (one - ratio)
         desk[CORE, l] = desk[SPOT, l] + leap * fx
         desk[CORE + 1, l] = desk[SPOT + 1, l] + leap * fy
         desk[CORE + 2, l] = desk[SPOT + 2, l] + leap * fz
-    to_triangle(desk)
 
 
 @kernel
@@ -236,35 +226,38 @@ def find_deepest(desk, shapes, k):
     """Find the deepest point of the triangle in CORNERS, from SPOT on, all in the solid's axes; return whether any lane may touch.
 
     It is left in SPOT with its weights, and the core's in CORE; CONTACT has its signed distance and the solid's normal there.
+    The steps stand in loops, each kernel at one place: they are inlined, and compilation takes its time for each place.
     """
-    if shapes.kinds[k] == MESH:
-        beyond = shapes.cells[k] * desk.dtype.type(CELLS)
-        for l in range(desk.shape[1]):
-            desk[RHO, l] = desk[THICKNESS, l] + beyond
-        for _ in range(MESH_ROUNDS):
-            _to_core_of_mesh(desk, shapes, k)
-            to_triangle(desk)
-        measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
-        return True
-    boxes = False
+    mesh, boxes = shapes.kinds[k] == MESH, False
     for c in range(3):
         for l in range(desk.shape[1]):
             boxes |= desk[HALF + c, l] > 0
+    deep = shapes.cells[k] * desk.dtype.type(CELLS)
     for l in range(desk.shape[1]):
-        desk[RHO, l] = desk.dtype.type(DEPTH) * desk[THICKNESS, l]
-    _to_core_of_box(desk)
-    to_triangle(desk)
-    if boxes:  # the core of a sphere is a point, for which one round is all there is to do
-        if not _some_may_touch(desk):
-            return False
-        _two_rounds_and_a_leap(desk)
-        measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
-        for l in range(desk.shape[1]):
-            desk[RHO, l] = max(desk[RHO, l], desk.dtype.type(-2) * desk[CONTACT, l])
-        _two_rounds_and_a_leap(desk)
-        _to_core_of_box(desk)
+        desk[RHO, l] = desk[THICKNESS, l] + deep if mesh else desk.dtype.type(DEPTH) * desk[THICKNESS, l]
+    # a sphere's core is a point, for which one round is all there is to do; a box has two rounds and a leap, twice, and one more
+    steps = MESH_ROUNDS if mesh else (BOX_STEPS if boxes else 1)
+    for step in range(steps):
+        leaps = boxes and not mesh and (step == 3 or step == 6)
+        if leaps:
+            _leap(desk)
+        elif mesh:
+            _to_core_of_mesh(desk, shapes, k)
+        else:
+            for e in range(3):
+                for l in range(desk.shape[1]):
+                    desk[BEFORE + e, l] = desk[BETWEEN + e, l]
+                for l in range(desk.shape[1]):
+                    desk[BETWEEN + e, l] = desk[SPOT + e, l]
+            _to_core_of_box(desk)
         to_triangle(desk)
-    measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
+        if step == 0 and boxes and not mesh and not _some_may_touch(desk):
+            return False
+        if step == 3 or step == steps - 1:
+            measure(desk, SPOT, shapes, k, desk.dtype.type(np.inf))
+        if step == 3:
+            for l in range(desk.shape[1]):
+                desk[RHO, l] = max(desk[RHO, l], desk.dtype.type(-2) * desk[CONTACT, l])
     return True
 
 
@@ -297,9 +290,9 @@ def _turn_normal(desk):
 
 
 @kernel
-def _push_out(carried, desk):
+def _push_out(h, carried, desk):
     """What the contact changes, per inverse mass and weight of a corner: of positions to SPOT, of velocities to MOTION."""
-    zero, one, tiny = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12)
+    zero, one, tiny, relaxed = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12), desk.dtype.type(RELAXED)
     for l in range(desk.shape[1]):
         depth, nx, ny, nz = -desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         yielding = desk[YIELDING, l]
@@ -310,6 +303,8 @@ def _push_out(carried, desk):
         un = ux * nx + uy * ny + uz * nz
         tx, ty, tz = ux - un * nx, uy - un * ny, uz - un * nz
         stopped = max(-un, zero)
+        moved = min(depth, stopped * h)
+        depth = moved + relaxed * (depth - moved)
         speed = np.sqrt(tx * tx + ty * ty + tz * tz) + tiny
         lost = min(desk[FRICTION, l] * stopped / speed, one)
         desk[SPOT, l] = share * (depth * nx - carried * lost * tx)
@@ -378,7 +373,8 @@ def find_touches(x, triangles, shapes, k, touches, desk):
     """
     rows, which, count, local = touches
     for l in range(desk.shape[1]):
-        desk[RADIUS, l] -= desk.dtype.type(1 - KEPT) * desk[THICKNESS, l]
+        half = min(desk[HALF, l], min(desk[HALF + 1, l], desk[HALF + 2, l])) + desk[RADIUS, l]
+        desk[RADIUS, l] -= desk[THICKNESS, l] + desk.dtype.type(2 * SINKS) * half
     for p in range(x.shape[0]):
         _place(x[p], desk, local[p])
     for t in range(triangles.shape[0]):
@@ -407,11 +403,11 @@ def find_touches(x, triangles, shapes, k, touches, desk):
 
 
 @kernel
-def press(x, v, w, triangles, colliders, touches, carried, desk):
+def press(x, v, w, triangles, colliders, touches, h, carried, desk):
     """Resolve the touches of one block.
 
-    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); carried: how long the velocity that friction takes has
-    moved the positions already [s]; desk: (DESK, lanes).
+    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); h: the substep [s]; carried: how long the
+    velocity that friction takes has moved the positions already [s]; desk: (DESK, lanes).
     """
     rows, which, count, _ = touches
     size = 3 * desk.shape[1]
@@ -442,7 +438,7 @@ def press(x, v, w, triangles, colliders, touches, carried, desk):
                 motion[e] = a[e] * vi[e] + b[e] * vj[e] + c[e] * vm[e]
             for l in range(desk.shape[1]):
                 desk[YIELDING, l] = wi[l] * a[l] * a[l] + wj[l] * b[l] * b[l] + wm[l] * c[l] * c[l]
-            _push_out(carried, desk)
-            _move_corner(x[i], v[i], wi, a, desk)
-            _move_corner(x[j], v[j], wj, b, desk)
-            _move_corner(x[m], v[m], wm, c, desk)
+            _push_out(h, carried, desk)
+            for corner in range(3):
+                p = triangles[which[n, 0], corner]
+                _move_corner(x[p], v[p], w[p], touch[3 * corner], desk)
