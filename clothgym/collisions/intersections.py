@@ -178,14 +178,14 @@ def _verdict(x, first, second, work):
                 b[j, c] = x[second[n], c]
             j -= 1
     if shared == 0:
-        return 0 if _apart(a, b, work[6:]) else _triangles(a, b)
+        return _triangles(a, b, work[6:])
     if shared == 1:
         if _wedges_apart(a, b):
             return 0
-        one = 0 if _apart(a[1:], b, work[6:]) else _segment_triangle(a[1], a[2], b[0], b[1], b[2])
+        one = _segment_triangle(a[1:], b, work[6:])
         if one == 1:
             return 1
-        two = 0 if _apart(b[1:], a, work[6:]) else _segment_triangle(b[1], b[2], a[0], a[1], a[2])
+        two = _segment_triangle(b[1:], a, work[6:])
         return 1 if two == 1 else max(one, two)
     if shared == 2:
         return _folded_flat(a[0], a[1], a[2], b[2])
@@ -286,23 +286,44 @@ def _wedges_apart(a, b):
 
 
 @kernel
-def _triangles(a, b):
+def _triangles(a, b, work):
     """Whether two triangles without a common vertex intersect: whether a side of one meets the other."""
+    a0, a1, a2 = _orientation(b[0], b[1], b[2], a[0]), _orientation(b[0], b[1], b[2], a[1]), _orientation(b[0], b[1], b[2], a[2])
+    if a0 == a1 and a0 == a2 and (a0 == 1 or a0 == -1):
+        return 0
+    b0, b1, b2 = _orientation(a[0], a[1], a[2], b[0]), _orientation(a[0], a[1], a[2], b[1]), _orientation(a[0], a[1], a[2], b[2])
+    if b0 == b1 and b0 == b2 and (b0 == 1 or b0 == -1):
+        return 0
+    unsure = max(a0, a1, a2, b0, b1, b2) == UNSURE or (a0 == 0 and a1 == 0 and a2 == 0)
+    if unsure and _apart(a, b, work):
+        return 0
     verdict = 0
     for n in range(3):
         m = (n + 1) % 3
-        one = _segment_triangle(a[n], a[m], b[0], b[1], b[2])
-        two = _segment_triangle(b[n], b[m], a[0], a[1], a[2])
+        over, under = (a0, a1) if n == 0 else (a1, a2) if n == 1 else (a2, a0)
+        one = _pierces(a[n], a[m], b[0], b[1], b[2], over, under)
+        over, under = (b0, b1) if n == 0 else (b1, b2) if n == 1 else (b2, b0)
+        two = _pierces(b[n], b[m], a[0], a[1], a[2], over, under)
         if one == 1 or two == 1:
             return 1
         verdict = max(verdict, one, two)
-    return verdict
+    return 0 if verdict == UNSURE and not unsure and _apart(a, b, work) else verdict
 
 
 @kernel
-def _segment_triangle(p, q, a, b, c):
-    """Whether segment pq meets triangle abc: 1, 0 or UNSURE."""
-    over, under = _orientation(a, b, c, p), _orientation(a, b, c, q)
+def _segment_triangle(p, t, work):
+    """Whether a segment, (2, 3), meets a triangle, (3, 3): 1, 0 or UNSURE."""
+    over, under = _orientation(t[0], t[1], t[2], p[0]), _orientation(t[0], t[1], t[2], p[1])
+    unsure = over == UNSURE or under == UNSURE or (over == 0 and under == 0)
+    if unsure and _apart(p, t, work):
+        return 0
+    verdict = _pierces(p[0], p[1], t[0], t[1], t[2], over, under)
+    return 0 if verdict == UNSURE and not unsure and _apart(p, t, work) else verdict
+
+
+@kernel
+def _pierces(p, q, a, b, c, over, under):
+    """Whether segment pq, whose ends lie ``over`` and ``under`` the plane of triangle abc, meets it: 1, 0 or UNSURE."""
     if over == UNSURE or under == UNSURE:
         return UNSURE
     if over == 0 and under == 0:
