@@ -25,6 +25,7 @@ FLOORS = {
     "clothgym.observed": 5,
     "clothgym.simulation": 5,
     "clothgym.render": 6,
+    "clothgym.crumpling": 6,
     "clothgym.scenes": 6,
     "clothgym.envs": 7,
     "clothgym.adapters": 8,

@@ -1,0 +1,456 @@
+"""Floor 6: what crumples, folds and wrings a sheet: manoeuvres for tests and benchmarks, and crumpled, folded and rumpled starts.
+
+A manoeuvre is a batch of sheets above a floor, one seed an environment, and a script for their anchors:
+
+    heap = MANOEUVRES["heap"](grid(25, 25, 1.0, 1.0), seeds=range(5), self_collision="strict")
+    while not heap.over:
+        heap.step()
+
+Lengths scale with the sheet's side, its larger extent at rest, and speeds are given; all but the last manoeuvres last as long as
+they take a sheet of about a metre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import count, one_of, positive
+from clothgym.collisions import Plane
+from clothgym.collisions.intersections import find_intersections
+from clothgym.hands import Gripper
+from clothgym.material import Material
+from clothgym.mesh import ClothMesh
+from clothgym.simulation import Simulation
+
+FRICTION = 0.5  # of the floor
+TILT = np.radians(3)  # a seed turns the start by about that
+ROUGHNESS = 1e-3  # and shifts each particle by about that, in shortest springs
+CALM = 5.0  # rate of the linear drag that brings starts to rest [1/s]
+REST_SPEED = 2e-3  # root of the mean squared speed at which a start is at rest [m/s]
+MOST_SETTLING = 20.0  # seconds of settling after which a start should be at rest
+
+
+class Manoeuvre:
+    """A batch of sheets that something happens to.
+
+    Args:
+        mesh: the sheet, flat at rest.
+        material: the fabric.
+        seeds: one an environment; it varies the start slightly, and whatever is drawn at random.
+        thickness: distance that layers of the start keep, and that hands leave between layers [m].
+        options: of ``Simulation``, ``self_collision`` for instance.
+
+    Attributes:
+        simulation: the batch.
+        seconds: how long it lasts.
+        time: passed since its start [s].
+    """
+
+    seconds: float
+    grippers: ClassVar[Sequence[Gripper]] = ()
+
+    def __init__(
+        self,
+        mesh: ClothMesh,
+        material: Material | None = None,
+        seeds: Sequence[int] = (0,),
+        thickness: float = 0.008,
+        **options: Any,
+    ) -> None:
+        self.mesh = mesh
+        self.random = [np.random.default_rng(seed) for seed in seeds]
+        self.thickness = positive("thickness", thickness)
+        self.rest = mesh.rest_positions - (mesh.rest_positions.max(axis=0) + mesh.rest_positions.min(axis=0)) / 2
+        self.side = float(np.ptp(self.rest, axis=0).max())
+        self.frames = 0
+        self.simulation = Simulation(
+            mesh,
+            material,
+            num_envs=len(self.random),
+            colliders=[Plane(friction=FRICTION)],
+            anchors=self._anchors().tolist(),
+            grippers=self.grippers,
+            **options,
+        )
+        self.start = self._varied(*self._start())
+        self.simulation.reset(positions=self.start)
+        self.held = self.simulation.positions[:, self.simulation.anchors].astype(np.float64)
+
+    @property
+    def time(self) -> float:
+        return self.frames * self.simulation.time_step
+
+    @property
+    def over(self) -> bool:
+        return self.time >= self.seconds - 1e-9
+
+    def step(self) -> None:
+        """One control step."""
+        self._steer(self.time + self.simulation.time_step)
+        self.simulation.step()
+        self.frames += 1
+
+    def _anchors(self) -> NDArray:
+        """Particles that are held, in the order of ``held``."""
+        return np.zeros(0, np.int64)
+
+    def _start(self) -> tuple[NDArray, float]:
+        """Positions of the start [m], (particles, 3), and the height of the lowest over the floor."""
+        raise NotImplementedError
+
+    def _steer(self, time: float) -> None:
+        """Tell the hands where to be at that time."""
+
+    def _varied(self, x: NDArray, height: float) -> NDArray:
+        """Each environment's start: turned a little, made a little uneven, and put at its height."""
+        short = self.mesh.springs.rest_length.min()
+        sheets = []
+        for random in self.random:
+            sheet = x @ _rotation(random.normal(size=3), TILT * random.uniform(0.2, 1.0)).T
+            sheet += np.clip(random.normal(size=x.shape), -2, 2) * ROUGHNESS * short
+            sheets.append(sheet + (0, 0, height - sheet[:, 2].min()))
+        return np.array(sheets)
+
+    def _near(self, x: float, y: float) -> int:
+        """The particle nearest to a place on the border of the sheet's box: (1, 1) is a corner, (1, 0) the middle of a side."""
+        place = np.array([x, y, 0]) * np.ptp(self.rest, axis=0) / 2
+        return int(np.argmin(np.linalg.norm(self.rest - place, axis=1)))
+
+
+class EdgeDrop(Manoeuvre):
+    """A sheet that stands upright falls on its edge."""
+
+    seconds = 5.0
+
+    def _start(self) -> tuple[NDArray, float]:
+        return self.rest[:, [0, 2, 1]] * (1, -1, 1), 0.1 * self.side
+
+
+class ZFold(Manoeuvre):
+    """A sheet folded to and fro falls.
+
+    Its height rises evenly along the sheet, so that it is the graph of a function over an upright plane and cannot intersect.
+    """
+
+    seconds = 5.0
+
+    def __init__(self, *args: Any, leaves: int = 8, **options: Any) -> None:
+        self.leaves = count("leaves", leaves)
+        super().__init__(*args, **options)
+
+    def _start(self) -> tuple[NDArray, float]:
+        along, lowest = self.rest[:, 0] - self.rest[:, 0].min(), 0.1 * self.side
+        length = np.ptp(self.rest[:, 0])
+        creases = np.linspace(0, length, self.leaves + 1)
+        spacing = float(np.median(self.mesh.springs.rest_length[self.mesh.springs.kind <= 2]))
+        if self.mesh.shape is None:
+            slope = 0.5  # creases go through triangles: less of a slope would shorten them much more
+        else:
+            columns = np.unique(along.round(9))
+            creases = np.unique(columns[np.abs(columns[:, None] - creases).argmin(axis=0)])
+            # the columns beside a crease are twice the slope apart
+            slope = min(max(0.13, 0.75 * self.thickness / spacing), 0.9)
+        leaf = np.clip(np.searchsorted(creases, along, side="right") - 1, 0, len(creases) - 2)
+        within = along - creases[leaf]
+        across = np.concatenate([[0.0], np.cumsum(np.diff(creases) * np.where(np.arange(len(creases) - 1) % 2, -1, 1))])
+        x = (across[leaf] + np.where(leaf % 2, -1, 1) * within) * np.sqrt(1 - slope**2)
+        return np.stack([x - x.mean(), self.rest[:, 1], slope * along], axis=1), lowest
+
+
+class Heap(Manoeuvre):
+    """A sheet that hangs by a corner is let go."""
+
+    seconds, release = 7.0, 3.0
+
+    def _anchors(self) -> NDArray:
+        return np.array([self._near(1, 1)])
+
+    def _start(self) -> tuple[NDArray, float]:
+        across, up = self.rest[:, 0] - self.rest[:, 1], self.rest[:, 0] + self.rest[:, 1]
+        return np.stack([across, np.zeros_like(across), up], axis=1) / np.sqrt(2), 0.1 * self.side
+
+    def _steer(self, time: float) -> None:
+        self.simulation.move_anchors(self.held)
+        if time >= self.release:
+            self.simulation.release()
+
+
+class Fold(Manoeuvre):
+    """A sheet on the floor is folded in half by its corners, across and along in turn."""
+
+    carrying, holding, resting = 1.5, 0.3, 0.7  # [s]
+    # by fold: the direction of the carried side, and directions from the middle of what is held there; later folds hold corners
+    # of all layers, and the ends of creases, which lie where the middle of a side was
+    FOLDS = (
+        ((0, 1), ((-1, 1), (1, 1))),
+        ((1, 0), ((1, -1), (1, 0), (1, 1))),
+        ((0, -1), ((-1, -1), (-1, 1), (1, -1), (1, 1), (0, -1), (0, 1))),
+    )
+
+    def __init__(self, *args: Any, times: int = 1, **options: Any) -> None:
+        self.times = count("times", times)
+        if times > len(self.FOLDS):
+            raise ValueError(f"times={times!r}: a sheet is folded {len(self.FOLDS)} times at most")
+        self.seconds = (self.carrying + self.holding + self.resting) * times + 1.5
+        self.directions = sorted({d for _, held in self.FOLDS[:times] for d in held})
+        super().__init__(*args, **options)
+        self.targets = self.held.copy()
+        self.miss = np.array([random.uniform(-0.02, 0.02) * self.side for random in self.random])
+        self.simulation.release()
+
+    def _anchors(self) -> NDArray:
+        return np.array([self._near(*d) for d in self.directions])
+
+    def _start(self) -> tuple[NDArray, float]:
+        return self.rest, 0.5 * self.thickness
+
+    def _varied(self, x: NDArray, height: float) -> NDArray:
+        sheets = super()._varied(x, height)
+        sheets[:, :, 2] = height  # a sheet that stands on a corner would slip
+        return sheets
+
+    def _steer(self, time: float) -> None:
+        fold, passed = divmod(time - 1e-9, self.carrying + self.holding + self.resting)
+        if fold >= self.times:
+            return
+        direction, held = self.FOLDS[int(fold)]
+        anchors = [self.directions.index(d) for d in held]
+        step = self.simulation.time_step
+        if passed <= step:
+            for anchor in anchors:
+                self.simulation.attach(None, [anchor])
+            self.held = self.simulation.positions[:, self.simulation.anchors].astype(np.float64)
+            self.axis, self.top = self._crease(np.array(direction, float)), self.held[:, anchors, 2].max(axis=1)
+        elif passed > self.carrying + self.holding:
+            self.simulation.release()
+            return
+        # all that is held turns about the crease
+        angle = np.pi * _eased(min(passed / self.carrying, 1.0))
+        out = self.held[:, :, :2] @ np.array(direction) - self.axis[:, None]
+        up = self.held[:, :, 2] - (self.top + self.thickness)[:, None]
+        turned = np.cos(angle) * out - np.sin(angle) * up
+        self.targets[:] = self.held
+        self.targets[:, :, :2] += (turned - out)[:, :, None] * direction
+        self.targets[:, :, 2] += np.sin(angle) * out + (np.cos(angle) - 1) * up
+        self.simulation.move_anchors(self.targets)
+
+    def _crease(self, direction: NDArray) -> NDArray[np.float64]:
+        """Where each sheet is folded, along the direction [m], (num_envs,): about the middle of what is there now."""
+        along = self.simulation.positions[:, :, :2].astype(np.float64) @ direction
+        return (along.max(axis=1) + along.min(axis=1)) / 2 + self.miss
+
+
+class Wring(Manoeuvre):
+    """Two opposite edges are turned against each other, by some particles in their middle, and brought nearer.
+
+    Args:
+        turns: of one against the other.
+        seconds_of_turning: then they are held.
+        share: of the edges that is held.
+        approach: how much nearer they are at the end, in their distance.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        turns: float = 3.0,
+        seconds_of_turning: float = 9.0,
+        share: float = 0.25,
+        approach: float = 0.15,
+        hold: float = 2.0,
+        **options: Any,
+    ) -> None:
+        self.turns, self.turning, self.share, self.approach = turns, seconds_of_turning, share, approach
+        self.seconds = seconds_of_turning + hold
+        super().__init__(*args, **options)
+
+    def _anchors(self) -> NDArray:
+        x, y = self.rest[:, 0], self.rest[:, 1]
+        # of a disc the rims within a fifth of the radius
+        reach = 1e-6 if self.mesh.shape is not None else 0.1 * self.side
+        width = (0.5 * self.share + 1e-6) * self.side
+        edges = [np.flatnonzero((end * x >= x.max() - reach) & (np.abs(y) <= width)) for end in (-1, 1)]
+        rim = np.unique(_rim(self.mesh.triangles))
+        return np.concatenate([np.intersect1d(edge, rim) for edge in edges])
+
+    def _start(self) -> tuple[NDArray, float]:
+        return self.rest, 0.7 * self.side
+
+    def _steer(self, time: float) -> None:
+        share = min(time / self.turning, 1.0)
+        middle = self.held.mean(axis=1, keepdims=True)
+        offset = self.held - middle
+        angle = np.where(offset[:, :, 0] > 0, 1, -1) * np.pi * self.turns * share
+        c, s = np.cos(angle), np.sin(angle)
+        y, z = offset[:, :, 1], offset[:, :, 2]
+        turned = np.stack([offset[:, :, 0] * (1 - self.approach * share), c * y - s * z, s * y + c * z], axis=2)
+        self.simulation.move_anchors(middle + turned)
+
+
+class Drag(Manoeuvre):
+    """A sheet is dragged about above the floor by a corner that makes for random places.
+
+    Args:
+        speed: of the corner [m/s].
+    """
+
+    def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
+        self.speed, self.seconds = positive("speed", speed), positive("seconds", seconds)
+        super().__init__(*args, **options)
+        self.target, self.goal = self.held[:, 0].copy(), self.held[:, 0].copy()
+
+    def _anchors(self) -> NDArray:
+        return np.array([self._near(1, 1)])
+
+    def _start(self) -> tuple[NDArray, float]:
+        return self.rest, 0.05 * self.side
+
+    def _steer(self, time: float) -> None:
+        for env, random in enumerate(self.random):
+            left = self.speed * self.simulation.time_step
+            while left > 0:
+                way = self.goal[env] - self.target[env]
+                length = float(np.linalg.norm(way))
+                if length > left:
+                    self.target[env] += way * (left / length)
+                    break
+                self.target[env], left = self.goal[env], left - length
+                self.goal[env] = random.uniform((-0.5, -0.5, 0.02), (0.5, 0.5, 0.7)) * self.side
+        self.simulation.move_anchors(self.target[:, None])
+
+
+class PickAndDrop(Manoeuvre):
+    """A sheet on the floor is picked up at a random place, carried some way and dropped, a few times.
+
+    Args:
+        picks: how often.
+        lift: lowest and highest height to which it is lifted, in sides.
+        carry: how far it is carried along x and y at most, in sides.
+    """
+
+    grippers = (Gripper(speed=1.0),)
+    closing, dropping = 0.15, 1.0  # [s]
+
+    def __init__(
+        self, *args: Any, picks: int = 2, lift: tuple[float, float] = (0.1, 0.4), carry: float = 0.4, **options: Any
+    ) -> None:
+        self.lift, self.carry = lift, carry
+        super().__init__(*args, **options)
+        self.lifting = 1.5 * self.side * np.hypot(lift[1], np.sqrt(2) * carry) / self.grippers[0].speed
+        self.turn = self.closing + self.lifting + self.dropping
+        self.seconds = count("picks", picks) * self.turn
+
+    def _start(self) -> tuple[NDArray, float]:
+        return self.rest, 0.5 * self.thickness
+
+    def _steer(self, time: float) -> None:
+        passed = (time - 1e-9) % self.turn
+        grippers, step = self.simulation.grippers, self.simulation.time_step
+        if passed <= step:
+            x = self.simulation.positions.astype(np.float64)
+            self.taken = np.array([x[env, random.integers(len(self.rest))] for env, random in enumerate(self.random)])
+            low, high = (-self.carry, -self.carry, self.lift[0]), (self.carry, self.carry, self.lift[1])
+            self.goal = np.array([random.uniform(low, high) for random in self.random]) * self.side
+            self.goal[:, 2] += self.taken[:, 2]
+            grippers.place(self.taken[:, None])
+        share = _eased(min(max(passed - self.closing, 0.0) / self.lifting, 1.0))
+        opening = float(passed > self.closing + self.lifting)
+        grippers.move((self.taken + share * (self.goal - self.taken))[:, None], np.full((len(self.random), 1), opening))
+
+
+MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
+    "edge drop": EdgeDrop,
+    "z-fold": ZFold,
+    "heap": Heap,
+    "fold": Fold,
+    "fold twice": partial(Fold, times=2),
+    "fold three times": partial(Fold, times=3),
+    "wring": Wring,
+    "impossible wring": partial(Wring, turns=5.0, seconds_of_turning=5.0, share=1.0, approach=0.0, hold=1.0),
+    "drag at 1 m/s": Drag,
+    "drag at 3 m/s": partial(Drag, speed=3.0),
+}
+STARTS: dict[str, Callable[..., Manoeuvre]] = {
+    "crumpled": partial(PickAndDrop, lift=(0.7, 1.1), carry=0.2),
+    "folded": partial(Fold, times=2),
+    "rumpled": PickAndDrop,
+}
+
+
+def starts(
+    mesh: ClothMesh,
+    material: Material | None = None,
+    kind: str = "crumpled",
+    count: int = 1,
+    seed: int = 0,
+    thickness: float = 0.008,
+    **options: Any,
+) -> NDArray:
+    """Sheets at rest on a floor at z = 0, free of intersections [m], (count, particles, 3).
+
+    Args:
+        mesh: the sheet, flat at rest.
+        material: the fabric.
+        kind: "crumpled" (lifted high at a random place and dropped, twice), "folded" (in half, twice) or "rumpled" (lifted a
+            little, twice).
+        count: how many.
+        seed: the sheet i of seed s is the first of seed s + i.
+        thickness: of the cloth at self-contact [m].
+        options: of ``Simulation``; ``self_collision`` is "strict" with that thickness unless given.
+
+    Raises:
+        ValueError: an unknown kind, or whatever ``Simulation`` does not take.
+        RuntimeError: a sheet that is not at rest after ``MOST_SETTLING`` seconds, or that intersects itself.
+    """
+    one_of("kind", kind, *STARTS)
+    options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options
+    manoeuvre = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
+    while not manoeuvre.over:
+        manoeuvre.step()
+    simulation = manoeuvre.simulation
+    simulation.set_parameters(air_drag=CALM * simulation.material.density)
+    while (speed := _rms_speed(simulation)).max() > REST_SPEED:
+        if manoeuvre.time > manoeuvre.seconds + MOST_SETTLING:
+            raise RuntimeError(
+                f"{kind} sheet of seed {seed + int(speed.argmax())} still moves at {speed.max():.2g} m/s after {MOST_SETTLING} s "
+                "of settling: take another seed, or a fabric with more damping_time"
+            )
+        simulation.step(6)
+        manoeuvre.frames += 6
+    found = find_intersections(mesh.triangles, simulation.positions)
+    if len(found):
+        env, first, second = found[0].tolist()
+        raise RuntimeError(
+            f"{kind} sheet of seed {seed + env} intersects itself {np.sum(found[:, 0] == env)} times, at triangles {first} and "
+            f"{second} for instance: take self_collision='strict', and a thickness that fits the mesh"
+        )
+    return simulation.positions
+
+
+def _rms_speed(simulation: Simulation) -> NDArray[np.float64]:
+    """Root of the mean squared speed of each sheet [m/s], (num_envs,)."""
+    return np.sqrt((simulation.velocities.astype(np.float64) ** 2).sum(axis=2).mean(axis=1))
+
+
+def _eased(share: float) -> float:
+    """From 0 to 1 without a jerk at the ends."""
+    return (1 - float(np.cos(np.pi * share))) / 2
+
+
+def _rotation(axis: NDArray, angle: float) -> NDArray[np.float64]:
+    """Rotation about an axis, (3, 3), after Rodrigues."""
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def _rim(triangles: NDArray) -> NDArray:
+    """Edges of one triangle only, (edges, 2)."""
+    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
+    edges, times = np.unique(edges, axis=0, return_counts=True)
+    return edges[times == 1]
