@@ -1,0 +1,248 @@
+"""Intersections of sheets that crumple, by how they collide with themselves: counted exactly after every control step.
+
+    python benchmarks/self_collision.py                          # what the results lack, and the tables; hours, case by case
+    python benchmarks/self_collision.py --select strict 25x25    # cases whose names hold all these words
+    python benchmarks/self_collision.py --quick                  # 13 x 13, one seed, 8 mm, one second each, written nowhere
+
+Sections of ``results/self_collision.json``:
+
+* manoeuvres: those of ``clothgym.crumpling`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
+  intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation told.  Modes:
+  "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
+  every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
+* drape: steps of random actions in ClothDrape-v0 with ``self_collision="strict"``, by target.
+
+What is counted is said in ``clothgym.collisions.intersections``, which knows nothing of self-collision.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from tqdm import tqdm
+
+from clothgym import ClothMesh, Simulation, disc, grid
+from clothgym._jit import kernel
+from clothgym.bench import machine
+from clothgym.collisions.intersections import count_intersections
+from clothgym.crumpling import MANOEUVRES, Manoeuvre
+
+Row = dict[str, Any]
+Case = tuple[Callable[..., Row], Row]
+
+RESULT = Path(__file__).parent / "results" / "self_collision.json"
+SEEDS, FRAME = 5, 1 / 60
+DRAGGING = 10.0  # seconds of the manoeuvres without end
+MESHES: dict[str, Callable[[], ClothMesh]] = {
+    "13x13": lambda: grid(13, 13, 1.0, 1.0),
+    "25x25": lambda: grid(25, 25, 1.0, 1.0),
+    "disc": lambda: disc(0.5, 12),
+    "37x37": lambda: grid(37, 37, 1.0, 1.0),
+    "49x49": lambda: grid(49, 49, 1.0, 1.0),
+}
+COMPARED = "25x25"  # the mesh on which all modes are compared
+THICKNESSES = (8, 4, 2)  # [mm]
+TARGETS = {"box": "box", "sphere": "sphere", "capsule": "post"}  # the environment calls an upright capsule a post
+STEPS, LANES = 20_000, 50
+
+
+@kernel
+def push_apart(x, v, held, rest, diameter):
+    """Move particles that are nearer than ``diameter`` [m] to that distance, and take the velocity with which they approach.
+
+    x [m], v [m/s]: (block, particle, 3, lane); held: (block, particle, lane); rest [m]: (particles, 3).  Pairs are found by sorting
+    along x; those nearer than ``diameter`` at rest are left alone.
+    """
+    for b in range(x.shape[0]):
+        for l in range(x.shape[3]):
+            order = np.argsort(x[b, :, 0, l].copy())
+            for m in range(len(order)):
+                i = order[m]
+                for n in range(m + 1, len(order)):
+                    j = order[n]
+                    if x[b, j, 0, l] - x[b, i, 0, l] >= diameter:
+                        break
+                    dx, dy, dz = x[b, j, 0, l] - x[b, i, 0, l], x[b, j, 1, l] - x[b, i, 1, l], x[b, j, 2, l] - x[b, i, 2, l]
+                    distance = np.sqrt(dx * dx + dy * dy + dz * dz)
+                    shares = (not held[b, i, l]) + (not held[b, j, l])
+                    if distance >= diameter or distance == 0 or shares == 0:
+                        continue
+                    ex, ey, ez = rest[j, 0] - rest[i, 0], rest[j, 1] - rest[i, 1], rest[j, 2] - rest[i, 2]
+                    if ex * ex + ey * ey + ez * ez <= diameter * diameter:
+                        continue
+                    closing = (v[b, j, 0, l] - v[b, i, 0, l]) * dx + (v[b, j, 1, l] - v[b, i, 1, l]) * dy
+                    closing += (v[b, j, 2, l] - v[b, i, 2, l]) * dz
+                    out = (diameter - distance) / distance / shares
+                    stop = -min(closing, 0.0) / (distance * distance) / shares
+                    for c, d in ((0, dx), (1, dy), (2, dz)):
+                        if not held[b, i, l]:
+                            x[b, i, c, l] -= out * d
+                            v[b, i, c, l] -= stop * d
+                        if not held[b, j, l]:
+                            x[b, j, c, l] += out * d
+                            v[b, j, c, l] += stop * d
+
+
+def with_spheres(name: str, mesh: ClothMesh, seeds: range, thickness: float, diameter: float) -> Iterator[Manoeuvre]:
+    """A manoeuvre after each of its frames, with particles as balls; a control step is a substep, between which they push."""
+    substeps = Simulation(mesh, time_step=FRAME).substeps
+    manoeuvre = MANOEUVRES[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME / substeps, substeps=1)
+    simulation = manoeuvre.simulation
+    held = np.zeros((len(seeds), mesh.num_particles), bool)
+    while not over(manoeuvre):
+        for _ in range(substeps):
+            manoeuvre.step()
+            held[:, simulation.anchors] = simulation.attached
+            blocks = simulation.layout.to_blocks(held, np.dtype(bool))
+            push_apart(simulation.view.x, simulation.view.v, blocks, mesh.rest_positions, diameter)
+        yield manoeuvre
+
+
+def with_simulation(name: str, mesh: ClothMesh, seeds: range, thickness: float, options: Row) -> Iterator[Manoeuvre]:
+    """A manoeuvre after each of its frames."""
+    manoeuvre = MANOEUVRES[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME, **options)
+    while not over(manoeuvre):
+        manoeuvre.step()
+        yield manoeuvre
+
+
+def over(manoeuvre: Manoeuvre) -> bool:
+    return manoeuvre.over or manoeuvre.time >= (DRAGGING if "drag" in type(manoeuvre).__name__.lower() else np.inf) - 1e-9
+
+
+def measure_manoeuvre(
+    manoeuvre: str, mesh: str, mode: str, thickness_mm: float, seeds: int = SEEDS, seconds: float = np.inf
+) -> Row:
+    """Frames of all seeds, and of how many each, and in how many something intersected."""
+    sheet, thickness = MESHES[mesh](), thickness_mm / 1000
+    given = manoeuvre, sheet, range(seeds), thickness
+    if "spheres" in mode:
+        spacing = float(sheet.springs.rest_length.min())
+        frames = with_spheres(*given, 0.9 * spacing if "covering" in mode else thickness)
+    else:
+        option = {} if mode == "none" else {"self_collision": {"mode": mode, "thickness": thickness}}
+        frames = with_simulation(*given, option)
+    begun = time.perf_counter()
+    bad, worst, count, gap, lag, clamped = np.zeros(seeds, int), 0, 0, np.inf, 0.0, 0
+    for state in tqdm(frames, desc=f"{manoeuvre}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False):
+        found = count_intersections(sheet.triangles, state.simulation.positions)
+        bad += found > 0
+        worst = max(worst, int(found.max()))
+        count += 1
+        if mode in ("fast", "strict"):
+            told = state.simulation.self_contacts()
+            gap, lag, clamped = min(gap, float(told.gap.min())), max(lag, float(told.lag.max())), clamped + int(told.clamped.sum())
+        if count * FRAME >= seconds:
+            break
+    row: Row = {"frames": count * seeds, "intersecting": int(bad.sum()), "by_seed": bad.tolist(), "worst": worst}
+    if mode in ("fast", "strict"):
+        row |= {"gap_mm": 1000 * gap, "lag_mm": 1000 * lag, "clamped": clamped}
+    return row | {"diverged": int(state.simulation.diverged.sum()), "wall_s": round(time.perf_counter() - begun, 1)}
+
+
+def measure_drape(target: str, steps: int = STEPS) -> Row:
+    """Environment steps of random actions, summed over a batch; episodes begin anew when they end."""
+    lanes = min(LANES, steps)
+    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=lanes, autoreset_mode="Disabled", self_collision="strict")
+    options = {"target": {"shape": TARGETS[target]}}
+    env.reset(seed=0, options=options)
+    random = np.random.default_rng(0)
+    simulation = env.unwrapped.task.simulation
+    bad, worst, failures, gap = 0, 0, 0, np.inf
+    for _ in tqdm(range(-(-steps // lanes)), desc=f"drape, {target}", leave=False):
+        _, _, terminated, truncated, info = env.step(random.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        found = count_intersections(simulation.mesh.triangles, simulation.positions)
+        bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
+        gap = min(gap, float(simulation.self_contacts().gap.min()))
+        ended = terminated | truncated
+        failures += int(np.sum(np.asarray(info["failure"])[ended] != ""))
+        if ended.any():
+            env.reset(options=options | {"reset_mask": ended})
+    env.close()
+    return {"steps": -(-steps // lanes) * lanes, "intersecting": bad, "worst": worst, "gap_mm": 1000 * gap, "failures": failures}
+
+
+def cases() -> dict[str, list[Case]]:
+    """All cases, those of coarse sheets first."""
+    rows: list[Row] = []
+    for mesh in MESHES:
+        for name in MANOEUVRES:
+            for thickness in THICKNESSES:
+                modes = ["strict"]
+                if mesh == COMPARED:
+                    modes += ["fast"] + (["none", "spheres", "covering spheres"] if thickness == THICKNESSES[0] else [])
+                rows += [{"manoeuvre": name, "mesh": mesh, "mode": mode, "thickness_mm": thickness} for mode in modes]
+    return {
+        "manoeuvres": [(measure_manoeuvre, row) for row in rows],
+        "drape": [(measure_drape, {"target": target}) for target in TARGETS],
+    }
+
+
+def fill(path: Path, sections: dict[str, list[Case]], select: list[str], fresh: bool, about: Row) -> Row:
+    """Measure the cases that the file lacks, and write each at once: what is interrupted goes on where it was."""
+    path.parent.mkdir(exist_ok=True)
+    results: Row = {"machine": machine(), "about": about} | (json.loads(path.read_text()) if path.exists() and not fresh else {})
+    wanted = [(name, *case) for name, rows in sections.items() for case in rows]
+    wanted = [(name, measure, key) for name, measure, key in wanted if all(word in f"{name} {key}" for word in select)]
+    for name, measure, key in tqdm(wanted, unit="case"):
+        rows = results.setdefault(name, [])
+        if not any(key.items() <= row.items() for row in rows):
+            rows.append(key | measure(**key))
+            part = path.with_suffix(".part")
+            part.write_text(json.dumps(results, indent=1) + "\n")
+            part.replace(path)
+    return results
+
+
+def table(rows: list[Row]) -> str:
+    """Rows as text, one column a key."""
+    heads = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [[f"{v:.4g}" if isinstance(v := row.get(key, ""), float) else str(v) for key in heads] for row in rows]
+    widths = [max(len(line[k]) for line in [heads, *cells]) for k in range(len(heads))]
+    return "\n".join("  ".join(text.rjust(width) for text, width in zip(line, widths)) for line in [heads, *cells])
+
+
+ABOUT = {
+    "frames": "control steps of 1/60 s of all seeds; intersecting: those in which two triangles had a point in common that they "
+    "should not have; worst: most such pairs of one sheet in one frame",
+    "spheres": "particles as balls, pushed apart fully in each substep without their approach velocity, no friction; diameter: the "
+    "thickness, or 0.9 spacings where covering; pairs nearer than that at rest do not collide",
+    "physics": "cotton, semi_implicit_euler, automatic substeps, sheets of 1 m, floor with friction 0.5",
+}
+
+
+def quick() -> None:
+    """Whether it runs: a second of each case on a coarse sheet."""
+    rows = []
+    for name in tqdm(MANOEUVRES, unit="case"):
+        for mode in ("none", "spheres", "fast", "strict"):
+            key = {"manoeuvre": name, "mesh": "13x13", "mode": mode, "thickness_mm": 8}
+            rows.append(key | measure_manoeuvre(**key, seeds=1, seconds=1.0))
+    print(table(rows))
+    print(table([{"target": target} | measure_drape(target, steps=200) for target in TARGETS]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--select", nargs="*", default=[], help="only cases whose names hold all these words")
+    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
+    parser.add_argument("--quick", action="store_true", help="a second of each on a coarse sheet, written nowhere")
+    args = parser.parse_args()
+    if args.quick:
+        quick()
+        return
+    results = fill(RESULT, cases(), args.select, args.fresh, ABOUT)
+    for name in cases():
+        if results.get(name):
+            print(f"\n{name}\n{table(results[name])}")
+
+
+if __name__ == "__main__":
+    main()
