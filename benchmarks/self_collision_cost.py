@@ -1,0 +1,334 @@
+"""What self-collision costs: against none, with the number of particles, and beside MuJoCo's.
+
+    pip install "mujoco>=4" matplotlib tqdm
+    python benchmarks/self_collision_cost.py                      # measures what the results lack, prints tables, draws the plot
+    python benchmarks/self_collision_cost.py --select cost alone  # cases whose names hold all these words
+    python benchmarks/self_collision_cost.py --quick              # few frames of coarse sheets, written nowhere
+
+Sections of ``results/self_collision_cost.json``; all on one thread, semi-implicit Euler with automatic substeps, cotton, 8 mm
+unless said:
+
+* cost: milliseconds of a control step of 1/60 s per environment on 25 x 25, and ratios to none.  The modes take turns frame by
+  frame in one process.  Of a state the median frame counts, of an episode the sum of all frames, the faster of two runs of each.
+* growth: the same from 13 x 13 to 100 x 100 at the same spacing, of one environment; ``docs/self_collision.png`` shows it.
+* mujoco: frames/s of a sheet of half a metre that falls on its edge, for two seconds, by MuJoCo's ``ipc`` mode, by its ordinary
+  contacts, and by ours; and in how many frames something intersected, counted in all by the same exact method.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from functools import lru_cache, partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+from self_collision import Case, Row, fill, table
+from tqdm import tqdm
+
+from clothgym import ClothMesh, Material, Plane, Simulation, grid
+from clothgym.collisions.intersections import count_intersections
+from clothgym.crumpling import FRICTION, Drag, EdgeDrop, Fold, Heap, Manoeuvre, ZFold
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+RESULT = Path(__file__).parent / "results" / "self_collision_cost.json"
+PICTURE = Path(__file__).parent.parent / "docs" / "self_collision.png"
+FRAME, THICKNESS, LANES = 1 / 60, 0.008, 64
+MODES = ("none", "fast", "strict")
+WARM, TIMED = 20, 60  # frames of a state
+ROUNDS = 2  # of an episode
+SETTLING = 4.0  # seconds after a manoeuvre
+# what strict mode may cost, over none
+LIMITS = {"hanging": 1.5, "flat": 1.5, "settled heap": 3.0, "settled three-layer fold": 6.0}
+LIMITS |= {"falling": 10.0, "folding": 10.0, "dragging at 1 m/s": 10.0}
+ALONE_LIMIT = 2.6
+EPISODES: dict[str, Callable[..., Manoeuvre]] = {
+    "falling": EdgeDrop,
+    "folding": Fold,
+    "dragging at 1 m/s": partial(Drag, speed=1.0, seconds=10.0),
+}
+SETTLED: dict[str, Callable[..., Manoeuvre]] = {"settled heap": Heap, "settled three-layer fold": partial(ZFold, leaves=3)}
+SPACING = 1 / 24  # of the sheets that grow [m]
+SIDES = (13, 17, 25, 35, 49, 71, 100)
+LEAF = 8  # cells of a leaf of the folded sheet that grows
+
+# MuJoCo's scene
+ROWS, SIDE, SECONDS, DROP, THIN = 25, 0.5, 2.0, 0.05, 0.004
+COTTON = Material.preset("cotton")
+YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # where the preset comes from: [Pa], [m]
+THEIRS = [
+    {"engine": "MuJoCo", "contact": contact, "steps": steps}
+    for contact, counts in (("ipc", (1, 4)), ("ordinary", (4,)))
+    for steps in counts
+]
+TARGET_RATIO = 50  # times the frames/s of MuJoCo's ipc mode on one core
+
+ABOUT = {
+    "cost": "ms per environment and control step of 1/60 s; 64 environments with different seeds, or one alone; ratios to none. "
+    "hanging: from two corners, at rest; flat: on the floor; falling: an upright sheet drops on its edge, 5 s; folding: in half, "
+    "4 s; dragging: a corner at 1 m/s, 10 s",
+    "growth": "spacing 41.7 mm at all sizes; folded: leaves of 8 cells, the first second of its fall; alone on one thread",
+    "mujoco": "25 x 25, 0.5 m, cotton, upright, falls 5 cm on its edge, 2 s. MuJoCo 4: 2D flex, discrete integrator, Newton "
+    "solver, flex radius 2 mm, selfcollide auto, plane below, contacts of ipc are frictionless; steps a frame of 1/60 s as stated. "
+    "clothgym: strict, thickness 4 mm, friction 0.3 and 0.5 on the floor, automatic substeps; a batch's frames/s are summed",
+}
+
+
+def option(mode: str, thickness: float = THICKNESS) -> Row:
+    return {"threads": 1} | ({} if mode == "none" else {"self_collision": {"mode": mode, "thickness": thickness}})
+
+
+def interleaved(steps: dict[str, Callable[[], object]], frames: int) -> dict[str, list[float]]:
+    """Seconds that each frame took, by mode; the modes take turns, and so does who begins."""
+    times: dict[str, list[float]] = {mode: [] for mode in steps}
+    for frame in tqdm(range(frames), unit="frame", leave=False):
+        order = list(steps)
+        for mode in order[frame % len(order) :] + order[: frame % len(order)]:
+            begun = time.perf_counter()
+            steps[mode]()
+            times[mode].append(time.perf_counter() - begun)
+    return times
+
+
+def row_of(seconds: dict[str, float], envs: int, limit: float) -> Row:
+    """ms per environment, and ratios."""
+    row: Row = {f"{mode}_ms": 1000 * s / envs for mode, s in seconds.items()}
+    row |= {f"{mode}_ratio": s / seconds["none"] for mode, s in seconds.items() if mode != "none"}
+    return row | {"limit": limit, "within": bool(row["strict_ratio"] <= limit)}
+
+
+@lru_cache
+def settled(name: str, side: int, envs: int) -> NDArray:
+    """Sheets that have come to rest in strict mode [m], (envs, particles, 3)."""
+    manoeuvre = SETTLED[name](grid(side, side, 1.0, 1.0), seeds=range(envs), thickness=THICKNESS, **option("strict"))
+    while not manoeuvre.over:
+        manoeuvre.step()
+    manoeuvre.simulation.step(round(SETTLING / FRAME))
+    return manoeuvre.simulation.positions
+
+
+def of_a_state(mesh: ClothMesh, x: NDArray, envs: int, anchors: list[int], frames: int = TIMED) -> dict[str, float]:
+    """Median seconds of a frame from those positions, by mode."""
+    steps = {}
+    for mode in MODES:
+        simulation = Simulation(mesh, num_envs=envs, colliders=[Plane(friction=FRICTION)], anchors=anchors, **option(mode))
+        simulation.reset(positions=x)
+        simulation.step(WARM)
+        steps[mode] = simulation.step
+    return {mode: statistics.median(times) for mode, times in interleaved(steps, frames).items()}
+
+
+def of_an_episode(make: Callable[[str], Manoeuvre], seconds: float = np.inf) -> dict[str, float]:
+    """Mean seconds of a frame, by mode; of each frame the faster of several runs counts, and the hands' scripts do not."""
+    best: dict[str, NDArray] = {}
+    for _ in range(ROUNDS):
+        manoeuvres = {mode: make(mode) for mode in MODES}
+        times: dict[str, list[float]] = {mode: [] for mode in MODES}
+        steps = {}
+        for mode, manoeuvre in manoeuvres.items():
+            manoeuvre.simulation.step = _clocked(manoeuvre.simulation.step, times[mode])  # type: ignore[method-assign]
+            steps[mode] = manoeuvre.step
+        first = manoeuvres["none"]
+        interleaved(steps, round(min(first.seconds, seconds) / first.simulation.time_step))
+        for mode in MODES:
+            best[mode] = np.minimum(best.get(mode, np.inf), times[mode])
+    return {mode: float(np.mean(times)) for mode, times in best.items()}
+
+
+def _clocked(step: Callable[..., None], times: list[float]) -> Callable[..., None]:
+    def clocked(n: int = 1) -> None:
+        begun = time.perf_counter()
+        step(n)
+        times.append(time.perf_counter() - begun)
+
+    return clocked
+
+
+def measure_cost(case: str, envs: int, side: int = 25, seconds: float = np.inf) -> Row:
+    mesh = grid(side, side, 1.0, 1.0)
+    limit = ALONE_LIMIT if envs == 1 else LIMITS[case]
+    if case in EPISODES:
+        loaded = EPISODES[case](mesh, seeds=[0])
+        for mode in MODES:  # kernels are loaded before the clock runs
+            Simulation(mesh, num_envs=envs, anchors=loaded.simulation.anchors.tolist(), **option(mode)).step()
+        return row_of(
+            of_an_episode(lambda mode: EPISODES[case](mesh, seeds=range(envs), thickness=THICKNESS, **option(mode)), seconds),
+            envs,
+            limit,
+        )
+    anchors: list[int] = []
+    x = mesh.rest_positions + (0, 0, 0.001)
+    if case == "hanging":
+        anchors, x = list(mesh.corners[2:]), mesh.rest_positions[:, [0, 2, 1]] + (0, 0, 0.7)
+    elif case in SETTLED:
+        x = settled(case, side, envs)
+    return row_of(of_a_state(mesh, x, envs, anchors, TIMED if seconds == np.inf else round(seconds / FRAME)), envs, limit)
+
+
+def measure_growth(side: int, scene: str, frames: int = TIMED) -> Row:
+    mesh = grid(side, side, (side - 1) * SPACING, (side - 1) * SPACING)
+    if scene == "flat":
+        seconds = of_a_state(mesh, mesh.rest_positions + (0, 0, 0.001), 1, [], frames)
+    else:
+        for mode in MODES:
+            Simulation(mesh, **option(mode)).step()
+        leaves = max(1, (side - 1) // LEAF)
+        seconds = of_an_episode(lambda mode: ZFold(mesh, thickness=THICKNESS, leaves=leaves, **option(mode)), frames * FRAME)
+    return {"particles": side * side} | {f"{mode}_ms": 1000 * s for mode, s in seconds.items()}
+
+
+def mujoco_model(contact: str, steps: int) -> Any:
+    spacing = SIDE / (ROWS - 1)
+    spec = mujoco.MjSpec.from_string(f"""
+        <mujoco>
+          <size memory="200M"/>
+          <option timestep="{FRAME / steps!r}" integrator="discrete" solver="Newton" gravity="0 0 -9.81">
+            <flag ipc="{"enable" if contact == "ipc" else "disable"}"/>
+          </option>
+          <worldbody>
+            <geom type="plane" size="2 2 0.1"/>
+            <flexcomp name="sheet" type="grid" dim="2" count="{ROWS} {ROWS} 1" spacing="{spacing!r} {spacing!r} 1"
+                      radius="{THIN / 2!r}" pos="0 0 {SIDE / 2 + DROP!r}" euler="88 0 0">
+              <contact selfcollide="auto"/>
+              <elasticity young="{YOUNG!r}" poisson="{POISSON!r}" thickness="{SHEET_THICKNESS!r}" damping="{COTTON.damping_time!r}"
+                          elastic2d="both"/>
+            </flexcomp>
+          </worldbody>
+        </mujoco>""")
+    for body in spec.bodies[1:]:
+        borders = int(np.sum(np.isclose(np.abs(body.pos[:2]), SIDE / 2)))
+        body.mass = COTTON.density * spacing**2 / 2**borders
+    return spec.compile()
+
+
+def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECONDS) -> Row:
+    """One sheet on one core."""
+    model = mujoco_model(contact, steps)
+    data = mujoco.MjData(model)
+    data.qpos[:] += np.random.default_rng(0).normal(scale=2e-5, size=model.nq)
+    mujoco.mj_forward(model, data)
+    triangles = model.flex_elem.reshape(-1, 3)
+    times, bad, worst = [], 0, 0
+    for _ in tqdm(range(round(seconds / FRAME)), desc=f"{engine} {contact} {steps}", leave=False):
+        begun = time.perf_counter()
+        mujoco.mj_step(model, data, nstep=steps)
+        times.append(time.perf_counter() - begun)
+        found = int(count_intersections(triangles, data.flexvert_xpos)[0])
+        bad, worst = bad + (found > 0), max(worst, found)
+    warned = sum(warning.number for warning in data.warning)
+    return _speeds(times, 1) | {"intersecting": bad, "frames": len(times), "worst": worst, "warnings": int(warned)}
+
+
+def measure_ours(engine: str, contact: str, lanes: int, seconds: float = SECONDS) -> Row:
+    """A batch of sheets on one core."""
+    mesh = grid(ROWS, ROWS, SIDE, SIDE)
+    manoeuvre = EdgeDrop(mesh, COTTON, seeds=range(lanes), thickness=THIN, **option(contact, THIN))
+    simulation = manoeuvre.simulation
+    simulation.step()  # loads the kernels
+    simulation.reset(positions=manoeuvre.start - (0, 0, 0.1 * SIDE - DROP))
+    times, bad, worst = [], 0, 0
+    for _ in range(round(seconds / FRAME)):
+        begun = time.perf_counter()
+        simulation.step()
+        times.append(time.perf_counter() - begun)
+        found = count_intersections(mesh.triangles, simulation.positions)
+        bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
+    row = {"steps": simulation.substeps} | _speeds(times, lanes)
+    return row | {"intersecting": bad, "frames": lanes * len(times), "worst": worst}
+
+
+def _speeds(times: list[float], sheets: int) -> Row:
+    """Frames/s over the whole run, in its slowest tenth and in its fastest."""
+    tenth = max(1, len(times) // 10)
+    ordered = sorted(times)
+    slow, fast = sum(ordered[-tenth:]) / tenth, sum(ordered[:tenth]) / tenth
+    return {"frames/s": sheets * len(times) / sum(times), "slowest": sheets / slow, "fastest": sheets / fast}
+
+
+def cases() -> dict[str, list[Case]]:
+    ours = [{"engine": "clothgym", "contact": "strict", "lanes": lanes} for lanes in (1, LANES)]
+    return {
+        "cost": [(measure_cost, {"case": case, "envs": envs}) for envs in (LANES, 1) for case in LIMITS],
+        "growth": [(measure_growth, {"side": side, "scene": scene}) for side in SIDES for scene in ("flat", "folded")],
+        "mujoco": [(measure_mujoco, key) for key in THEIRS] + [(measure_ours, key) for key in ours],
+    }
+
+
+def print_ratio(rows: list[Row]) -> None:
+    """Our frames/s over those of MuJoCo's ipc mode."""
+    ours = {row["lanes"]: row["frames/s"] for row in rows if row["engine"] == "clothgym"}
+    for row in rows:
+        if row["contact"] == "ipc":
+            told = ", ".join(f"{lanes} lanes {speed / row['frames/s']:.0f} times" for lanes, speed in ours.items())
+            print(f"over MuJoCo's ipc with {row['steps']} steps a frame: {told} (wanted: {TARGET_RATIO})")
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    colours = {"none": "#8d99ae", "fast": "#edae49", "strict": "#d1495b"}
+    for scene, style in (("folded", {}), ("flat", {"ls": "--", "mfc": "white"})):
+        chosen = sorted((row for row in rows if row["scene"] == scene), key=lambda row: row["particles"])
+        for mode, colour in colours.items():
+            figures = [row[f"{mode}_ms"] for row in chosen]
+            axes.plot(
+                [r["particles"] for r in chosen],
+                figures,
+                marker="o",
+                ms=3.5,
+                lw=1.4,
+                color=colour,
+                label=f"{mode}, {scene}",
+                **style,
+            )
+    axes.set(xscale="log", yscale="log", xlabel="particles", ylabel="ms per control step of 1/60 s, one core")
+    axes.set_title("Cost of self-collision by size, one environment, spacing 42 mm", loc="left", fontsize=11)
+    axes.legend(frameon=False, fontsize=8.5)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def quick() -> None:
+    """Whether it runs."""
+    both = [{"case": case, "envs": envs} for case in LIMITS for envs in (1, 4)]
+    print(table([key | measure_cost(**key, side=13, seconds=0.5) for key in both]))
+    growing = [{"side": side, "scene": scene} for side in (13, 17) for scene in ("flat", "folded")]
+    print(table([key | measure_growth(**key, frames=10) for key in growing]))
+    rows = [key | measure_mujoco(**key, seconds=0.2) for key in THEIRS]
+    rows += [
+        key | measure_ours(**key, seconds=0.2) for key in ({"engine": "clothgym", "contact": "strict", "lanes": n} for n in (1, 4))
+    ]
+    print(table(rows))
+    print_ratio(rows)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--select", nargs="*", default=[], help="only cases whose names hold all these words")
+    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
+    parser.add_argument("--quick", action="store_true", help="few frames of coarse sheets, written nowhere")
+    args = parser.parse_args()
+    if args.quick:
+        quick()
+        return
+    results = fill(RESULT, cases(), args.select, args.fresh, ABOUT | {"mujoco version": version("mujoco")})
+    for name in cases():
+        if results.get(name):
+            print(f"\n{name}\n{table(results[name])}")
+    if results.get("mujoco"):
+        print_ratio(results["mujoco"])
+    if results.get("growth"):
+        draw(results["growth"], PICTURE)
+
+
+if __name__ == "__main__":
+    main()
