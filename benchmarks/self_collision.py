@@ -137,7 +137,7 @@ def measure_manoeuvre(
         worst = max(worst, int(found.max()))
         count += 1
         if mode in ("fast", "strict"):
-            told = state.simulation.self_contacts()
+            told = state.simulation.self_contacts
             gap, lag, clamped = min(gap, float(told.gap.min())), max(lag, float(told.lag.max())), clamped + int(told.clamped.sum())
         if count * FRAME >= seconds:
             break
@@ -160,7 +160,7 @@ def measure_drape(target: str, steps: int = STEPS) -> Row:
         _, _, terminated, truncated, info = env.step(random.uniform(-1, 1, env.action_space.shape).astype(np.float32))
         found = count_intersections(simulation.mesh.triangles, simulation.positions)
         bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
-        gap = min(gap, float(simulation.self_contacts().gap.min()))
+        gap = min(gap, float(simulation.self_contacts.gap.min()))
         ended = terminated | truncated
         failures += int(np.sum(np.asarray(info["failure"])[ended] != ""))
         if ended.any():

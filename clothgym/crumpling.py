@@ -6,8 +6,7 @@ A manoeuvre is a batch of sheets above a floor, one seed an environment, and a s
     while not heap.over:
         heap.step()
 
-Lengths scale with the sheet's side, its larger extent at rest, and speeds are given; all but the last manoeuvres last as long as
-they take a sheet of about a metre.
+Lengths scale with the sheet's side, its larger extent at rest; durations are those of a sheet of about a metre.
 """
 
 from __future__ import annotations
@@ -250,23 +249,18 @@ class Wring(Manoeuvre):
 
     Args:
         turns: of one against the other.
-        seconds_of_turning: then they are held.
+        turning: how long that takes [s]; then they are held.
         share: of the edges that is held.
         approach: how much nearer they are at the end, in their distance.
     """
 
+    holding = 2.0  # [s]
+
     def __init__(
-        self,
-        *args: Any,
-        turns: float = 3.0,
-        seconds_of_turning: float = 9.0,
-        share: float = 0.25,
-        approach: float = 0.15,
-        hold: float = 2.0,
-        **options: Any,
+        self, *args: Any, turns: float = 3.0, turning: float = 9.0, share: float = 0.25, approach: float = 0.15, **options: Any
     ) -> None:
-        self.turns, self.turning, self.share, self.approach = turns, seconds_of_turning, share, approach
-        self.seconds = seconds_of_turning + hold
+        self.turns, self.turning, self.share, self.approach = turns, turning, share, approach
+        self.seconds = turning + self.holding
         super().__init__(*args, **options)
 
     def _anchors(self) -> NDArray:
@@ -371,7 +365,7 @@ MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
     "fold twice": partial(Fold, times=2),
     "fold three times": partial(Fold, times=3),
     "wring": Wring,
-    "impossible wring": partial(Wring, turns=5.0, seconds_of_turning=5.0, share=1.0, approach=0.0, hold=1.0),
+    "impossible wring": partial(Wring, turns=5.0, turning=5.0, share=1.0, approach=0.0),
     "drag at 1 m/s": Drag,
     "drag at 3 m/s": partial(Drag, speed=3.0),
 }

@@ -96,6 +96,7 @@ SOUPS = {
     "on a lattice": lambda rng, n: rng.integers(0, 4, (n, 3)),
     "in a tilted plane": lambda rng, n: np.c_[rng.integers(0, 5, (n, 2)), np.zeros(n)] @ turned(n),
     "in the floor": lambda rng, n: np.c_[rng.normal(size=(n, 2)), np.full(n, 0.3)],
+    "slivers in the floor": lambda rng, n: np.c_[rng.integers(0, 9, n) * (1 / 3), rng.integers(0, 9, n) / 3e7, np.zeros(n)],
     "slivers": lambda rng, n: rng.normal(size=(n, 3)) * (1, 1e-3, 1e-5) @ turned(n),
     "far away": lambda rng, n: 15.9 - rng.integers(0, 3, (n, 3)) * 0.05,
     "off a lattice by an ulp": lambda rng, n: np.nextafter(rng.integers(1, 4, (n, 3)), rng.integers(0, 2, (n, 3)) * 9.0),

@@ -294,16 +294,18 @@ def _triangles(a, b, work):
     b0, b1, b2 = _orientation(a[0], a[1], a[2], b[0]), _orientation(a[0], a[1], a[2], b[1]), _orientation(a[0], a[1], a[2], b[2])
     if b0 == b1 and b0 == b2 and (b0 == 1 or b0 == -1):
         return 0
-    unsure = max(a0, a1, a2, b0, b1, b2) == UNSURE or (a0 == 0 and a1 == 0 and a2 == 0)
+    if a0 == 0 and a1 == 0 and a2 == 0:
+        return _in_one_plane(a, b, work)
+    unsure = max(a0, a1, a2, b0, b1, b2) == UNSURE
     if unsure and _apart(a, b, work):
         return 0
     verdict = 0
     for n in range(3):
         m = (n + 1) % 3
         over, under = (a0, a1) if n == 0 else (a1, a2) if n == 1 else (a2, a0)
-        one = _pierces(a[n], a[m], b[0], b[1], b[2], over, under)
+        one = _pierces(a[n], a[m], b, over, under)
         over, under = (b0, b1) if n == 0 else (b1, b2) if n == 1 else (b2, b0)
-        two = _pierces(b[n], b[m], a[0], a[1], a[2], over, under)
+        two = _pierces(b[n], b[m], a, over, under)
         if one == 1 or two == 1:
             return 1
         verdict = max(verdict, one, two)
@@ -314,23 +316,23 @@ def _triangles(a, b, work):
 def _segment_triangle(p, t, work):
     """Whether a segment, (2, 3), meets a triangle, (3, 3): 1, 0 or UNSURE."""
     over, under = _orientation(t[0], t[1], t[2], p[0]), _orientation(t[0], t[1], t[2], p[1])
-    unsure = over == UNSURE or under == UNSURE or (over == 0 and under == 0)
+    if over == 0 and under == 0:
+        return _in_one_plane(p, t, work)
+    unsure = over == UNSURE or under == UNSURE
     if unsure and _apart(p, t, work):
         return 0
-    verdict = _pierces(p[0], p[1], t[0], t[1], t[2], over, under)
+    verdict = _pierces(p[0], p[1], t, over, under)
     return 0 if verdict == UNSURE and not unsure and _apart(p, t, work) else verdict
 
 
 @kernel
-def _pierces(p, q, a, b, c, over, under):
-    """Whether segment pq, whose ends lie ``over`` and ``under`` the plane of triangle abc, meets it: 1, 0 or UNSURE."""
-    if over == UNSURE or under == UNSURE:
+def _pierces(p, q, t, over, under):
+    """Whether segment pq, whose ends lie ``over`` and ``under`` the plane of a triangle, meets it: 1, 0 or UNSURE."""
+    if over == UNSURE or under == UNSURE or (over == 0 and under == 0):
         return UNSURE
-    if over == 0 and under == 0:
-        return _in_one_plane(p, q, a, b, c)
     if over == under:
         return 0
-    one, two, three = _orientation(p, q, a, b), _orientation(p, q, b, c), _orientation(p, q, c, a)
+    one, two, three = _orientation(p, q, t[0], t[1]), _orientation(p, q, t[1], t[2]), _orientation(p, q, t[2], t[0])
     if (one == 1 or two == 1 or three == 1) and (one == -1 or two == -1 or three == -1):
         return 0
     return UNSURE if one == UNSURE or two == UNSURE or three == UNSURE else 1
@@ -354,23 +356,44 @@ def _orientation(a, b, c, d):
 
 
 @kernel
-def _in_one_plane(p, q, a, b, c):
-    """Whether a segment surely meets a triangle in the same plane x, y or z = constant: 1, else UNSURE."""
+def _in_one_plane(p, q, work):
+    """Whether a segment or triangle p and a triangle q that lie in one plane intersect: 1, 0 or UNSURE; exact sides tell if the
+    plane is x, y or z = constant."""
     for k in range(3):
-        if a[k] == b[k] and a[k] == c[k] and a[k] == p[k] and a[k] == q[k]:
+        level = p[0, k] == q[0, k] and p[1, k] == q[0, k] and q[1, k] == q[0, k] and q[2, k] == q[0, k]
+        if level and (p.shape[0] == 2 or p[2, k] == q[0, k]):
             i, j = (k + 1) % 3, (k + 2) % 3
-            one, two, three = _turn(a, b, p, i, j), _turn(b, c, p, i, j), _turn(c, a, p, i, j)
-            if one != UNSURE and one == two and one == three:
-                return 1
-            if _cross_over(p, q, a, b, i, j) or _cross_over(p, q, b, c, i, j) or _cross_over(p, q, c, a, i, j):
-                return 1
-    return UNSURE
+            one = _divides(q, p, i, j)
+            if one == 1:
+                return 0
+            two = _divides(p, q, i, j)
+            if two == 1:
+                return 0
+            return 1 if one == 0 and two == 0 else UNSURE
+    return 0 if _apart(p, q, work) else UNSURE
 
 
 @kernel
-def _cross_over(p, q, a, b, i, j):
-    """Whether two segments surely cross in the plane of axes i and j."""
-    return _turn(p, q, a, i, j) * _turn(p, q, b, i, j) == -1 and _turn(a, b, p, i, j) * _turn(a, b, q, i, j) == -1
+def _divides(t, others, i, j):
+    """Whether a side of a triangle or segment t has all other points strictly beyond it, in the plane of axes i and j: 1, 0 or
+    UNSURE."""
+    verdict = 0
+    for n in range(3 if t.shape[0] == 3 else 1):
+        m = (n + 1) % 3
+        inner = _turn(t[n], t[m], t[3 - n - m], i, j) if t.shape[0] == 3 else -_turn(t[n], t[m], others[0], i, j)
+        if inner != 1 and inner != -1:
+            verdict = UNSURE
+            continue
+        beyond, within = 0, 0
+        for o in range(others.shape[0]):
+            side = _turn(t[n], t[m], others[o], i, j)
+            beyond += side == -inner
+            within += side == inner
+        if beyond == others.shape[0]:
+            return 1
+        if within == 0:
+            verdict = UNSURE
+    return verdict
 
 
 @kernel

@@ -1,0 +1,115 @@
+"""Manoeuvres that crumple sheets, and starts made by them."""
+
+import numpy as np
+import pytest
+from exact_intersections import intersecting_pairs
+
+from clothgym import disc, grid
+from clothgym.collisions.intersections import count_intersections
+from clothgym.crumpling import MANOEUVRES, STARTS, starts
+
+GRID, DISC = grid(13, 13, 0.8, 0.8), disc(0.4, 6)
+
+
+def run(manoeuvre, seconds=np.inf):
+    """Step until then; the counts of each frame, (frames, num_envs)."""
+    counts = []
+    while not manoeuvre.over and manoeuvre.time < seconds:
+        manoeuvre.step()
+        counts.append(count_intersections(manoeuvre.mesh.triangles, manoeuvre.simulation.positions))
+    return np.array(counts)
+
+
+@pytest.mark.parametrize("mesh", [GRID, grid(25, 25, 1, 1), DISC], ids=["coarse", "fine", "disc"])
+@pytest.mark.parametrize("name", [*MANOEUVRES, "rumpled"])
+def test_a_manoeuvre_starts_without_intersections_above_the_floor(name, mesh):
+    manoeuvre = (MANOEUVRES | STARTS)[name](mesh, seeds=range(3))
+    assert count_intersections(mesh.triangles, manoeuvre.start).tolist() == [0, 0, 0]
+    assert manoeuvre.start[:, :, 2].min() > 0
+    # a start may shorten threads, where a disc's are creased, but not stretch them
+    assert manoeuvre.simulation.strain().max() < 0.01
+    assert len({sheet.tobytes() for sheet in manoeuvre.start}) == 3
+
+
+@pytest.mark.parametrize("name", MANOEUVRES)
+def test_without_self_collision_a_manoeuvre_intersects(name):
+    manoeuvre = MANOEUVRES[name](GRID, seeds=[0])
+    counts = run(manoeuvre, 4.5)
+    assert np.mean(counts > 0) > 0.2
+    assert not manoeuvre.simulation.diverged.any()
+
+
+def test_a_seed_is_the_same_sheet_in_any_batch():
+    together, alone = (MANOEUVRES["drag at 1 m/s"](GRID, seeds=seeds) for seeds in ([3, 4, 5], [4]))
+    for _ in range(30):
+        together.step()
+        alone.step()
+    assert np.array_equal(together.simulation.positions[1], alone.simulation.positions[0])
+
+
+@pytest.mark.parametrize("layers", [2, 6])
+def test_leaves_of_the_z_fold_keep_their_distance(layers):
+    # columns beside a crease face each other across it
+    manoeuvre = MANOEUVRES["z-fold"](grid(25, 25, 1, 1), seeds=[0], thickness=0.008, leaves=layers)
+    columns = manoeuvre.start[0].reshape(25, 25, 3)
+    apart = np.linalg.norm(columns[:, 2:] - columns[:, :-2], axis=2).min()
+    assert 0.0115 < apart < 0.013  # 1.5 thicknesses, less the unevenness of a seed
+
+
+@pytest.mark.parametrize(("times", "extents"), [(1, (1.0, 0.5)), (2, (0.5, 0.5)), (3, (0.5, 0.25))])
+def test_a_folded_sheet_has_half_the_size(times, extents):
+    name = ("fold", "fold twice", "fold three times")[times - 1]
+    manoeuvre = MANOEUVRES[name](grid(13, 13, 1.0, 1.0), seeds=[0, 1])
+    while not manoeuvre.over:
+        manoeuvre.step()
+    found = np.ptp(manoeuvre.simulation.positions[:, :, :2], axis=1)
+    assert np.all(np.abs(found - extents) < 0.15)
+    assert not manoeuvre.simulation.attached.any()
+
+
+def test_a_wring_turns_one_end_against_the_other():
+    manoeuvre = MANOEUVRES["wring"](GRID, seeds=[0], turns=0.25, turning=1.0)
+    before = manoeuvre.held.copy()
+    run(manoeuvre, 1.0)
+    after = manoeuvre.simulation.positions[0, manoeuvre.simulation.anchors]
+    left, right = np.split(np.arange(len(after)), 2)
+    for end, angle in ((left, -np.pi / 4), (right, np.pi / 4)):
+        across = [np.ptp(x[end][:, 1:][[0, -1]], axis=0) for x in (before[0], after)]
+        assert np.allclose(np.abs(np.arctan2(across[1][1], across[1][0])), abs(angle), atol=0.08)
+    # the ends have come nearer by the share that is the default
+    assert np.isclose(np.ptp(after[:, 0]) / np.ptp(before[0, :, 0]), 0.85, atol=0.01)
+
+
+def test_a_corner_is_dragged_at_its_speed():
+    manoeuvre = MANOEUVRES["drag at 3 m/s"](GRID, seeds=[7])
+    corner, places = manoeuvre.simulation.anchors[0], []
+    for _ in range(60):
+        manoeuvre.step()
+        places.append(manoeuvre.simulation.positions[0, corner])
+    ways = np.linalg.norm(np.diff(places, axis=0), axis=1) * 60
+    assert ways.max() < 3.001
+    # it loses way only where it turns within a frame
+    assert np.median(ways) == pytest.approx(3, rel=1e-3)
+
+
+@pytest.mark.parametrize("kind", STARTS)
+def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
+    x = starts(GRID, kind=kind, count=2, seed=5)
+    assert x.shape == (2, GRID.num_particles, 3)
+    assert not np.array_equal(x[0], x[1])
+    for sheet in x:
+        assert intersecting_pairs(GRID.triangles, sheet) == set()
+    assert 0 <= x[:, :, 2].min() < 0.01
+    assert x[:, :, 2].max() > 0.008  # not flat
+
+
+def test_starts_that_intersect_are_refused():
+    with pytest.raises(RuntimeError, match="folded sheet of seed 3 intersects itself .* times, at triangles"):
+        starts(GRID, kind="folded", seed=3, self_collision=False)
+
+
+def test_what_cannot_be_started():
+    with pytest.raises(ValueError, match="crumpled"):
+        starts(GRID, kind="ironed")
+    with pytest.raises(ValueError, match="3 times at most"):
+        MANOEUVRES["fold"](GRID, times=4)
