@@ -164,6 +164,10 @@ class Hands:
         """Whether each anchor holds its particle, (num_envs, anchors)."""
         return self.layout.to_public(self.holder[:, self.anchors] == np.arange(len(self.anchors))[:, None])
 
+    def take_up_lag(self, first: int, last: int, lag: NDArray, behind: NDArray, w: NDArray, free_w: NDArray) -> None:
+        """Begin a control step of blocks ``first`` to ``last`` after one in which what is held may have been held up."""
+        settle_lag(first, last, lag, behind, self.holder, self.anchors, self.limits[:, REACH2], w, free_w)
+
     def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids) -> None:
         """Begin a control step of blocks ``first`` to ``last``."""
         allowed, time_step = self.targets, x.dtype.type(self.time_step)
@@ -408,3 +412,31 @@ def let_slip(pull, holder, w, free_w, limits):
                     if px * px + py * py + pz * pz > limits[k, SLIP2]:
                         holder[b, p, l] = FREE
                         w[b, p, l] = free_w[b, p, l]
+
+
+@kernel
+def settle_lag(first, last, lag, behind, holder, anchors, reach2, w, free_w):
+    """Before the hands move: an anchor goes on from where its particle is, and so owes nothing for it; what has come out of the
+    reach of a gripper's fingers has slipped.
+
+    lag: (blocks, particles, 3, lanes).  behind: (blocks, lanes).  holder: (blocks, particles, lanes).  anchors: their particles.
+    reach2: squares of what the hands reach [m^2], (hands,).
+    """
+    for b in range(first, last):
+        for l in range(behind.shape[1]):
+            if not behind[b, l] > 0:
+                continue
+            own = np.zeros((anchors.shape[0], 3), lag.dtype)
+            for k in range(anchors.shape[0]):
+                for c in range(3):
+                    own[k, c] = lag[b, anchors[k], c, l]
+            for p in range(holder.shape[1]):
+                k = holder[b, p, l]
+                if k < 0:
+                    continue
+                if k < anchors.shape[0]:
+                    for c in range(3):
+                        lag[b, p, c, l] -= own[k, c]
+                elif lag[b, p, 0, l] ** 2 + lag[b, p, 1, l] ** 2 + lag[b, p, 2, l] ** 2 > reach2[k]:
+                    holder[b, p, l] = -1
+                    w[b, p, l] = free_w[b, p, l]

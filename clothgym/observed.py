@@ -5,7 +5,7 @@ from __future__ import annotations
 from numpy.typing import NDArray
 
 from clothgym.bending import Bending
-from clothgym.collisions import Contacts, Solids
+from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids, count_intersections
 from clothgym.forces import Energy, energy, structural_strain
 from clothgym.hands import Hands
 from clothgym.limiting import Limiting
@@ -23,6 +23,7 @@ class Observed:
     threads: int
     _hands: Hands
     _solids: Solids
+    _contact: SelfCollision
     _x: NDArray
     _v: NDArray
     _free_w: NDArray
@@ -113,3 +114,12 @@ class Observed:
         """How deep the deepest point of the sheet, on its triangles too, is in the colliders' surface [m], (num_envs,); 0 if it
         is in none.  The thickness that contact keeps does not count as part of a collider."""
         return self._solids.penetration(self._x, self._surface)
+
+    @property
+    def self_contacts(self) -> SelfContacts | None:
+        """The sheets' contacts with themselves in the last control step; None without ``self_collision``."""
+        return self._contact.told()
+
+    def intersections(self) -> NDArray:
+        """Number of pairs of triangles that intersect, (num_envs,): an exact count, that self-collision has no part in."""
+        return count_intersections(self.mesh.triangles, self.positions)

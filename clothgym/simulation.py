@@ -16,7 +16,8 @@ from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
-from clothgym.collisions import DESK, Collider, Solids, resolve, room_for_touches
+from clothgym.collisions import DESK, Collider, SelfCollision, Solids, resolve, room_for_touches
+from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
 from clothgym.hands import Gripper, Grippers, Hands
@@ -35,8 +36,8 @@ AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked
 
 
 def advance(
-    first, last, x, v, w, elements, surface, fabric, shapes, colliders, h, carried, substeps, air_every, look_every, options, plan,
-    rows, limit, limited, diverged,
+    first, last, x, v, w, elements, surface, fabric, shapes, colliders, sheet, h, carried, substeps, air_every, look_every, options,
+    plan, rows, limit, limited, diverged,
 ):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
@@ -53,17 +54,20 @@ def advance(
                 add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
+            press(x[b], v[b], w[b], sheet, b, step, h, carried)  # noqa: F821
             look = step % look_every == 0
             resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)
+            keep_apart(x[b], v[b], w[b], sheet, b, h, carried)  # noqa: F821
         remeasure(x[b], elements.springs, limited[b])  # noqa: F821
         mark_diverged(x[b], v[b], diverged[b])
 
 
 @cache
-def _compiled(substep: Any, name: str, model: Bending, limits: bool) -> Any:
+def _compiled(substep: Any, name: str, model: Bending, limits: bool, collides: bool) -> Any:
     """The main loop around an integrator's substep, in which the model's kernels bend."""
     bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", **model.kernels)
-    return specialize(advance, f"advance_{name}_{model.name}_{limits}", substep=bound, **limiting.KERNELS[limits])
+    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides]
+    return specialize(advance, f"advance_{name}_{model.name}_{limits}_{collides}", substep=bound, **parts)
 
 
 class Simulation(Observed):
@@ -84,6 +88,7 @@ class Simulation(Observed):
         anchor_speed: largest speed of an anchor [m/s].
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.
+        self_collision: False, "fast" or "strict", or a dict with mode, thickness [m] and friction, see ``collisions``.
         strain_limit: largest strain of threads and diagonals, see ``limiting``; None for none.
         on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
         dtype: "float32", or "float64" for reference runs.
@@ -109,6 +114,7 @@ class Simulation(Observed):
         anchor_speed: float = 10.0,
         grippers: Sequence[Gripper] = (),
         bending: str = "springs",
+        self_collision: bool | str | Mapping[str, Any] = False,
         strain_limit: float | None = None,
         on_divergence: Literal["warn", "raise", "ignore"] = "warn",
         dtype: str = "float32",
@@ -142,8 +148,11 @@ class Simulation(Observed):
         self.colliders = self._solids.colliders
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
-        self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged)
-        self._advance = _compiled(self.integrator.substep, self.integrator.name, self.bending, strain_limit is not None)
+        self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
+        own = f"{self._contact.options} {self._contact.thickness}"
+        self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
+        parts = self.bending, strain_limit is not None, self._contact.options is not None
+        self._advance = _compiled(self.integrator.substep, self.integrator.name, *parts)
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
         self._planned_substeps = 0
@@ -157,6 +166,7 @@ class Simulation(Observed):
                 gravity=vector("gravity", gravity),
                 wind=vector("wind", wind),
                 colliders=self._solids.described(),
+                contact=self._contact.blank(),
                 sheet=self._sheet,
             )
         )
@@ -182,11 +192,14 @@ class Simulation(Observed):
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
+            if self._contact.strict:
+                memory = self._contact.sheet.memory
+                self._hands.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
-                self._solids.shapes, self._solids.rows, h, carried, self.substeps, air_every, look_every, options, self._plan,
-                rows, limit, self._limited, self._diverged,
+                self._solids.shapes, self._solids.rows, self._contact.sheet, h, carried, self.substeps, air_every, look_every,
+                options, self._plan, rows, limit, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
@@ -195,6 +208,7 @@ class Simulation(Observed):
             if self._hands.can_slip:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
             self._steps += 1
+            self._contact.warn(self._steps)
             if self._diverged.any() and self.on_divergence != "ignore":
                 new = self.diverged & ~self._reported
                 self._reported |= new
@@ -263,6 +277,8 @@ class Simulation(Observed):
         shape = (len(env), self.mesh.num_particles, 3)
         x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
+        if positions is not None:
+            self._contact.check(x)
         block, lane = self.layout.place(env)
         self._x[block, :, :, lane] = np.broadcast_to(x, shape)
         self._v[block, :, :, lane] = np.broadcast_to(v, shape)
@@ -273,6 +289,7 @@ class Simulation(Observed):
         self._limited[block, :, lane] = 0
         self._reported[env] = False
         self._apply_masses(block, lane)
+        self._contact.begin(block, lane, self._x)
 
     def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **figures: ArrayLike) -> None:
         """Change material figures (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
@@ -328,6 +345,7 @@ class Simulation(Observed):
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
             **self._solids.public(),
+            **self._contact.public(),
             steps=self._steps.copy(),
             diverged=self.diverged,
             sheet=self._sheet,
@@ -342,6 +360,7 @@ class Simulation(Observed):
         counts = len(self.anchors), len(self.grippers), len(self.colliders)
         check_fits(state, self.num_envs, self.mesh.num_particles, self._hands.members, *counts, self._sheet)
         guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
+        self._contact.check(state.positions)
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)
@@ -357,6 +376,7 @@ class Simulation(Observed):
         self._diverged = blocks(state.diverged, np.dtype(bool))
         self._reported = self.diverged
         self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
+        self._contact.restore(state, self._x)
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
 

@@ -160,6 +160,14 @@ class State:
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
+        contact_start, contact_bounds, contact_limits: where each vertex was when self-collision last looked around it [m],
+            (num_envs, particles, 3), and the squares of how far it may go from there, see ``collisions.proximity`` [m^2],
+            (num_envs, particles), negative where it has not looked; no particles without self-collision.
+        contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
+        contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
+            ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
+        contact_tight: its pairs that may come no closer, (num_envs,); contact_ties, contact_planes: see there, (num_envs, pairs,
+            ...).
         steps: control steps since the environment's reset, (num_envs,).
         diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
         sheet: digest of the mesh and of what bends, the same for all, ().
@@ -184,6 +192,17 @@ class State:
     parameters: NDArray
     colliders: NDArray
     collider_homes: NDArray
+    contact_start: NDArray
+    contact_bounds: NDArray
+    contact_limits: NDArray
+    contact_lag: NDArray
+    contact_count: NDArray
+    contact_particles: NDArray
+    contact_figures: NDArray
+    contact_impulses: NDArray
+    contact_tight: NDArray
+    contact_ties: NDArray
+    contact_planes: NDArray
     steps: NDArray
     diverged: NDArray
     sheet: NDArray
@@ -232,7 +251,9 @@ def check_fits(
     if state.colliders.shape[1] != colliders:
         raise ValueError(f"the state has {state.colliders.shape[1]} colliders, this simulation {colliders}")
     if not np.array_equal(state.sheet, sheet):
-        raise ValueError("the state is of a sheet of another shape or size, or of another bending model than this simulation's")
+        raise ValueError(
+            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's"
+        )
 
 
 def at_rest(
@@ -244,12 +265,13 @@ def at_rest(
     gravity: NDArray,
     wind: NDArray,
     colliders: NDArray,
+    contact: dict[str, NDArray],
     sheet: NDArray,
 ) -> State:
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
     anchors: particles, (anchors,).  hands: how many.  parameters: (figures,).  gravity, wind: (3,).  colliders: (colliders,
-    rows).
+    rows).  contact: arrays of self-collision.
     """
 
     def each(value: NDArray) -> NDArray:
@@ -275,6 +297,7 @@ def at_rest(
         parameters=each(parameters),
         colliders=each(colliders),
         collider_homes=each(colliders),
+        **contact,
         steps=np.zeros(num_envs, np.int64),
         diverged=np.zeros(num_envs, bool),
         sheet=sheet,
@@ -299,9 +322,9 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, by_particle: 
     return Elements(springs, bends)
 
 
-def digest_of(mesh: ClothMesh, hinged: bool) -> NDArray[np.uint64]:
-    """What tells one sheet, with what bends it, from another."""
-    digest = hashlib.sha256(bytes([hinged]))
+def digest_of(mesh: ClothMesh, hinged: bool, contact: str) -> NDArray[np.uint64]:
+    """What tells one sheet, with what bends it and how it collides with itself, from another."""
+    digest = hashlib.sha256(bytes([hinged]) + contact.encode())
     for array in (mesh.rest_positions, mesh.triangles, *mesh.springs, *mesh.hinges):
         digest.update(np.ascontiguousarray(array).tobytes())
     return np.frombuffer(digest.digest()[:8], np.uint64)[0].reshape(())

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.measures import CENTROID, FINITE, STRETCH2
+from clothgym.simulation import Simulation
 from clothgym.state import State
 
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
@@ -42,6 +43,16 @@ def failures(summary: NDArray, low: NDArray, high: NDArray) -> NDArray:
     torn = summary[STRETCH2] > TORN**2
     diverged = summary[FINITE] == 0
     return np.where(diverged, 1, np.where(torn, 2, np.where(outside, 3, 0)))
+
+
+def physics_info(simulation: Simulation, strain: NDArray) -> dict[str, Any]:
+    """What ``info`` tells of the physics, arrays (num_envs,): the largest strain, given, and the one before any limiting; with
+    self-collision its contacts, the moves that it cut short, and the largest lag of what is held [m]."""
+    limiting, contacts = simulation.limiting, simulation.self_contacts
+    info = {"strain_max": strain, "strain_before_limiting": strain.copy() if limiting is None else limiting.before}
+    if contacts is not None:
+        info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "hand_lag": contacts.lag}
+    return info
 
 
 def within_ball(vectors: NDArray) -> NDArray:

@@ -406,6 +406,7 @@ class ClothStrainEnv(ClothEnv):
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``wind`` | ``None`` | the id's own; or what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for a calm |
     | ``strain_limit`` | ``None`` | anything else is refused, see above |
+    | ``self_collision`` | ``False`` | or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
     | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
 

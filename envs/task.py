@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, integrators
-from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, within_ball
+from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, physics_info, within_ball
 from clothgym.envs.measures import SUMMARY, largest_strain, see_points, summarize
 from clothgym.envs.physics import Physics, check_material_option, check_ranges, checked_ranges, checked_wind, most_demanding
 from clothgym.mesh import SHEAR
@@ -43,7 +43,7 @@ class Task(ABC):
         num_envs: environments in the batch.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
-        bending, strain_limit: as ``Simulation`` takes them.
+        bending, strain_limit, self_collision: as ``Simulation`` takes them.
         obs_mode: one of ``obs_modes``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the judgement alone).
         randomize: ranges of material figures drawn at each reset, ``{"density": [0.1, 0.2]}``.
@@ -70,6 +70,7 @@ class Task(ABC):
         substeps: int | str | None = None,
         bending: str = "springs",
         strain_limit: float | None = None,
+        self_collision: bool | str | Mapping[str, Any] = False,
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",
         randomize: Mapping[str, Sequence[float]] | None = None,
@@ -102,6 +103,7 @@ class Task(ABC):
             grippers=physics.grippers,
             bending=bending,
             strain_limit=strain_limit,
+            self_collision=self_collision,
             threads=threads,
             on_divergence="ignore",  # a step's outcome says so
         )
@@ -298,9 +300,7 @@ class Task(ABC):
         judged = running & settled & (failure == 0)
         terminated = judged | (failure > 0)
         strain = largest_strain(summary)
-        limiting = self.simulation.limiting
-        before = strain.copy() if limiting is None else limiting.before
-        info: dict[str, Any] = {"strain_max": strain, "strain_before_limiting": before}
+        info: dict[str, Any] = physics_info(self.simulation, strain)
         info |= self._account(running, failure, strain) | self._judgement()
         for key, value in self._judge(np.flatnonzero(judged), summary).items():
             info[key][judged] = value

@@ -1,0 +1,320 @@
+"""Which primitives of one sheet may be close: the broad phase of self-collision's query.
+
+Near pairs (see ``pairs``) by the distances of their vertices; all others by boxes of blocks, boxes, balls and planes of leaves, and
+balls of primitives.  What is left out is surely farther apart than the query's reach.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.collisions.pairs import LEAVES
+
+TINY = 1e-300
+FLAT = 0.2  # angle [rad] up to which neighbouring faces are taken for flat: there vertices alone keep layers apart
+
+
+class Reach(NamedTuple):
+    """Distances of a query [m].
+
+    near, far: within which near pairs, and all others, are found.  near_thickness, far_thickness: of the cloth there.
+    margin: beyond the thickness within which a pair becomes a contact.  stop: below it a pair may come no closer.
+    standoff: distance at which what is held stops.
+    """
+
+    near: float
+    far: float
+    near_thickness: float
+    far_thickness: float
+    margin: float
+    stop: float
+    standoff: float
+
+
+@kernel
+def along(p, v, nx, ny, nz):
+    """Place of a vertex along a direction [m]."""
+    return nx * p[v, 0] + ny * p[v, 1] + nz * p[v, 2]
+
+
+@kernel
+def stretches(p, edges, rest_edges, triangles, triangle_edges, stretch):
+    """The largest (length over rest length)^2, at least 1, of the edges of each vertex' triangles; returns that of the sheet."""
+    ratio = np.empty(edges.shape[0])
+    largest = 1.0
+    for e in range(edges.shape[0]):
+        i, j = edges[e, 0], edges[e, 1]
+        dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        ratio[e] = max((dx * dx + dy * dy + dz * dz) * rest_edges[e], 1.0)
+        largest = max(largest, ratio[e])
+    stretch[:] = 1.0
+    for t in range(triangles.shape[0]):
+        own = max(ratio[triangle_edges[t, 0]], max(ratio[triangle_edges[t, 1]], ratio[triangle_edges[t, 2]]))
+        for c in range(3):
+            stretch[triangles[t, c]] = max(stretch[triangles[t, c]], own)
+    return largest
+
+
+@kernel
+def come_close(p, ends, slack, stretch, within, out):
+    """Near pairs of vertices that are so close that some of their primitives may be within reach; returns how many."""
+    count = 0
+    for q in range(ends.shape[0]):
+        i, j = ends[q, 0], ends[q, 1]
+        dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        out[count] = q
+        count += dx * dx + dy * dy + dz * dz <= within + slack[q] * max(stretch[i], stretch[j])
+    return count
+
+
+@kernel
+def near_candidates(p, pairs, near):
+    """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), edges
+    and edges, (candidates, 2), and the sheet's largest stretch."""
+    near_pairs, begins, near_list, vertex_triangles = pairs.near_pairs, pairs.near, pairs.near_list, pairs.vertex_triangles
+    stretch = np.empty(p.shape[0])
+    largest = stretches(p, pairs.edges, pairs.rest_edges, pairs.triangles, pairs.triangle_edges, stretch)
+    close = np.empty(pairs.ends.shape[0] + 1, np.int32)
+    number = come_close(p, pairs.ends, pairs.slack, stretch, near * near, close)
+    most = 0
+    for c in range(number):
+        most += begins[close[c] + 1] - begins[close[c]]
+    corners, edges = np.zeros((most, 3), np.int32), np.empty((most, 2), np.int32)
+    first, second = 0, 0
+    seen = np.zeros(near_pairs.shape[0] if number > 0 else 0, np.bool_)
+    for c in range(number):
+        for m in range(begins[close[c]], begins[close[c] + 1]):
+            n = near_list[m]
+            if seen[n]:
+                continue
+            seen[n] = True
+            if n < vertex_triangles:
+                corners[first, 0], corners[first, 1] = near_pairs[n, 0], near_pairs[n, 1]
+                first += 1
+            else:
+                edges[second, 0], edges[second, 1] = near_pairs[n, 0], near_pairs[n, 1]
+                second += 1
+    return corners[:first], edges[:second], np.sqrt(largest)
+
+
+@kernel
+def enclose(p, corners, blocks, box, ball, hulls):
+    """Boxes, (6, leaves), and balls (centre and radius), (4, leaves), around leaves, and boxes around blocks, (6, blocks)."""
+    for leaf in range(corners.shape[0]):
+        i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
+        for c in range(3):
+            a, b, d, e = p[i, c], p[j, c], p[k, c], p[l, c]
+            box[c, leaf] = min(min(a, b), min(d, e))
+            box[3 + c, leaf] = max(max(a, b), max(d, e))
+            ball[c, leaf] = 0.25 * (a + b + d + e)
+        square = 0.0
+        for m in range(4):
+            v = corners[leaf, m]
+            dx, dy, dz = p[v, 0] - ball[0, leaf], p[v, 1] - ball[1, leaf], p[v, 2] - ball[2, leaf]
+            square = max(square, dx * dx + dy * dy + dz * dz)
+        ball[3, leaf] = np.sqrt(square)
+    for k in range(blocks.shape[0] - 1):
+        for c in range(3):
+            low, high = box[c, blocks[k]], box[3 + c, blocks[k]]
+            for leaf in range(blocks[k], blocks[k + 1]):
+                low, high = min(low, box[c, leaf]), max(high, box[3 + c, leaf])
+            hulls[c, k] = low
+            hulls[3 + c, k] = high
+
+
+@kernel
+def excess(box, ball, leaf, first, far, out):
+    """By how much the leaves of a block, ``LEAVES`` from ``first`` on, are out of reach of a leaf: surely so if it is above 0."""
+    lx, ly, lz = box[0, leaf] - far, box[1, leaf] - far, box[2, leaf] - far
+    hx, hy, hz = box[3, leaf] + far, box[4, leaf] + far, box[5, leaf] + far
+    bx, by, bz, br = ball[0, leaf], ball[1, leaf], ball[2, leaf], ball[3, leaf] + far
+    for m in range(LEAVES):
+        other = first + m
+        dx, dy, dz, r = ball[0, other] - bx, ball[1, other] - by, ball[2, other] - bz, ball[3, other] + br
+        low = max(box[0, other] - hx, max(box[1, other] - hy, box[2, other] - hz))
+        high = max(lx - box[3, other], max(ly - box[4, other], lz - box[5, other]))
+        out[m] = max(dx * dx + dy * dy + dz * dz - r * r, max(low, high))
+
+
+@kernel
+def far_leaves(pairs, far, ball, box, hulls, out):
+    """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more than fit are written."""
+    blocks, neighbours, next_leaves = pairs.blocks, pairs.neighbours, pairs.next_leaves
+    beyond = np.empty(LEAVES)
+    count = 0
+    for one in range(blocks.shape[0] - 1):
+        for two in range(one, blocks.shape[0] - 1):
+            if out_of_reach(hulls, one, hulls, two, far):
+                continue
+            for leaf in range(blocks[one], blocks[one + 1]):
+                if out_of_reach(box, leaf, hulls, two, far):
+                    continue
+                first = blocks[two]
+                excess(box, ball, leaf, first, far, beyond)
+                for m in range(LEAVES):
+                    other = first + m
+                    if not beyond[m] <= 0.0 or other <= leaf:
+                        continue
+                    beside = False
+                    for n in range(neighbours[leaf], neighbours[leaf + 1]):
+                        beside |= next_leaves[n] == other
+                    if not beside:
+                        if count < out.shape[0]:
+                            out[count, 0] = leaf
+                            out[count, 1] = other
+                        count += 1
+    return count
+
+
+@kernel
+def out_of_reach(a, i, b, j, far):
+    """Whether box i of ``a`` and box j of ``b`` are farther apart than ``far`` along an axis."""
+    apart = (a[0, i] > b[3, j] + far) | (a[1, i] > b[4, j] + far) | (a[2, i] > b[5, j] + far)
+    return apart | (b[0, j] > a[3, i] + far) | (b[1, j] > a[4, i] + far) | (b[2, j] > a[5, i] + far)
+
+
+@kernel
+def faces_of(p, triangles, faces):
+    """Unit normals of triangles, (3, triangles)."""
+    for t in range(triangles.shape[0]):
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
+        cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        scale = 1.0 / np.sqrt(cx * cx + cy * cy + cz * cz + TINY)
+        faces[0, t], faces[1, t], faces[2, t] = cx * scale, cy * scale, cz * scale
+
+
+@kernel
+def ridges_of(faces, edge_triangles, ridges):
+    """Which edges are ridges: those on the border, and those whose faces differ by more than ``FLAT``."""
+    least = 1.0 - 0.5 * FLAT * FLAT
+    for e in range(edge_triangles.shape[0]):
+        s, t = edge_triangles[e, 0], edge_triangles[e, 1]
+        turn = faces[0, s] * faces[0, t] + faces[1, s] * faces[1, t] + faces[2, s] * faces[2, t]
+        ridges[e] = (s == t) | (not turn >= least)
+
+
+@kernel
+def between(p, corners, leaf, other, nx, ny, nz):
+    """Distance along a unit direction of two leaves that it separates [m], on whichever side; else negative."""
+    i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
+    a, b, c, d = along(p, i, nx, ny, nz), along(p, j, nx, ny, nz), along(p, k, nx, ny, nz), along(p, l, nx, ny, nz)
+    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    i, j, k, l = corners[other, 0], corners[other, 1], corners[other, 2], corners[other, 3]
+    a, b, c, d = along(p, i, nx, ny, nz), along(p, j, nx, ny, nz), along(p, k, nx, ny, nz), along(p, l, nx, ny, nz)
+    return max(low - max(max(a, b), max(c, d)), min(min(a, b), min(c, d)) - high)
+
+
+@kernel
+def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, found, number, gaps):
+    """Keep those of ``number`` pairs of leaves that no plane shows to be out of reach, with the distance that a plane shows, below
+    zero if none does, and the plane's normal, (pairs, 4).  Returns how many.
+
+    The planes are square to either leaf's first triangle.
+    """
+    count = 0
+    for pair in range(number):
+        leaf, other = found[pair, 0], found[pair, 1]
+        s, t = own_triangles[leaf_triangles[leaf]], own_triangles[leaf_triangles[other]]
+        gap = between(p, corners, leaf, other, faces[0, s], faces[1, s], faces[2, s])
+        second = between(p, corners, leaf, other, faces[0, t], faces[1, t], faces[2, t])
+        if second > gap:
+            gap, s = second, t
+        if gap < far:
+            found[count, 0], found[count, 1] = leaf, other
+            gaps[count, 0], gaps[count, 1], gaps[count, 2], gaps[count, 3] = gap, faces[0, s], faces[1, s], faces[2, s]
+            count += 1
+    return count
+
+
+@kernel
+def far_vertices(p, leaves, ball, far, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
+    """Vertices and triangles of leaves' pairs that may be close, with the number of the pair; returns how many, though no more than
+    fit are written."""
+    count = 0
+    for pair in range(leaves.shape[0]):
+        for way in range(2):
+            leaf, other = leaves[pair, way], leaves[pair, 1 - way]
+            r = ball[3, other] + far
+            for m in range(leaf_vertices[leaf], leaf_vertices[leaf + 1]):
+                v = own_vertices[m]
+                dx, dy, dz = p[v, 0] - ball[0, other], p[v, 1] - ball[1, other], p[v, 2] - ball[2, other]
+                if dx * dx + dy * dy + dz * dz <= r * r:
+                    for n in range(leaf_triangles[other], leaf_triangles[other + 1]):
+                        if count < out.shape[0]:
+                            out[count, 0], out[count, 1], out[count, 2] = v, own_triangles[n], pair
+                        count += 1
+    return count
+
+
+@kernel
+def far_edges(p, leaves, layered, ridges, stretch, far, leaf_edges, own_edges, edges, half_edges, out):
+    """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more than fit are
+    written."""
+    count = 0
+    for pair in range(leaves.shape[0]):
+        leaf, other, some = leaves[pair, 0], leaves[pair, 1], layered[pair]
+        for m in range(leaf_edges[leaf], leaf_edges[leaf + 1]):
+            e = own_edges[m]
+            if some and not ridges[e]:
+                continue
+            i, j = edges[e, 0], edges[e, 1]
+            mx, my, mz = p[i, 0] + p[j, 0], p[i, 1] + p[j, 1], p[i, 2] + p[j, 2]
+            half = half_edges[e] * stretch + far
+            for n in range(leaf_edges[other], leaf_edges[other + 1]):
+                f = own_edges[n]
+                if some and not ridges[f]:
+                    continue
+                k, l = edges[f, 0], edges[f, 1]
+                dx, dy, dz = p[k, 0] + p[l, 0] - mx, p[k, 1] + p[l, 1] - my, p[k, 2] + p[l, 2] - mz
+                r = half + half_edges[f] * stretch
+                if dx * dx + dy * dy + dz * dz <= 4.0 * r * r:
+                    if count < out.shape[0]:
+                        out[count, 0], out[count, 1] = e, f
+                    count += 1
+    return count
+
+
+@kernel
+def far_pairs(p, pairs, far, faces):
+    """Pairs of leaves without a common vertex to look into, (pairs, 2), the distance that a plane shows them to have [m] and
+    its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3)."""
+    corners, size = pairs.corners, pairs.corners.shape[0]
+    # the last block is looked at as if it were full
+    box, ball = np.full((6, size + LEAVES), np.inf), np.zeros((4, size + LEAVES))
+    hulls = np.empty((6, pairs.blocks.shape[0] - 1))
+    enclose(p, corners, pairs.blocks, box, ball, hulls)
+    found = np.empty((16 * size, 2), np.int32)
+    number = far_leaves(pairs, far, ball, box, hulls, found)
+    if number > found.shape[0]:
+        found = np.empty((number, 2), np.int32)
+        far_leaves(pairs, far, ball, box, hulls, found)
+    gaps = np.empty((number, 4))
+    number = gaps_of_leaves(p, corners, faces, pairs.leaf_triangles, pairs.own_triangles, far, found, number, gaps)
+    leaves = found[:number]
+    vertices = np.empty((4 * number, 3), np.int32)
+    owned = pairs.leaf_vertices, pairs.own_vertices, pairs.leaf_triangles, pairs.own_triangles
+    count = far_vertices(p, leaves, ball, far, owned[0], owned[1], owned[2], owned[3], vertices)
+    if count > vertices.shape[0]:
+        vertices = np.empty((count, 3), np.int32)
+        far_vertices(p, leaves, ball, far, owned[0], owned[1], owned[2], owned[3], vertices)
+    return leaves, gaps[:number], vertices[:count]
+
+
+@kernel
+def far_sides(p, pairs, leaves, layered, ridges, stretch, far):
+    """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges.
+
+    stretch: the largest of an edge.
+    """
+    sides = np.empty((4 * leaves.shape[0], 2), np.int32)
+    owned = pairs.leaf_edges, pairs.own_edges, pairs.edges, pairs.half_edges
+    count = far_edges(p, leaves, layered, ridges, stretch, far, owned[0], owned[1], owned[2], owned[3], sides)
+    if count > sides.shape[0]:
+        sides = np.empty((count, 2), np.int32)
+        far_edges(p, leaves, layered, ridges, stretch, far, owned[0], owned[1], owned[2], owned[3], sides)
+    return sides[:count]

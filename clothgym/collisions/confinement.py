@@ -1,0 +1,241 @@
+"""The bounds of self-collision: what has left its bound is looked at anew, and in strict mode drawn back.
+
+Everything happens between two certified states, the positions at the end of two substeps.  A move is cut short on the straight way
+from the first, which lies in every bound.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.collisions.proximity import CLAMPED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
+
+INSIDE = 0.999  # of a bound that is used, for rounding
+REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
+FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
+
+
+@kernel
+def confine(x, v, w, sheet, block, h):
+    """Keep one block's sheets within their bounds; see the module."""
+    memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
+    start, bounds, limits, old = memory.start[block], memory.bounds[block], memory.limits[block], memory.old[block]
+    lanes = x.shape[2]
+    for l in range(memory.used[block]):
+        if memory.behind[block, l] > 0:
+            memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
+    out = np.zeros(lanes, np.bool_)
+    if lanes == 1:
+        out[0] = _leaves(x, start, bounds, samples, 0)
+    else:
+        _leave(x, start, bounds, samples, out)
+    for l in range(memory.used[block]):
+        if not out[l]:
+            continue
+        # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
+        if not (_leaves(x, start, limits, samples, l) or (setting.strict and _comes_close(x, memory, block, l))):
+            continue
+        _renew(x, v, w, sheet, block, l)
+        if setting.strict:
+            _hold_apart(x, v, w, sheet, block, l)
+    for p in range(x.shape[0]):
+        for c in range(3):
+            xc, oc = x[p, c], old[p, c]
+            for l in range(lanes):
+                oc[l] = xc[l]
+
+
+@kernel
+def _leave(x, start, bounds, samples, beyond):
+    """Mark lanes of which a vertex has left its bound, but for a motion that all share: it changes no distance."""
+    lanes = x.shape[2]
+    share = x.dtype.type(1 / samples.shape[0])
+    mean = np.zeros((3, lanes), x.dtype)
+    for s in range(samples.shape[0]):
+        xs, ss = x[samples[s]], start[samples[s]]
+        for c in range(3):
+            for l in range(lanes):
+                mean[c, l] += (xs[c, l] - ss[c, l]) * share
+    for p in range(x.shape[0]):
+        xp, sp, bp = x[p], start[p], bounds[p]
+        for l in range(lanes):
+            dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
+            inside = dx * dx + dy * dy + dz * dz <= bp[l]
+            beyond[l] |= not inside
+
+
+@kernel
+def _leaves(x, start, bounds, samples, l):
+    """The same for one lane, without loops of one round."""
+    share = x.dtype.type(1 / samples.shape[0])
+    mx, my, mz = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
+    for s in range(samples.shape[0]):
+        p = samples[s]
+        mx += (x[p, 0, l] - start[p, 0, l]) * share
+        my += (x[p, 1, l] - start[p, 1, l]) * share
+        mz += (x[p, 2, l] - start[p, 2, l]) * share
+    beyond = False
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+        inside = dx * dx + dy * dy + dz * dz <= bounds[p, l]
+        beyond |= not inside
+    return beyond
+
+
+@kernel
+def _catch_up(x, w, lag, l, h):
+    """Move what lags behind its hand on, as far as the speed for it allows; who has been let go lags no more.  Returns the largest
+    lag that is left."""
+    zero = x.dtype.type(0)
+    left = zero
+    most = x.dtype.type(REPAY) * h
+    for p in range(x.shape[0]):
+        if w[p, l] > zero:
+            lag[p, 0, l] = lag[p, 1, l] = lag[p, 2, l] = zero
+            continue
+        lx, ly, lz = lag[p, 0, l], lag[p, 1, l], lag[p, 2, l]
+        length = np.sqrt(lx * lx + ly * ly + lz * lz)
+        if length > zero:
+            share = min(most / length, x.dtype.type(1))
+            for c in range(3):
+                way = share * lag[p, c, l]
+                x[p, c, l] += way
+                lag[p, c, l] -= way
+            left = max(left, length - share * length)
+    return left
+
+
+@kernel
+def _renew(x, v, w, sheet, block, l):
+    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it."""
+    memory, setting = sheet.memory, sheet.setting
+    start, bounds, old, lag = memory.start[block], memory.limits[block], memory.old[block], memory.lag[block]
+    look_around(old, w, sheet, block, l)
+    if not setting.strict:
+        return
+    zero, one = x.dtype.type(0), x.dtype.type(1)
+    report = memory.report[block, l]
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p, 0, l] - start[p, 0, l], x[p, 1, l] - start[p, 1, l], x[p, 2, l] - start[p, 2, l]
+        square = dx * dx + dy * dy + dz * dz
+        if square > bounds[p, l]:
+            keep = np.sqrt(bounds[p, l] / square)
+            report[CLAMPED] += 1
+            held = w[p, l] <= zero
+            for c in range(3):
+                back = (one - keep) * (x[p, c, l] - start[p, c, l])
+                x[p, c, l] -= back
+                if held:
+                    lag[p, c, l] += back
+                else:
+                    v[p, c, l] *= keep
+    _note_lag(w, memory, block, l)
+
+
+@kernel
+def _gap(x, ties, planes, t, l):
+    """Distance of tied pair t of one lane along its direction [m]."""
+    nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
+    own, number = ties[t, 0], ties[t, 1]
+    low, high = np.inf, -np.inf
+    for m in range(number):
+        p = ties[t, 3 + m]
+        place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
+        if m < own:
+            low = min(low, place)
+        else:
+            high = max(high, place)
+    return low - high
+
+
+@kernel
+def _comes_close(x, memory, block, l):
+    """Whether a tied pair of one lane is closer than it may be."""
+    ties, planes = memory.ties[block, l], memory.planes[block, l]
+    close = False
+    for t in range(memory.tight[block, l]):
+        # not what is not a number: that has diverged, and is not held
+        close |= _gap(x, ties, planes, t, l) < planes[t, KEPT]
+    return close
+
+
+@kernel
+def _hold_apart(x, v, w, sheet, block, l):
+    """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; those of others may follow.
+    Returns whether any stayed."""
+    memory = sheet.memory
+    old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
+    ties, planes = memory.ties[block, l], memory.planes[block, l]
+    zero = x.dtype.type(0)
+    stay = np.zeros(x.shape[0], np.bool_)
+    some, going = False, True
+    while going:
+        going = False
+        for t in range(memory.tight[block, l]):
+            if _gap(x, ties, planes, t, l) < planes[t, KEPT]:
+                for m in range(ties[t, 1]):
+                    p = ties[t, 3 + m]
+                    if stay[p]:
+                        continue
+                    stay[p] = True
+                    some, going = True, True
+                    report[CLAMPED] += 1
+                    for c in range(3):
+                        if w[p, l] <= zero:
+                            lag[p, c, l] += x[p, c, l] - old[p, c, l]
+                        else:
+                            v[p, c, l] = zero
+                        x[p, c, l] = old[p, c, l]
+    if some:
+        _note_lag(w, memory, block, l)
+    return some
+
+
+@kernel
+def _note_lag(w, memory, block, l):
+    """The largest lag of one lane."""
+    lag = memory.lag[block]
+    largest = lag.dtype.type(0)
+    for p in range(w.shape[0]):
+        if w[p, l] <= 0:
+            largest = max(largest, lag[p, 0, l] * lag[p, 0, l] + lag[p, 1, l] * lag[p, 1, l] + lag[p, 2, l] * lag[p, 2, l])
+    memory.behind[block, l] = np.sqrt(largest)
+    memory.report[block, l, LAG] = max(memory.report[block, l, LAG], np.float64(memory.behind[block, l]))
+
+
+@kernel
+def look_around(x, w, sheet, block, l):
+    """Query one lane at the given positions."""
+    memory, setting = sheet.memory, sheet.setting
+    start, bounds = memory.start[block], memory.bounds[block]
+    particles = x.shape[0]
+    p, held = np.empty((particles, 3)), np.empty(particles, np.bool_)
+    room, free = np.empty(particles), np.empty(particles)
+    farthest = 0.0
+    for k in range(particles):
+        held[k] = w[k, l] <= 0
+        for c in range(3):
+            start[k, c, l] = x[k, c, l]
+            p[k, c] = x[k, c, l]
+            farthest = max(farthest, abs(p[k, c]))
+    report = memory.report[block, l]
+    report[QUERIES] += 1
+    # what is not finite, or beyond all cloth, has diverged, and is told of as that
+    if setting.single and farthest > FARTHEST and farthest < 1e3:
+        report[UNCERTAIN] = 1
+    count, tight = query(
+        p, sheet.pairs, sheet.reach, held, room, free, memory.particles[block, l], memory.figures[block, l], memory.ties[block, l],
+        memory.planes[block, l], report,
+    )  # fmt: skip
+    memory.tight[block, l] = tight
+    if not setting.strict:
+        room[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
+        free[:] = room
+    for k in range(particles):
+        bounds[k, l] = (INSIDE * room[k]) ** 2
+        memory.limits[block, k, l] = (INSIDE * free[k]) ** 2
+    memory.impulses[block, l, :count, :] = 0
+    memory.contacts[block, l] = count
+    memory.choices[block, l] = -1
+    report[ROWS] = count

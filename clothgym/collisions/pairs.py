@@ -1,0 +1,230 @@
+"""Which pairs of a sheet's vertices, edges and triangles can touch: all that follows from the mesh alone, made once.
+
+Triangles are joined to leaves, two across an edge where possible (a grid's quads), and leaves lie in memory along a k-d tree of
+the flat sheet, so that a run of them, a block, is a compact patch.  A leaf owns its triangles, and each vertex and edge belongs to
+one leaf: a pair of primitives is met in one pair of leaves only (after Curtis, Tamstorf and Manocha 2008).
+
+Leaves that share a vertex always overlap.  Their primitive pairs that share no vertex, the near pairs, are listed, and are cleared
+in a query by distances between vertices: for points P = sum a_i p_i and Q = sum b_j q_j with weights that sum to one,
+
+    |P - Q|^2 = sum a_i b_j |p_i - q_j|^2 - sum_{i<k} a_i a_k |p_i - p_k|^2 - sum_{j<l} b_j b_l |q_j - q_l|^2,
+
+so the pair is farther than R apart if all ``|p_i - q_j|^2`` exceed R^2 by the most that the two last sums can be, the slack:
+a quarter of an edge's square for an edge, for a triangle the square of the radius of the smallest circle around it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.mesh import ClothMesh
+
+LEAVES = 8  # in a block, but for the last one: a vector of float64
+SAMPLES = 16  # vertices whose mean displacement stands for that of the sheet
+
+Int = NDArray[np.int32]
+Real = NDArray[np.float64]
+
+
+class Pairs(NamedTuple):
+    """A mesh's primitives in the order of a query; ranges are given by where each begins, with the end at the end.
+
+    triangles, edges, triangle_edges: vertices of each, (triangles, 3) and (edges, 2), and the edges of each triangle, opposite its
+    corners, (triangles, 3).
+    edge_triangles: both triangles of each edge, (edges, 2), the same twice on the border.
+    half_edges: half the rest length of each edge [m], (edges,).
+    rest_edges: one over the square of its rest length [1/m^2], (edges,).
+    vertex_owner, edge_owner: the triangle that stands for each in contacts with a triangle's border, (particles,), (edges,).
+    corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
+    leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
+    blocks: where each block's leaves begin, (blocks + 1,).
+    neighbours: where the leaves that share a vertex with each leaf and come after it begin, (leaves + 1,); ``next_leaves``.
+    ends, slack: near pairs of vertices, (near, 2), and the slack of the primitive pairs they are in, at rest [m^2], (near,).
+    near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
+    near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
+    edges.
+    samples: (SAMPLES,).
+    """
+
+    triangles: Int
+    edges: Int
+    triangle_edges: Int
+    edge_triangles: Int
+    half_edges: Real
+    rest_edges: Real
+    vertex_owner: Int
+    edge_owner: Int
+    corners: Int
+    leaf_vertices: Int
+    own_vertices: Int
+    leaf_edges: Int
+    own_edges: Int
+    leaf_triangles: Int
+    own_triangles: Int
+    blocks: Int
+    neighbours: Int
+    next_leaves: Int
+    ends: Int
+    slack: Real
+    near: Int
+    near_list: Int
+    near_pairs: Int
+    vertex_triangles: int
+    samples: Int
+
+
+def pairs_of(mesh: ClothMesh) -> Pairs:
+    """The mesh's pairs."""
+    triangles, x = mesh.triangles, mesh.rest_positions
+    sides = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
+    edges, inverse = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
+    triangle_edges = inverse.reshape(-1, 3)
+    length2 = ((x[edges[:, 0]] - x[edges[:, 1]]) ** 2).sum(axis=1)
+    members = _leaves(triangles, triangle_edges, length2)
+    order, blocks = _compact(np.array([x[np.unique(triangles[m])].mean(axis=0) for m in members]))
+    members = [members[k] for k in order]
+    leaf_of_triangle = np.zeros(len(triangles), np.int64)
+    for leaf, own in enumerate(members):
+        leaf_of_triangle[own] = leaf
+    # what a triangle stands for: each vertex and edge is that of the first triangle that has it
+    vertex_owner = _first(triangles, len(x))
+    edge_owner = _first(triangle_edges, len(edges))
+    last = len(triangles) - 1 - _first(triangle_edges[::-1], len(edges))
+    vertex_leaf, edge_leaf = leaf_of_triangle[vertex_owner], leaf_of_triangle[edge_owner]
+    corners = np.array([_four(np.unique(triangles[m])) for m in members])
+    around: list[list[int]] = [[] for _ in range(len(x))]
+    for leaf, own in enumerate(corners):
+        for vertex in set(own.tolist()):
+            around[vertex].append(leaf)
+    beside = [sorted({other for vertex in set(own.tolist()) for other in around[vertex]}) for own in corners]
+    after = [[other for other in each if other > leaf] for leaf, each in enumerate(beside)]
+    vertex_triangle, edge_edge = _near_pairs(triangles, edges, members, beside, vertex_leaf, edge_leaf)
+    ends, slack, near, near_list = _near_vertices(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge)
+    counted = [_ranges(np.bincount(of, minlength=len(members))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
+    by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
+    return Pairs(
+        triangles=_int(triangles),
+        edges=_int(edges),
+        triangle_edges=_int(triangle_edges),
+        edge_triangles=_int(np.stack([edge_owner, last], axis=1)),
+        half_edges=0.5 * np.sqrt(length2),
+        rest_edges=1 / length2,
+        vertex_owner=_int(vertex_owner),
+        edge_owner=_int(edge_owner),
+        corners=_int(corners),
+        leaf_vertices=counted[0],
+        own_vertices=_int(by_leaf[0]),
+        leaf_edges=counted[1],
+        own_edges=_int(by_leaf[1]),
+        leaf_triangles=counted[2],
+        own_triangles=_int(by_leaf[2]),
+        blocks=_int(np.array(blocks)),
+        neighbours=_ranges(np.array([len(each) for each in after])),
+        next_leaves=_int(np.concatenate([np.array(each, np.int64) for each in after])),
+        ends=_int(ends),
+        slack=slack,
+        near=near,
+        near_list=_int(near_list),
+        near_pairs=_int(np.concatenate([vertex_triangle, edge_edge])),
+        vertex_triangles=len(vertex_triangle),
+        samples=_int(np.linspace(0, len(x) - 1, SAMPLES).round()),
+    )
+
+
+def _int(values: NDArray) -> Int:
+    return np.ascontiguousarray(values, np.int32)
+
+
+def _ranges(counts: NDArray) -> Int:
+    return _int(np.concatenate([[0], np.cumsum(counts)]))
+
+
+def _first(parts: NDArray, count: int) -> NDArray[np.int64]:
+    """The first row in which each of ``count`` numbers stands."""
+    first = np.full(count, len(parts))
+    np.minimum.at(first, parts.ravel(), np.repeat(np.arange(len(parts)), parts.shape[1]))
+    return first
+
+
+def _four(vertices: NDArray) -> NDArray:
+    return np.concatenate([vertices, np.repeat(vertices[-1:], 4 - len(vertices))])
+
+
+def _leaves(triangles: NDArray, triangle_edges: NDArray, length2: NDArray) -> list[list[int]]:
+    """Triangles joined in pairs across edges, longest edges first; what is left stays alone."""
+    sides: list[list[int]] = [[] for _ in range(len(length2))]
+    for t, own in enumerate(triangle_edges):
+        for edge in own:
+            sides[edge].append(t)
+    free = np.ones(len(triangles), bool)
+    leaves = []
+    for edge in np.lexsort((np.arange(len(length2)), -np.round(length2 / length2.max(), 9))):
+        if len(sides[edge]) == 2 and free[sides[edge]].all():
+            free[sides[edge]] = False
+            leaves.append(sides[edge])
+    return leaves + [[t] for t in np.flatnonzero(free).tolist()]
+
+
+def _compact(centres: NDArray) -> tuple[list[int], list[int]]:
+    """An order in which runs are compact, by halving along the longest side, and where the runs begin."""
+    order: list[int] = []
+    begins = [0]
+    waiting = [np.arange(len(centres))]
+    while waiting:
+        part = waiting.pop()
+        if len(part) <= LEAVES:
+            order += part.tolist()
+            begins.append(len(order))
+            continue
+        axis = np.ptp(centres[part], axis=0).argmax()
+        part = part[np.argsort(centres[part, axis], kind="stable")]
+        half = -(-len(part) // (2 * LEAVES)) * LEAVES
+        waiting += [part[half:], part[:half]]
+    return order, begins
+
+
+def _near_pairs(
+    triangles: NDArray, edges: NDArray, members: list[list[int]], beside: list[list[int]], vertex_leaf: NDArray, edge_leaf: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Pairs of a vertex and a triangle, and of two edges, that share no vertex and whose leaves do, or are the same."""
+    vertices_of = [np.flatnonzero(vertex_leaf == leaf).tolist() for leaf in range(len(members))]
+    edges_of = [np.flatnonzero(edge_leaf == leaf).tolist() for leaf in range(len(members))]
+    corner_sets, end_sets = [set(t) for t in triangles.tolist()], [set(e) for e in edges.tolist()]
+    vertex_triangle, edge_edge = [], []
+    for leaf, others in enumerate(beside):
+        for other in others:
+            vertex_triangle += [(v, t) for v in vertices_of[leaf] for t in members[other] if v not in corner_sets[t]]
+            edge_edge += [
+                (e, f) for e in edges_of[leaf] for f in edges_of[other] if (leaf < other or e < f) and other >= leaf
+                and not end_sets[e] & end_sets[f]
+            ]  # fmt: skip
+    return np.array(vertex_triangle, np.int64).reshape(-1, 2), np.array(edge_edge, np.int64).reshape(-1, 2)
+
+
+def _near_vertices(
+    triangles: NDArray,
+    edges: NDArray,
+    triangle_edges: NDArray,
+    length2: NDArray,
+    vertex_triangle: NDArray,
+    edge_edge: NDArray,
+) -> tuple[NDArray, Real, Int, NDArray]:
+    """Pairs of vertices of near pairs, their slack, and for each the near pairs that it is in: where they begin, and which."""
+    a, b, c = np.sort(length2[triangle_edges], axis=1).T
+    doubled2 = (2 * (a * b + b * c + c * a) - a * a - b * b - c * c) / 4  # the square of twice the area (Heron)
+    circle = np.where(a + b <= c, c / 4, a * b * c / (4 * doubled2))
+    v, t = vertex_triangle.T
+    e, f = edge_edge.T
+    first = [np.repeat(v, 3), edges[e][:, [0, 0, 1, 1]].ravel()]
+    second = [triangles[t].ravel(), edges[f][:, [0, 1, 0, 1]].ravel()]
+    slack = [np.repeat(circle[t], 3), np.repeat((length2[e] + length2[f]) / 4, 4)]
+    which = np.concatenate([np.repeat(np.arange(len(v)), 3), len(v) + np.repeat(np.arange(len(e)), 4)])
+    both = np.sort(np.stack([np.concatenate(first), np.concatenate(second)], axis=1), axis=1)
+    ends, pair = np.unique(both, axis=0, return_inverse=True)
+    largest = np.zeros(len(ends))
+    np.maximum.at(largest, pair.ravel(), np.concatenate(slack))
+    order = np.argsort(pair.ravel(), kind="stable")
+    return ends, largest, _ranges(np.bincount(pair.ravel(), minlength=len(ends))), which[order]

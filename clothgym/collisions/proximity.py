@@ -1,0 +1,358 @@
+"""What of one sheet is close to what: the query of self-collision.
+
+From the positions of one environment it finds every vertex and triangle, and every two edges, without a common vertex, that are
+closer than the reach, and gives each vertex a bound: how far it may go, in any direction, before the query must be made anew.  If
+d is a lower bound of the distance of a pair, and each of its vertices moves by less than half of d, the pair cannot touch,
+whatever the paths are; so a vertex may move by ``SHARE`` times the smallest such distance, less a margin for rounding.
+
+Distances are taken in float64 and certified: with n the unit vector between the closest points, the least ``n.a`` of one side less
+the largest ``n.b`` of the other is a lower bound of the distance for any n at all, so nothing rests on the closest points
+being right.  (Closest points of slivers in float32 overestimate by half a millimetre.)
+
+Where layers touch, their distance is small, and bounds that are a share of it would call for a query with every step that
+they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are tied: as soon as a vertex has left its bound,
+their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits, follows from the
+other pairs alone.  Every state is certified either by the bounds, or by the limits and the ties.
+
+Per-vertex bounds instead of continuous collision detection: Chen, Hsu, Liu, Macklin, Yang and Yuksel, Offset Geometric
+Contact, ACM Transactions on Graphics 44(4), 2025.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
+
+LAYERED = 0.6  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
+LOOSE = 0.8  # of the reach below which pairs are tied
+SHARE = 0.45  # of a pair's distance that each side may use; below a half
+# what is told of each environment, see ``self_collision.SelfContact``
+ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 5, 6, 7
+REPORT = 8
+# what is kept of a contact beside its four particles, (room, 4): the gap is n.(sum of weights times positions), with n a unit
+# vector from the second primitive to the first; the thickness is the gap at which it acts [m]
+WEIGHTS, NORMAL, THICKNESS = 0, 4, 7
+FIGURES = 8
+ROUNDING = 1e-9  # of a distance in float64 [m]
+# of a tight pair: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
+KEPT = 3
+# and how many vertices are the first primitive's, how many all are, the pair of leaves or -1, and the vertices, (room, TIE)
+TIE = 11
+MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
+
+
+@kernel
+def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
+    """Barycentric weights of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
+    abx, aby, abz = bx - ax, by - ay, bz - az
+    acx, acy, acz = cx - ax, cy - ay, cz - az
+    apx, apy, apz = px - ax, py - ay, pz - az
+    d1 = abx * apx + aby * apy + abz * apz
+    d2 = acx * apx + acy * apy + acz * apz
+    if d1 <= 0.0 and d2 <= 0.0:
+        return 1.0, 0.0, 0.0
+    bpx, bpy, bpz = px - bx, py - by, pz - bz
+    d3 = abx * bpx + aby * bpy + abz * bpz
+    d4 = acx * bpx + acy * bpy + acz * bpz
+    if d3 >= 0.0 and d4 <= d3:
+        return 0.0, 1.0, 0.0
+    cpx, cpy, cpz = px - cx, py - cy, pz - cz
+    d5 = abx * cpx + aby * cpy + abz * cpz
+    d6 = acx * cpx + acy * cpy + acz * cpz
+    if d6 >= 0.0 and d5 <= d6:
+        return 0.0, 0.0, 1.0
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        t = d1 / (d1 - d3)
+        return 1.0 - t, t, 0.0
+    vb = d5 * d2 - d1 * d6
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        t = d2 / (d2 - d6)
+        return 1.0 - t, 0.0, t
+    va = d3 * d6 - d5 * d4
+    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return 0.0, 1.0 - t, t
+    scale = 1.0 / (va + vb + vc)
+    v, w = vb * scale, vc * scale
+    return 1.0 - v - w, v, w
+
+
+@kernel
+def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
+    """Where on segments ab and cd they are closest, each from 0 to 1 (Ericson 2005, 5.1.9)."""
+    ux, uy, uz = bx - ax, by - ay, bz - az
+    vx, vy, vz = dx - cx, dy - cy, dz - cz
+    rx, ry, rz = ax - cx, ay - cy, az - cz
+    a = ux * ux + uy * uy + uz * uz
+    e = vx * vx + vy * vy + vz * vz
+    f = vx * rx + vy * ry + vz * rz
+    c = ux * rx + uy * ry + uz * rz
+    b = ux * vx + uy * vy + uz * vz
+    denominator = a * e - b * b
+    s = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 0.0 else 0.0
+    t = (b * s + f) / e if e > 0.0 else 0.0
+    if t < 0.0:
+        t = 0.0
+        s = min(max(-c / a, 0.0), 1.0) if a > 0.0 else 0.0
+    elif t > 1.0:
+        t = 1.0
+        s = min(max((b - c) / a, 0.0), 1.0) if a > 0.0 else 0.0
+    return s, t
+
+
+@kernel
+def gap_of_vertex(p, v, i, j, k):
+    """Barycentric weights of the point of triangle ijk that is closest to vertex v, and the way from it to v [m]."""
+    px, py, pz = p[v, 0], p[v, 1], p[v, 2]
+    ax, ay, az = p[i, 0], p[i, 1], p[i, 2]
+    bx, by, bz = p[j, 0], p[j, 1], p[j, 2]
+    cx, cy, cz = p[k, 0], p[k, 1], p[k, 2]
+    a, b, c = closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz)
+    return a, b, c, px - (a * ax + b * bx + c * cx), py - (a * ay + b * by + c * cy), pz - (a * az + b * bz + c * cz)
+
+
+@kernel
+def gap_of_edges(p, i, j, k, l):
+    """Where on edges ij and kl they are closest, from 0 to 1, and the way from the second to the first [m]."""
+    ax, ay, az = p[i, 0], p[i, 1], p[i, 2]
+    bx, by, bz = p[j, 0], p[j, 1], p[j, 2]
+    cx, cy, cz = p[k, 0], p[k, 1], p[k, 2]
+    dx, dy, dz = p[l, 0], p[l, 1], p[l, 2]
+    s, t = closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz)
+    nx = (ax + s * (bx - ax)) - (cx + t * (dx - cx))
+    ny = (ay + s * (by - ay)) - (cy + t * (dy - cy))
+    nz = (az + s * (bz - az)) - (cz + t * (dz - cz))
+    return s, t, nx, ny, nz
+
+
+@kernel
+def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, figures):
+    """Write a contact down."""
+    particles[count, 0], particles[count, 1], particles[count, 2], particles[count, 3] = i, j, k, l
+    figures[count, 0], figures[count, 1], figures[count, 2], figures[count, 3] = wi, wj, wk, wl
+    figures[count, NORMAL], figures[count, NORMAL + 1], figures[count, NORMAL + 2] = nx, ny, nz
+    figures[count, THICKNESS] = thickness
+
+
+@kernel
+def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ties, planes):
+    """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
+    direction, or than ``standoff`` if a hand holds any."""
+    ties[tight, 0], ties[tight, 1], ties[tight, 2] = own, 4, group
+    ties[tight, 3], ties[tight, 4], ties[tight, 5], ties[tight, 6] = i, j, k, l
+    least = standoff if held[i] or held[j] or held[k] or held[l] else stop
+    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) - ROUNDING
+
+
+@kernel
+def vertex_contacts(
+    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, thickness, margin, loose, stop, standoff, held, room,
+    free, closest, count, particles, figures, tight, ties, planes, report,
+):  # fmt: skip
+    """Certify vertices and triangles, lower the room of their vertices, and write the contacts down.  Returns the
+    numbers of contacts and of tight pairs.
+
+    Pairs closer than ``loose`` are tied, as far as there is room; ``free`` is the room that the others leave.
+
+    One contact for each closest feature: a face's inside, or a border that this triangle stands for; of two vertices, which meet
+    twice, the one of the lower number has it.  closest: becomes the smallest distance
+    of each group of candidates [m], and its direction, (groups, 4).
+    """
+    for m in range(candidates.shape[0]):
+        v, t = candidates[m, 0], candidates[m, 1]
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        a, b, c, nx, ny, nz = gap_of_vertex(p, v, i, j, k)
+        square = nx * nx + ny * ny + nz * nz
+        if not square < reach * reach:
+            continue
+        scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        farthest = max(along(p, i, nx, ny, nz), max(along(p, j, nx, ny, nz), along(p, k, nx, ny, nz)))
+        certified = along(p, v, nx, ny, nz) - farthest
+        room[v], room[i], room[j], room[k] = (
+            min(room[v], certified), min(room[i], certified), min(room[j], certified), min(room[k], certified)
+        )  # fmt: skip
+        group = candidates[m, 2]
+        if certified < loose and tight < ties.shape[0]:
+            tie(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
+            tight += 1
+        else:
+            free[v], free[i], free[j], free[k] = (
+                min(free[v], certified), min(free[i], certified), min(free[j], certified), min(free[k], certified)
+            )  # fmt: skip
+        if certified < closest[group, 0]:
+            closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
+        if certified <= 0.0 or certified > thickness + margin:
+            continue
+        if b == 0.0 and c == 0.0:
+            mine = vertex_owner[i] == t and v < i
+        elif a == 0.0 and c == 0.0:
+            mine = vertex_owner[j] == t and v < j
+        elif a == 0.0 and b == 0.0:
+            mine = vertex_owner[k] == t and v < k
+        elif a == 0.0:
+            mine = edge_owner[triangle_edges[t, 0]] == t
+        elif b == 0.0:
+            mine = edge_owner[triangle_edges[t, 1]] == t
+        elif c == 0.0:
+            mine = edge_owner[triangle_edges[t, 2]] == t
+        else:
+            mine = True
+        if not mine:
+            continue
+        if count < particles.shape[0]:
+            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, thickness, count, particles, figures)
+            count += 1
+        else:
+            report[DROPPED] += 1
+    return count, tight
+
+
+@kernel
+def edge_contacts(
+    p, candidates, edges, ridges, reach, thickness, margin, loose, stop, standoff, held, room, free, count, particles, figures,
+    tight, ties, planes, report,
+):  # fmt: skip
+    """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same."""
+    for m in range(candidates.shape[0]):
+        e, f = candidates[m, 0], candidates[m, 1]
+        i, j, k, l = edges[e, 0], edges[e, 1], edges[f, 0], edges[f, 1]
+        s, t, nx, ny, nz = gap_of_edges(p, i, j, k, l)
+        square = nx * nx + ny * ny + nz * nz
+        if not square < reach * reach:
+            continue
+        scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        nearest = min(along(p, i, nx, ny, nz), along(p, j, nx, ny, nz))
+        certified = nearest - max(along(p, k, nx, ny, nz), along(p, l, nx, ny, nz))
+        room[i], room[j], room[k], room[l] = (
+            min(room[i], certified), min(room[j], certified), min(room[k], certified), min(room[l], certified)
+        )  # fmt: skip
+        if certified < loose and tight < ties.shape[0]:
+            tie(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
+            tight += 1
+        else:
+            free[i], free[j], free[k], free[l] = (
+                min(free[i], certified), min(free[j], certified), min(free[k], certified), min(free[l], certified)
+            )  # fmt: skip
+        inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
+        if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
+            if count < particles.shape[0]:
+                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, thickness, count, particles, figures)
+                count += 1
+            else:
+                report[DROPPED] += 1
+    return count, tight
+
+
+@kernel
+def tie_layers(p, corners, leaves, gaps, closest, loose, stop, standoff, held, room, free, layered, tight, ties, planes):
+    """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
+    triangles.  Returns the number of tied pairs.
+
+    gaps: what planes of the leaves show [m], and their normals; the plane across the closest vertex' way may show more.
+    layered: becomes which they are.
+    """
+    for pair in range(leaves.shape[0]):
+        leaf, other = leaves[pair, 0], leaves[pair, 1]
+        layered[pair] = gaps[pair, 0] >= max(LAYERED * closest[pair, 0], stop)
+        if not layered[pair]:
+            gap = between(p, corners, leaf, other, closest[pair, 1], closest[pair, 2], closest[pair, 3])
+            if gap >= max(LAYERED * closest[pair, 0], stop):
+                layered[pair] = True
+                gaps[pair, 0], gaps[pair, 1], gaps[pair, 2], gaps[pair, 3] = (
+                    gap,
+                    closest[pair, 1],
+                    closest[pair, 2],
+                    closest[pair, 3],
+                )
+    kept = 0
+    for t in range(tight):
+        if ties[t, 2] >= 0 and layered[ties[t, 2]]:
+            continue
+        ties[kept] = ties[t]
+        planes[kept] = planes[t]
+        kept += 1
+    for pair in range(leaves.shape[0]):
+        if not layered[pair]:
+            continue
+        leaf, other, gap = leaves[pair, 0], leaves[pair, 1], gaps[pair, 0]
+        tied = gap < loose and kept < ties.shape[0]
+        some = False
+        for m in range(4):
+            for v in (corners[leaf, m], corners[other, m]):
+                room[v] = min(room[v], gap)
+                some |= held[v]
+                if not tied:
+                    free[v] = min(free[v], gap)
+        if tied:
+            nx, ny, nz = gaps[pair, 1], gaps[pair, 2], gaps[pair, 3]
+            # the direction is from the second leaf to the first
+            way = along(p, corners[leaf, 0], nx, ny, nz) - along(p, corners[other, 0], nx, ny, nz)
+            sign = 1.0 if way > 0.0 else -1.0
+            ties[kept, 0], ties[kept, 1], ties[kept, 2] = 4, 8, -1
+            for m in range(4):
+                ties[kept, 3 + m], ties[kept, 7 + m] = corners[leaf, m], corners[other, m]
+            planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
+            planes[kept, KEPT] = min(gap, standoff if some else stop) - ROUNDING
+            kept += 1
+    return kept
+
+
+@kernel
+def query(p, pairs, reach, held, bounds, limits, particles, figures, ties, planes, report):
+    """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``figures``, and of
+    tied pairs, which are in ``ties`` and ``planes``.
+
+    p: positions in float64 [m], (particles, 3).  held: particles that hands hold, (particles,).  bounds: becomes how far each
+    vertex may go before a tied pair must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT,).
+    """
+    triangles, edges, triangle_edges = pairs.triangles, pairs.edges, pairs.triangle_edges
+    vertex_owner, edge_owner = pairs.vertex_owner, pairs.edge_owner
+    unlisted, margin, stop, standoff = min(reach.near, reach.far), reach.margin, reach.stop, reach.standoff
+    loose = LOOSE * unlisted
+    bounds[:] = unlisted
+    limits[:] = unlisted
+    faces, ridges = np.empty((3, triangles.shape[0])), np.empty(edges.shape[0], np.bool_)
+    faces_of(p, triangles, faces)
+    ridges_of(faces, pairs.edge_triangles, ridges)
+    corners, sides, stretch = near_candidates(p, pairs, reach.near)
+    closest = np.zeros((1, 4))
+    closest[0, 0] = reach.near
+    count, tight = vertex_contacts(
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.near, reach.near_thickness, margin, loose, stop,
+        standoff, held, bounds, limits, closest, 0, particles, figures, 0, ties, planes, report,
+    )  # fmt: skip
+    # these belong to no pair of leaves
+    ties[:tight, 2] = -1
+    count, tight = edge_contacts(
+        p, sides, edges, ridges, reach.near, reach.near_thickness, margin, loose, stop, standoff, held, bounds, limits, count,
+        particles, figures, tight, ties, planes, report,
+    )  # fmt: skip
+    leaves, gaps, corners = far_pairs(p, pairs, reach.far, faces)
+    closest = np.zeros((leaves.shape[0], 4))
+    closest[:, 0] = reach.far
+    count, tight = vertex_contacts(
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.far, reach.far_thickness, margin, loose, stop,
+        standoff, held, bounds, limits, closest, count, particles, figures, tight, ties, planes, report,
+    )  # fmt: skip
+    layered = np.empty(leaves.shape[0], np.bool_)
+    tight = tie_layers(
+        p, pairs.corners, leaves, gaps, closest, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes
+    )
+    sides = far_sides(p, pairs, leaves, layered, ridges, stretch, reach.far)
+    count, tight = edge_contacts(
+        p, sides, edges, ridges, reach.far, reach.far_thickness, margin, loose, stop, standoff, held, bounds, limits, count,
+        particles, figures, tight, ties, planes, report,
+    )  # fmt: skip
+    least = unlisted
+    for v in range(p.shape[0]):
+        least = min(least, bounds[v])
+        bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
+        limits[v] = SHARE * max(limits[v] - MARGIN, 0.0)
+    if least < unlisted:
+        report[GAP] = min(report[GAP], least)
+    return count, tight

@@ -1,0 +1,316 @@
+"""Self-collision of a batch: its options, its memory, and what it tells."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import kernel
+from clothgym.checks import not_negative, positive
+from clothgym.collisions.candidates import Reach, far_pairs, far_sides
+from clothgym.collisions.confinement import FARTHEST
+from clothgym.collisions.intersections import first_intersection
+from clothgym.collisions.pairs import Pairs, pairs_of
+from clothgym.collisions.proximity import (
+    FIGURES,
+    GAP,
+    LAG,
+    REPORT,
+    TIE,
+    UNCERTAIN,
+    edge_contacts,
+    gap_of_edges,
+    gap_of_vertex,
+    vertex_contacts,
+)
+from clothgym.collisions.self_collision import PUSH, Memory, Setting, Sheet
+from clothgym.mesh import ClothMesh
+from clothgym.state import Layout, State
+
+MODES = ("fast", "strict")
+REACH = 2.0  # how far a query sees, in thicknesses
+CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a contact
+ROOM = 12  # contacts for each vertex; more are counted as dropped
+TIGHT = 24  # tied pairs for each vertex; more bound their vertices instead
+STOP = 0.125  # thicknesses below which a pair may come no closer
+STANDOFF = 0.25  # thicknesses at which what is held stops
+USUAL = 0.28  # thickness where none is given, over the shortest distance at rest of what does not hang together
+NEAR_MOST, FAR_MOST = (
+    0.35,
+    0.45,
+)  # largest thickness over such a distance: of near pairs, which are thinner if need be, and of others
+FRICTION = 0.3
+BEYOND = (
+    f"within {FARTHEST:g} m float32 can certify that a sheet does not intersect itself; move the scene to the origin, or take "
+    "dtype='float64'"
+)
+# what ``Memory`` and ``State`` keep of each contact or tight pair, and what counts them
+ROW_ARRAYS = {"particles": "count", "figures": "count", "impulses": "count", "ties": "tight", "planes": "tight"}
+
+
+class SelfContacts(NamedTuple):
+    """Self-collision of each environment in the last control step, (num_envs,) each.
+
+    rows: contacts within reach; touching: those at which something acted in the last substep.
+    clamped: moves of a vertex in a substep that were cut short.  queries: made.  dropped: contacts for which there was no room
+    (they still bound their vertices).  gap: smallest certified distance at a query [m], inf if nothing was within reach or no
+    query made.
+    lag: how far the slowest held particle is behind its hand [m].  uncertified: whether the sheet went farther from the origin than
+    rounding allows.
+    """
+
+    rows: NDArray
+    touching: NDArray
+    clamped: NDArray
+    queries: NDArray
+    dropped: NDArray
+    gap: NDArray
+    lag: NDArray
+    uncertified: NDArray
+
+
+class Options(NamedTuple):
+    """How a sheet collides with itself: mode, thickness [m] (None for the usual one) and friction coefficient."""
+
+    mode: str
+    thickness: float | None
+    friction: float
+
+
+def options_of(value: Any) -> Options | None:
+    """What ``Simulation(self_collision=...)`` means; None for no self-collision.
+
+    Raises:
+        ValueError: an unknown mode or option, or a value that makes no sense.
+    """
+    if value is None or value is False:
+        return None
+    given = dict(value) if isinstance(value, Mapping) else {"mode": value}
+    for name in given:
+        if name not in Options._fields:
+            raise ValueError(f"self_collision: no option {name!r} (there are: {', '.join(Options._fields)})")
+    mode, thickness, friction = given.get("mode", "strict"), given.get("thickness"), given.get("friction", FRICTION)
+    if mode not in MODES:
+        raise ValueError(f"self_collision={mode!r}: must be False, 'fast' or 'strict', or a dict with mode, thickness and friction")
+    thickness = None if thickness is None else positive("self_collision: thickness", thickness)
+    return Options(mode, thickness, not_negative("self_collision: friction", friction))
+
+
+class SelfCollision:
+    """Self-collision of a batch.
+
+    Attributes:
+        options: what was asked for; None for none.
+        thickness: distance that the cloth keeps to itself [m].
+        sheet: what the main loop gives to the kernels.
+    """
+
+    def __init__(self, layout: Layout, mesh: ClothMesh, value: Any, dtype: np.dtype) -> None:
+        self.layout, self.dtype, self.options = layout, dtype, options_of(value)
+        self.sheet: Any = ()
+        self.thickness = 0.0
+        self._reported = np.zeros(layout.blocks * layout.lanes, bool)
+        if self.options is None:
+            return
+        pairs = pairs_of(mesh)
+        reach = reach_of(mesh, pairs, self.options.thickness)
+        self.thickness = reach.far_thickness
+        real = dtype.type
+        setting = Setting(self.options.mode == "strict", dtype == np.float32, real(self.options.friction), real(PUSH))
+        self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
+        self.check(mesh.rest_positions)
+
+    @property
+    def strict(self) -> bool:
+        """Whether sheets are kept from passing through themselves."""
+        return self.options is not None and self.options.mode == "strict"
+
+    def check(self, positions: NDArray) -> None:
+        """Refuse starts that strict mode cannot keep apart; positions: (sheets, particles, 3) or of one sheet [m].
+
+        Raises:
+            ValueError: a sheet that intersects itself, or that is too far from the origin to be certified.
+        """
+        if not self.strict:
+            return
+        x = np.asarray(positions, self.dtype)
+        farthest = float(np.abs(x).max())
+        if self.dtype == np.float32 and farthest > FARTHEST:
+            raise ValueError(f"positions: {farthest:.4g} m from the origin: {BEYOND}")
+        found = first_intersection(self.sheet.pairs.triangles, x)
+        if found is not None:
+            env, one, two = found
+            raise ValueError(
+                f"positions: in sheet {env} triangles {one} and {two} intersect: self_collision='strict' keeps apart what is "
+                "apart, and does not untangle; start from another sheet (clothgym.crumpling.starts makes some), or take "
+                "self_collision='fast'"
+            )
+
+    def begin(self, block: NDArray, lane: NDArray, x: NDArray) -> None:
+        """Start anew, with a query due at positions x in blocks [m]."""
+        if self.options is None:
+            return
+        memory = self.sheet.memory
+        for array in (memory.start, memory.old):
+            array[block, :, :, lane] = x[block, :, :, lane]
+        memory.bounds[block, :, lane] = memory.limits[block, :, lane] = -1
+        memory.lag[block, :, :, lane] = 0
+        memory.behind[block, lane] = 0
+        memory.contacts[block, lane] = 0
+        memory.tight[block, lane] = 0
+        memory.report[block, lane] = 0
+        self._reported[block * self.layout.lanes + lane] = False
+
+    def blank(self) -> dict[str, NDArray]:
+        """The arrays of ``State`` that are contact's where every query is due."""
+        num_envs, particles = self.layout.num_envs, 0 if self.options is None else self.sheet.memory.bounds.shape[1]
+        return {
+            "contact_start": np.zeros((num_envs, particles, 3)),
+            "contact_bounds": np.full((num_envs, particles), -1.0),
+            "contact_limits": np.full((num_envs, particles), -1.0),
+            "contact_lag": np.zeros((num_envs, particles, 3)),
+            "contact_count": np.zeros(num_envs, np.int32),
+            "contact_particles": np.zeros((num_envs, 0, 4), np.int32),
+            "contact_figures": np.zeros((num_envs, 0, FIGURES)),
+            "contact_impulses": np.zeros((num_envs, 0, 3)),
+            "contact_tight": np.zeros(num_envs, np.int32),
+            "contact_ties": np.zeros((num_envs, 0, TIE), np.int32),
+            "contact_planes": np.zeros((num_envs, 0, 4)),
+        }
+
+    def public(self) -> dict[str, NDArray]:
+        """The arrays of ``State`` that are contact's; no more contacts than some environment has."""
+        if self.options is None:
+            return self.blank()
+        memory, public = self.sheet.memory, self.layout.to_public
+        state = {
+            "contact_start": public(memory.start),
+            "contact_bounds": public(memory.bounds),
+            "contact_limits": public(memory.limits),
+            "contact_lag": public(memory.lag),
+            "contact_count": public(memory.contacts),
+            "contact_tight": public(memory.tight),
+        }
+        for name, counted in ROW_ARRAYS.items():
+            array, count = getattr(memory, name), state[f"contact_{counted}"]
+            used = array.reshape(-1, *array.shape[2:])[: self.layout.num_envs, : count.max()]
+            there = np.arange(used.shape[1]) < count[:, None]
+            state[f"contact_{name}"] = np.where(there[:, :, None], used, 0)
+        return state
+
+    def restore(self, state: State, x: NDArray) -> None:
+        """Take over from a state, with positions x in blocks [m]."""
+        if self.options is None:
+            return
+        memory, blocks = self.sheet.memory, self.layout.to_blocks
+        env = np.arange(self.layout.num_envs)
+        block, lane = self.layout.place(env)
+        self.begin(block, lane, x)
+        memory.lag[:] = blocks(state.contact_lag, self.dtype)
+        memory.behind[:] = np.sqrt((memory.lag**2).sum(axis=2)).max(axis=1)
+        due = np.any(state.contact_bounds < 0, axis=1).reshape(-1)
+        memory.start[block, :, :, lane] = np.where(due[:, None, None], self.layout.to_public(x), state.contact_start)
+        memory.bounds[:] = blocks(state.contact_bounds, self.dtype)
+        memory.limits[:] = blocks(state.contact_limits, self.dtype)
+        memory.contacts[block, lane] = state.contact_count
+        memory.tight[block, lane] = state.contact_tight
+        for name in ROW_ARRAYS:
+            array = getattr(state, f"contact_{name}")
+            getattr(memory, name)[block, lane, : array.shape[1]] = array
+
+    def warn(self, steps: NDArray) -> None:
+        """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""
+        if not self.strict or not self.sheet.memory.report[:, :, UNCERTAIN].any():
+            return
+        uncertain = self.sheet.memory.report[:, :, UNCERTAIN].ravel() == 1
+        new = np.flatnonzero(uncertain & ~self._reported)
+        if len(new):
+            self._reported[new] = True
+            warnings.warn(
+                f"environment {new[0]}: in control step {steps[new[0]]} the sheet is more than {FARTHEST:g} m from the origin: "
+                f"{BEYOND}",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+
+    def told(self) -> SelfContacts | None:
+        """What happened in the last control step."""
+        if self.options is None:
+            return None
+        report = self.sheet.memory.report.reshape(-1, REPORT)[: self.layout.num_envs]
+        numbers = report.T.copy()
+        rows, touching, clamped, queries, dropped = numbers[:GAP].astype(np.int64)
+        return SelfContacts(rows, touching, clamped, queries, dropped, numbers[GAP], numbers[LAG], numbers[UNCERTAIN] > 0)
+
+
+def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
+    """Room for a batch."""
+    shape, room = (layout.blocks, layout.lanes), ROOM * particles
+    used = np.clip(layout.num_envs - layout.lanes * np.arange(layout.blocks), 0, layout.lanes)
+    return Memory(
+        start=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        bounds=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
+        limits=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
+        old=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        lag=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        behind=np.zeros(shape, dtype),
+        contacts=np.zeros(shape, np.int32),
+        # contacts are written where they are needed only: an operating system gives no memory to what has never been touched
+        particles=np.empty((*shape, room, 4), np.int32),
+        figures=np.empty((*shape, room, FIGURES), dtype),
+        tight=np.zeros(shape, np.int32),
+        ties=np.empty((*shape, TIGHT * particles, TIE), np.int32),
+        planes=np.empty((*shape, TIGHT * particles, 4)),
+        impulses=np.zeros((*shape, room, 3), dtype),
+        chosen=np.empty((*shape, room), np.int32),
+        choices=np.zeros(shape, np.int32),
+        used=used,
+        report=np.zeros((*shape, REPORT)),
+    )
+
+
+@kernel
+def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
+    """Shortest distance of a near pair of primitives [m]."""
+    shortest = np.inf
+    for n in range(near_pairs.shape[0]):
+        i, j = near_pairs[n, 0], near_pairs[n, 1]
+        if n < vertex_triangles:
+            _, _, _, x, y, z = gap_of_vertex(p, i, triangles[j, 0], triangles[j, 1], triangles[j, 2])
+        else:
+            _, _, x, y, z = gap_of_edges(p, edges[i, 0], edges[i, 1], edges[j, 0], edges[j, 1])
+        shortest = min(shortest, x * x + y * y + z * z)
+    return np.sqrt(shortest)
+
+
+def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None) -> Reach:
+    """Distances of the query for a cloth thickness [m], or for the usual one.
+
+    Raises:
+        ValueError: the sheet is that close to itself at rest.
+    """
+    p = mesh.rest_positions.astype(np.float64)
+    near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.vertex_triangles))
+    # what does not hang together: nothing is looked for beyond two such distances
+    reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
+    leaves, _, corners = far_pairs(p, pairs, reach, faces)
+    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach)
+    figures = reach, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    none = np.empty((0, 4), np.int32), np.empty((0, FIGURES)), 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
+    owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
+    vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
+    edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *figures, 0, *none)
+    apart = float(room.min())
+    usual = USUAL * near
+    own = usual if thickness is None else thickness
+    if own > FAR_MOST * apart:
+        raise ValueError(
+            f"self_collision: thickness={own!r}: parts of this sheet that do not hang together are {apart:.3g} m apart at rest; "
+            f"at most {FAR_MOST * apart:.2g} fits, {usual:.2g} is usual"
+        )
+    thin = min(own, NEAR_MOST * near)
+    return Reach(REACH * thin, REACH * own, thin, own, CONTACT * thin, STOP * thin, STANDOFF * thin)

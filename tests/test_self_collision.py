@@ -1,0 +1,339 @@
+"""Self-collision: nothing passes through itself, judged by a count that knows nothing of it."""
+
+import numpy as np
+import pytest
+from exact_intersections import intersecting_pairs
+
+import clothgym
+from clothgym.collisions.candidates import Reach
+from clothgym.collisions.pairs import pairs_of
+from clothgym.collisions.proximity import FIGURES, REPORT, TIE, query
+from clothgym.crumpling import MANOEUVRES
+
+SIDE = 0.6
+
+
+def count_intersections(triangles, x):
+    return len(intersecting_pairs(triangles, x))
+
+
+def sheet(points=13):
+    return clothgym.grid(points, points, SIDE, SIDE)
+
+
+def three_layers(mesh, gap):
+    """The sheet folded in three, layers ``gap`` apart, the folds round."""
+    arc = np.pi * gap / 2
+    flat = (SIDE - 2 * arc) / 3
+    s = mesh.rest_positions[:, 0] - mesh.rest_positions[:, 0].min()
+    bend_one, bend_two = (s - flat) / (gap / 2), (s - 2 * flat - arc) / (gap / 2)
+    along = np.select(
+        [s < flat, s < flat + arc, s < 2 * flat + arc, s < 2 * flat + 2 * arc],
+        [s, flat + gap / 2 * np.sin(bend_one), 2 * flat + arc - s, -gap / 2 * np.sin(bend_two)],
+        s - 2 * flat - 2 * arc,
+    )
+    height = np.select(
+        [s < flat, s < flat + arc, s < 2 * flat + arc, s < 2 * flat + 2 * arc],
+        [0 * s, gap / 2 * (1 - np.cos(bend_one)), 0 * s + gap, gap + gap / 2 * (1 - np.cos(bend_two))],
+        2 * gap,
+    )
+    return np.stack([along, mesh.rest_positions[:, 1], height + 0.01], axis=1)
+
+
+# --- the query, against brute force -----------------------------------------------------------------------------------------
+
+
+def distances_by_sampling(mesh, x, points=25):
+    """Of each vertex: the smallest distance of a pair of vertex and triangle, or of two edges, that it is in and that shares no
+    vertex, (particles,): of points on a fine grid, so a little too large."""
+    triangles = mesh.triangles
+    edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+    share = np.linspace(0, 1, points)
+    on_edges = x[edges[:, :1]] * (1 - share[:, None]) + x[edges[:, 1:]] * share[:, None]
+    u, v = (grid.ravel() for grid in np.meshgrid(share, share))
+    inside = u + v <= 1 + 1e-9
+    weights = np.stack([1 - u - v, u, v], axis=1)[inside]
+    on_triangles = np.einsum("pc,tcd->tpd", weights, x[triangles])
+    room = np.full(len(x), np.inf)
+    for e in range(len(edges)):
+        for f in range(e + 1, len(edges)):
+            if not set(edges[e]) & set(edges[f]):
+                gap = np.sqrt(((on_edges[e][:, None] - on_edges[f]) ** 2).sum(axis=-1).min())
+                members = [*edges[e], *edges[f]]
+                room[members] = np.minimum(room[members], gap)
+    for p in range(len(x)):
+        for t in range(len(triangles)):
+            if p not in triangles[t]:
+                gap = np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
+                members = [p, *triangles[t]]
+                room[members] = np.minimum(room[members], gap)
+    return room
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_bound_is_no_larger_than_its_share_of_the_true_distance(seed):
+    """A strip folded in three and crumpled, in which far and near pairs come close."""
+    mesh = clothgym.grid(4, 10, SIDE, 0.2)
+    x = three_layers(mesh, 0.025)
+    x += np.random.default_rng(seed).normal(scale=0.004, size=x.shape)
+    truth = distances_by_sampling(mesh, x)
+    reach = Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0)
+    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT)
+    room = np.empty((900, 4), np.int32), np.empty((900, FIGURES)), np.empty((0, TIE), np.int32), np.empty((0, 4))
+    query(x, pairs_of(mesh), reach, np.zeros(len(x), bool), bounds, limits, *room, report)
+    near = truth < 0.03
+    assert near.sum() >= 6  # the case is worth something
+    assert np.all(bounds <= 0.45 * truth)
+    # and not much smaller than it could be
+    assert np.median(bounds[near] / (0.45 * truth[near])) > 0.55
+
+
+# --- nothing passes through itself ------------------------------------------------------------------------------------------
+
+SHORT = {"z-fold": 60, "heap": 150, "wring": 400, "drag at 3 m/s": 200}
+
+
+def bad_frames(name, mode, mesh, thickness=None, frames=None, every=1, seeds=(0,)):
+    setting = {"mode": mode} if thickness is None else {"mode": mode, "thickness": thickness}
+    made = MANOEUVRES[name](mesh, seeds=seeds, self_collision=setting, **({} if thickness is None else {"thickness": thickness}))
+    bad = 0
+    for frame in range(frames or SHORT[name]):
+        made.step()
+        if frame % every == 0:
+            bad += int(made.simulation.intersections()[0] > 0)
+    # the library's count is compared with the tests' own in test_intersections; here once more
+    assert count_intersections(mesh.triangles, made.simulation.positions[0]) == made.simulation.intersections()[0]
+    return bad, made.simulation
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_strict_never_intersects(name):
+    bad, simulation = bad_frames(name, "strict", sheet())
+    assert bad == 0
+    assert simulation.self_contacts.dropped[0] == 0
+    assert not simulation.diverged[0]
+
+
+def test_strict_never_intersects_on_a_disc():
+    bad, _ = bad_frames("heap", "strict", clothgym.disc(0.3, 6), frames=120)
+    assert bad == 0
+
+
+def test_a_thin_sheet_that_is_wrung_intersects_without_the_bound():
+    """If this did not fail, the tests above would prove nothing."""
+    bad, _ = bad_frames("wring", "fast", sheet(), thickness=0.004)
+    assert bad > 5
+
+
+def test_a_thin_sheet_that_is_wrung_does_not_intersect_with_it():
+    bad, simulation = bad_frames("wring", "strict", sheet(), thickness=0.004)
+    assert bad == 0
+
+
+# --- what it leaves alone ---------------------------------------------------------------------------------------------------
+
+
+def test_a_free_swing_is_the_same_to_the_bit():
+    runs = []
+    for mode in (False, "strict"):
+        simulation = clothgym.Simulation(sheet(), num_envs=3, anchors=[0, 12], self_collision=mode)
+        simulation.step(60)
+        runs.append(simulation.positions)
+    assert np.abs(runs[0][..., 2]).max() > 0.3  # it did swing
+    np.testing.assert_array_equal(*runs)
+
+
+def test_momentum_is_conserved_in_contact():
+    """Two halves of a folded sheet meet in free flight."""
+    mesh = sheet(9)
+    simulation = clothgym.Simulation(mesh, gravity=(0, 0, 0), air_density=0.0, self_collision={"mode": "fast", "friction": 0.5})
+    simulation.set_parameters(air_drag=0.0)
+    x = three_layers(mesh, 0.03)
+    v = np.zeros_like(x)
+    v[:, 2] = np.where(x[:, 2] > 0.055, -0.5, 0.1)
+    v[:, 0] = np.where(x[:, 2] > 0.055, 0.3, 0.0)
+    simulation.reset(positions=x, velocities=v)
+    mass = 1 / simulation.get_state().free_inverse_mass[0]
+    before = mass @ v
+    touching = 0
+    for _ in range(12):
+        simulation.step()
+        touching = max(touching, simulation.self_contacts.touching[0])
+    assert touching > 10
+    np.testing.assert_allclose(mass @ simulation.velocities[0], before, atol=1e-6)
+
+
+# --- at rest ----------------------------------------------------------------------------------------------------------------
+
+
+def test_three_layers_on_a_table_rest_at_their_thickness():
+    mesh = sheet(17)
+    simulation = clothgym.Simulation(mesh, colliders=[clothgym.Plane(friction=0.5)], self_collision="strict")
+    thickness = 0.28 * SIDE / 16 / np.sqrt(2)
+    simulation.set_parameters(air_drag=1.0)  # this fabric does not calm its folds itself
+    simulation.reset(positions=three_layers(mesh, 1.6 * thickness))
+    simulation.step(180)
+    x, v = simulation.positions[0], simulation.velocities[0]
+    assert np.sqrt((v**2).sum(axis=1).mean()) < 1e-3
+    flat = np.abs(x[:, 0] - x[:, 0].mean()) < 0.05  # away from the folds
+    layers = [x[flat & (np.round((x[:, 2] - 0.001) / thickness) == k), 2].mean() for k in range(3)]
+    np.testing.assert_allclose(np.diff(layers), thickness, rtol=0.2)
+
+
+@pytest.mark.parametrize(("friction", "slides"), [(0.2, True), (0.6, False)])
+def test_friction_between_layers(friction, slides):
+    """The upper half of a folded sheet under gravity aslant: it slides on the lower half, which is held, where tan(angle) is above
+    the coefficient."""
+    mesh = clothgym.grid(17, 9, 0.3, 0.6)
+    simulation = clothgym.Simulation(
+        mesh,
+        colliders=[clothgym.Plane(friction=0.5)],
+        anchors=[int(p) for p in np.flatnonzero(mesh.rest_positions[:, 1] < -0.01)],
+        self_collision={"mode": "strict", "friction": friction, "thickness": 0.006},
+    )
+    x = mesh.rest_positions.copy()
+    s = x[:, 1] + 0.3
+    gap, half = 0.008, 0.294
+    arc = np.pi * gap / 2
+    upper = s > half + arc
+    turn = np.clip((s - half) / (gap / 2), 0, np.pi)
+    x[:, 1] = np.where(upper, 2 * half + arc - s, np.where(s > half, half + gap / 2 * np.sin(turn), s))
+    x[:, 2] = np.where(s > half, gap / 2 * (1 - np.cos(turn)), 0) + 0.002
+    simulation.reset(positions=x)
+    # along the fold, where the fabric's own stiffness resists the sliding least
+    tilt = np.arctan(0.4)
+    simulation.set_parameters(gravity=9.81 * np.array([np.sin(tilt), 0, -np.cos(tilt)]))
+    start = simulation.positions[0]
+    simulation.step(20)
+    loose = (mesh.rest_positions[:, 1] > 0.05) & (mesh.rest_positions[:, 1] < 0.2)
+    moved = (simulation.positions[0] - start)[loose, 0].mean()
+    assert (moved > 5e-3) == slides
+
+
+# --- hands ------------------------------------------------------------------------------------------------------------------
+
+
+def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
+    """A corner is drawn over the sheet, most of which is held fast, and down on to it, as if to come out below."""
+    mesh = sheet(13)
+    away = np.abs(mesh.rest_positions[:, :2] - mesh.rest_positions[0, :2]).max(axis=1)
+    fixed = [int(p) for p in np.flatnonzero(away > 0.3)]
+    simulation = clothgym.Simulation(mesh, anchors=[0, *fixed], anchor_speed=2.0, self_collision="strict", gravity=(0, 0, 0))
+    targets = simulation.hand_positions
+    lags = []
+    for place in [(0.0, 0.0, 0.15), (0.12, 0.12, 0.1), (0.12, 0.12, -0.1)]:
+        targets[0, 0] = place
+        for _ in range(30):
+            simulation.move_anchors(targets)
+            simulation.step()
+            lags.append(simulation.self_contacts.lag[0])
+            assert simulation.intersections()[0] == 0
+    assert max(lags[:60]) < 1e-6 < max(lags[60:])
+    stopped = simulation.positions[0, 0]
+    assert 0 < stopped[2] < 2 * 0.28 * SIDE / 12 / np.sqrt(2)
+    # and it goes where it can
+    targets[0, 0] = (0.12, 0.12, 0.1)
+    for _ in range(30):
+        simulation.move_anchors(targets)
+        simulation.step()
+    np.testing.assert_allclose(simulation.positions[0, 0], targets[0, 0], atol=1e-3)
+
+
+# --- the state --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_restored_state_goes_on_to_the_bit(tmp_path):
+    mesh = sheet(13)
+    made = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict")
+    for _ in range(25):
+        made.step()
+    first = made.simulation
+    assert first.self_contacts.rows.min() > 10
+    state = first.get_state()
+    state.save(tmp_path / "state.npz")
+    first.step(20)
+    other = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
+    other.set_state(clothgym.State.load(tmp_path / "state.npz"))
+    other.step(20)
+    np.testing.assert_array_equal(first.positions, other.positions)
+
+
+def test_an_environment_does_not_feel_its_batch():
+    mesh = sheet(9)
+    together = MANOEUVRES["z-fold"](mesh, seeds=range(19), self_collision="strict")
+    alone = MANOEUVRES["z-fold"](mesh, seeds=[7], self_collision="strict")
+    for _ in range(30):
+        together.step()
+        alone.step()
+    assert alone.simulation.self_contacts.rows[0] > 0
+    np.testing.assert_array_equal(together.simulation.positions[7], alone.simulation.positions[0])
+
+
+@pytest.mark.parametrize("name", ["verlet", "xpbd", "projective_dynamics"])
+def test_other_integrators_take_part(name):
+    """One of each kind: explicit, by projections, implicit; the module knows none of them."""
+    mesh = sheet(9)
+    simulation = clothgym.Simulation(
+        mesh, integrator=name, substeps=16 if name == "projective_dynamics" else "auto",
+        colliders=[clothgym.Plane(friction=0.5)], self_collision="strict",
+    )  # fmt: skip
+    simulation.reset(positions=three_layers(mesh, 0.03))
+    for _ in range(30):
+        simulation.step()
+    assert count_intersections(mesh.triangles, simulation.positions[0]) == 0
+    assert not simulation.diverged[0]
+    assert np.ptp(simulation.positions[0, :, 2]) > 1.8 * 0.28 * SIDE / 8 / np.sqrt(2) * 0.6  # three layers
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("strickt", "'fast' or 'strict'"),
+        ({"mode": "strict", "thickness": -1.0}, "thickness"),
+        ({"mode": "strict", "friction": -0.1}, "friction"),
+        ({"mode": "strict", "thicknes": 0.01}, "no option 'thicknes'"),
+        ({"mode": "strict", "thickness": 0.05}, "at most"),
+    ],
+)
+def test_bad_options_are_named(value, message):
+    with pytest.raises(ValueError, match=message):
+        clothgym.Simulation(sheet(), self_collision=value)
+
+
+def test_a_start_in_intersection_is_refused_and_changes_nothing():
+    simulation = clothgym.Simulation(sheet(), self_collision="strict")
+    before = simulation.positions
+    x = three_layers(sheet(), 0.02)
+    x[:, 2] = np.abs(x[:, 2] - 0.02)
+    with pytest.raises(ValueError, match="triangles .* intersect"):
+        simulation.reset(positions=x)
+    np.testing.assert_array_equal(simulation.positions, before)
+
+
+def test_a_sheet_too_far_from_the_origin_is_reported():
+    simulation = clothgym.Simulation(sheet(), self_collision="strict")
+    far = sheet().rest_positions + [20.0, 0, 0]
+    with pytest.raises(ValueError, match="16 m"):
+        simulation.reset(positions=far)
+    simulation.reset(positions=sheet().rest_positions + [15.5, 0, 0], velocities=np.array([10.0, 0, 0]))
+    with pytest.warns(RuntimeWarning, match="16 m"):
+        simulation.step(20)
+    clothgym.Simulation(sheet(), self_collision="strict", dtype="float64").reset(positions=far)
+
+
+def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbours():
+    mesh = sheet(9)
+    x = np.stack([three_layers(mesh, 0.03)] * 3)
+    v = np.zeros_like(x)
+    runs = []
+    for fast in (0.0, 1e20):
+        simulation = clothgym.Simulation(mesh, num_envs=3, self_collision="strict", on_divergence="ignore")
+        v[1, 40] = fast
+        simulation.reset(positions=x, velocities=v)
+        simulation.step(5)
+        runs.append(simulation)
+    np.testing.assert_array_equal(runs[1].diverged, [False, True, False])
+    np.testing.assert_array_equal(runs[0].positions[[0, 2]], runs[1].positions[[0, 2]])
