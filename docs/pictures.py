@@ -1,6 +1,7 @@
 """The pictures of the README, made anew.
 
-python docs/pictures.py                                            # the strips: scripted agents in each task
+python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
+python docs/pictures.py --contact                                  # contact alone
 python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learnt policy
 """
 
@@ -14,6 +15,12 @@ from typing import Any
 import gymnasium as gym
 import imageio.v3 as iio
 import numpy as np
+
+from clothgym import Box, MeshCollider, Plane, Simulation, grid
+from clothgym.crumpling import MANOEUVRES
+from clothgym.render.camera import Camera
+from clothgym.render.renderer import Renderer
+from clothgym.render.solids import Solid
 
 HERE = Path(__file__).parent
 SIZE = 300
@@ -52,12 +59,79 @@ def draw_strips() -> None:
         iio.imwrite(HERE / name, np.concatenate(rows, axis=0))
 
 
+def stool(width: float = 0.3, leg: float = 0.05, height: float = 0.25, thick: float = 0.04) -> tuple[Any, Any]:
+    """Vertices and triangles of a seat on four legs: one closed surface, by the faces of the filled cells of a grid."""
+    filled = np.zeros((5, 5, 4), bool)
+    filled[1:4:2, 1:4:2, 1] = filled[1:4, 1:4, 2] = True
+    side = np.array([0, leg, width - leg, width]) - width / 2
+    vertices, triangles, seen = [], [], {}
+    for cell in np.argwhere(filled):
+        for axis in range(3):
+            for way in (0, 1):
+                if filled[tuple(cell + (2 * way - 1) * np.eye(3, dtype=int)[axis])]:
+                    continue
+                u, v = np.eye(3, dtype=int)[[(axis + 1) % 3, (axis + 2) % 3]]
+                first = cell - 1 + way * np.eye(3, dtype=int)[axis]
+                quad = [tuple(corner) for corner in (first, first + u, first + u + v, first + v)]
+                for corner in quad:
+                    if corner not in seen:
+                        seen[corner] = len(vertices)
+                        vertices.append((side[corner[0]], side[corner[1]], (0, height - thick, height)[corner[2]]))
+                a, b, c, d = (seen[corner] for corner in (quad if way else quad[::-1]))
+                triangles += [(a, b, c), (a, c, d)]
+    return np.array(vertices), np.array(triangles)
+
+
+def draw_contact() -> None:
+    """A sheet over a stool and over the corner of a box; and a heap, without self-collision and with it, cut open."""
+    mesh = grid(33, 33, 0.9, 0.9)
+    above = mesh.rest_positions * [0.95, 0.95, 1] + [0, 0, 0.32]
+    vertices, triangles = stool()
+    on_corner = (0.88, 0.3647, -0.2798, 0.1159)  # a box whose diagonal stands upright
+    scenes = [
+        (
+            MeshCollider(vertices=vertices, triangles=triangles, friction=0.4),
+            Solid(kind="mesh", center=(0, 0, 0), vertices=vertices, triangles=triangles),
+        ),
+        (
+            Box(center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner, friction=0.4),
+            Solid(kind="box", center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner),
+        ),
+    ]
+    camera = Camera(eye=(1.0, -1.1, 0.8), target=(0, 0, 0.1))
+    frames = []
+    for collider, solid in scenes:
+        cloth = Simulation(mesh, colliders=[Plane(friction=0.5), collider], self_collision="strict")
+        cloth.set_parameters(air_drag=1.0)
+        cloth.reset(positions=above)
+        cloth.step(150)
+        frames.append(picture(mesh, cloth.positions, camera, [solid]))
+    for mode in (False, "strict"):
+        heap = MANOEUVRES["heap"](grid(33, 33, 1.0, 1.0), seeds=[3], self_collision=mode)
+        while not heap.over:
+            heap.step()
+        x = heap.simulation.positions - heap.simulation.positions[:, :, :2].mean(axis=1, keepdims=True) @ np.eye(2, 3)
+        frames.append(picture(heap.simulation.mesh, x, Camera(eye=(0.75, -0.8, 0.5), target=(0, 0, 0.02)), []))
+    iio.imwrite(HERE / "contact.png", np.concatenate(frames, axis=1))
+
+
+def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Solid]) -> Any:
+    """One sheet, (height, width, 3)."""
+    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3, grid_shape=mesh.shape)
+    return renderer.rgb(positions[0], solids)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs=2, metavar=("FOLDER", "GIF"), help="folder of a training run, and the film's name")
+    parser.add_argument("--contact", action="store_true", help="draw contact alone")
     options = parser.parse_args()
+    if options.contact:
+        draw_contact()
+        return
     if options.run is None:
         draw_strips()
+        draw_contact()
         return
     sys.path.insert(0, str(HERE.parent / "training"))
     import policies
