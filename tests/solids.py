@@ -59,7 +59,8 @@ def bowl(outer=0.15, inner=0.12, around=32, down=10):
 
 
 def rotation(w, x, y, z):
-    """Matrix of a unit quaternion, by Rodrigues' formula."""
+    """Matrix of a quaternion, by Rodrigues' formula."""
+    w, x, y, z = np.array([w, x, y, z]) / np.linalg.norm([w, x, y, z])
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 

@@ -87,7 +87,8 @@ def test_small_sphere_does_not_come_through_between_particles(lift):
     x = simulation.positions[0]
     centre = simulation.collider_positions[0, 0]
     assert centre[2] == pytest.approx(-0.02 + 0.5 * 8 / 60, abs=1e-4)
-    assert depth(x, mesh.triangles, lambda p: sphere_distance(p - centre, 0.01)) < 0.05 * 0.02
+    # it presses into a taut sheet: what lies deeper than it moved in a substep is taken back gently
+    assert depth(x, mesh.triangles, lambda p: sphere_distance(p - centre, 0.01)) < 0.1 * 0.02
     # the sheet is above the ball, not around it
     near = np.linalg.norm(x[:, :2] - centre[:2], axis=1) < 0.05
     assert x[near, 2].max() > centre[2]
