@@ -55,7 +55,7 @@ def advance(
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
             press(x[b], v[b], w[b], sheet, b, step, h, carried)  # noqa: F821
-            look = step % look_every == 0
+            look = look_every > 0 and step % look_every == 0
             resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)
             keep_apart(x[b], v[b], w[b], sheet, b, h, carried)  # noqa: F821
         remeasure(x[b], elements.springs, limited[b])  # noqa: F821
@@ -88,6 +88,8 @@ class Simulation(Observed):
         anchor_speed: largest speed of an anchor [m/s].
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.
+        contact: "sheet": solids touch the whole sheet, and stop hands; or "particles": they touch particles only, and hands go
+            through them.
         self_collision: False, "fast" or "strict", or a dict with mode, thickness [m] and friction, see ``collisions``.
         strain_limit: largest strain of threads and diagonals, see ``limiting``; None for none.
         on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
@@ -114,6 +116,7 @@ class Simulation(Observed):
         anchor_speed: float = 10.0,
         grippers: Sequence[Gripper] = (),
         bending: str = "springs",
+        contact: str = "sheet",
         self_collision: bool | str | Mapping[str, Any] = False,
         strain_limit: float | None = None,
         on_divergence: Literal["warn", "raise", "ignore"] = "warn",
@@ -129,6 +132,8 @@ class Simulation(Observed):
         self.num_envs = count("num_envs", num_envs)
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
+        one_of("contact", contact, "sheet", "particles")
+        self.contact = contact
         self.threads = count("threads", threads) if threads is not None else _jit.default_threads()
         self.strain_limit = checked_limit(strain_limit)
         self.on_divergence = on_divergence
@@ -145,6 +150,7 @@ class Simulation(Observed):
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
+        self._barriers = self._solids if contact == "sheet" else Solids(self.layout, (), self.time_step, self.dtype)
         self.colliders = self._solids.colliders
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
@@ -188,14 +194,14 @@ class Simulation(Observed):
         self._prepare()
         rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
-        look_every = max(1, int(SURFACE_INTERVAL / h))
+        look_every = max(1, int(SURFACE_INTERVAL / h)) if self.contact == "sheet" else 0
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
             if self._contact.strict:
                 memory = self._contact.sheet.memory
                 self._hands.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
-            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
+            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
                 self._solids.shapes, self._solids.rows, self._contact.sheet, h, carried, self.substeps, air_every, look_every,

@@ -257,7 +257,7 @@ class ClothDrapeGripperEnv(ClothEnv):
     | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
     | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
     | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
-    | ``self_collision`` | ``False`` | or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more |
+    | ``self_collision`` | ``False`` | or ``"fast"``; ``"strict"`` with flat starts only: rumpled ones pass through themselves |
     | ``substeps`` | 50 | or ``"auto"`` |
     | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
     | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |

@@ -97,6 +97,7 @@ class Task(ABC):
             time_step=physics.time_step,
             substeps=substeps,  # type: ignore[arg-type]
             colliders=self._colliders(),
+            contact="particles",  # what the tasks were made and scored with
             air_density=physics.air_density if wind is None else AIR_DENSITY,
             anchors=physics.anchors,  # type: ignore[arg-type]
             anchor_speed=2 * physics.hand_speed,

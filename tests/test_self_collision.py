@@ -1,5 +1,6 @@
 """Self-collision: nothing passes through itself, judged by a count that knows nothing of it."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from exact_intersections import intersecting_pairs
@@ -283,6 +284,15 @@ def test_other_integrators_take_part(name):
     assert count_intersections(mesh.triangles, simulation.positions[0]) == 0
     assert not simulation.diverged[0]
     assert np.ptp(simulation.positions[0, :, 2]) > 1.8 * 0.28 * SIDE / 8 / np.sqrt(2) * 0.6  # three layers
+
+
+def test_an_environment_takes_it_and_tells_of_it():
+    env = gym.make("clothgym:ClothDrape-v0", self_collision="strict")
+    env.reset(seed=0)
+    for _ in range(8):
+        *_, info = env.step(np.array([0.5, 0.2, -1, -0.5, -0.2, -1, 0.3, 0.3], np.float32)[: env.action_space.shape[0]])
+    assert {"self_contacts", "clamped_moves", "hand_lag"} <= set(info)
+    assert env.unwrapped.task.simulation.intersections()[0] == 0
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------------
