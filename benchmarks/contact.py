@@ -68,7 +68,7 @@ def depths(rows: int, case: Case) -> dict[str, Any]:
     name, solid, distance, top, size = case
     mesh = grid(rows, rows, 0.6, 0.6)
     simulation = Simulation(mesh, Material.preset("cotton", air_drag=0.2), colliders=[solid], threads=1)
-    pieces = 3 if rows > 20 else 6
+    pieces = 2 if rows > 20 else 4
 
     def depth() -> float:
         return solids.depth(simulation.positions[0] - simulation.collider_positions[0, 0], mesh.triangles, distance, pieces) / size
