@@ -30,8 +30,8 @@ FRICTION = 0.5  # of the floor
 TILT = np.radians(3)  # a seed turns the start by about that
 ROUGHNESS = 1e-3  # and shifts each particle by about that, in shortest springs
 CALM = 5.0  # rate of the linear drag that brings starts to rest [1/s]
-REST_SPEED = 5e-3  # root of the mean squared speed at which a start is at rest; folds that are squeezed keep trembling [m/s]
-MOST_SETTLING = 20.0  # seconds of settling after which a start should be at rest
+REST_SPEED = 5e-3  # root of the mean squared speed at which a start is at rest [m/s]
+MOST_SETTLING, TREMBLING = 20.0, 0.05  # seconds of settling after which that speed will do: squeezed folds keep trembling
 
 
 class Manoeuvre:
@@ -410,9 +410,10 @@ def starts(
     simulation.set_parameters(air_drag=CALM * simulation.material.density)
     while (speed := _rms_speed(simulation)).max() > REST_SPEED:
         if manoeuvre.time > manoeuvre.seconds + MOST_SETTLING:
+            if speed.max() <= TREMBLING:
+                break
             raise RuntimeError(
-                f"{kind} sheet of seed {seed + int(speed.argmax())} still moves at {speed.max():.2g} m/s after {MOST_SETTLING} s "
-                "of settling: take another seed, or a fabric with more damping_time"
+                f"{kind} sheet of seed {seed + int(speed.argmax())} moves at {speed.max():.2g} m/s: take another seed or fabric"
             )
         simulation.step(6)
         manoeuvre.frames += 6
@@ -438,8 +439,7 @@ def _eased(share: float) -> float:
 
 def _rotation(axis: NDArray, angle: float) -> NDArray[np.float64]:
     """Rotation about an axis, (3, 3), after Rodrigues."""
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([(0, -z, y), (z, 0, -x), (-y, x, 0)])
+    cross = np.cross(np.eye(3), axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 

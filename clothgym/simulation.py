@@ -16,7 +16,8 @@ from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
-from clothgym.collisions import DESK, Collider, SelfCollision, Solids, resolve, room_for_touches
+from clothgym.collisions import DESK, Collider, SelfCollision, Solids, room_for_touches
+from clothgym.collisions.response import KERNELS as CONTACT
 from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
@@ -55,19 +56,19 @@ def advance(
             substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
             restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
             press(x[b], v[b], w[b], sheet, b, step, h, carried)  # noqa: F821
-            look = look_every > 0 and step % look_every == 0
-            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)
+            look = step % look_every == 0
+            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)  # noqa: F821
             keep_apart(x[b], v[b], w[b], sheet, b, h, carried)  # noqa: F821
         remeasure(x[b], elements.springs, limited[b])  # noqa: F821
         mark_diverged(x[b], v[b], diverged[b])
 
 
 @cache
-def _compiled(substep: Any, name: str, model: Bending, limits: bool, collides: bool) -> Any:
+def _compiled(substep: Any, name: str, model: Bending, limits: bool, collides: bool, contact: str) -> Any:
     """The main loop around an integrator's substep, in which the model's kernels bend."""
     bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", **model.kernels)
-    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides]
-    return specialize(advance, f"advance_{name}_{model.name}_{limits}_{collides}", substep=bound, **parts)
+    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | CONTACT[contact]
+    return specialize(advance, f"advance_{name}_{model.name}_{limits}_{collides}_{contact}", substep=bound, **parts)
 
 
 class Simulation(Observed):
@@ -157,7 +158,7 @@ class Simulation(Observed):
         self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
-        parts = self.bending, strain_limit is not None, self._contact.options is not None
+        parts = self.bending, strain_limit is not None, self._contact.options is not None, contact
         self._advance = _compiled(self.integrator.substep, self.integrator.name, *parts)
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -194,7 +195,7 @@ class Simulation(Observed):
         self._prepare()
         rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
-        look_every = max(1, int(SURFACE_INTERVAL / h)) if self.contact == "sheet" else 0
+        look_every = max(1, int(SURFACE_INTERVAL / h))
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:

@@ -61,12 +61,12 @@ def _push_out(x, v, w, carried, desk):
 
 
 @kernel
-def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
-    """Resolve the contacts of one block after a substep of ``h`` [s], and move the solids on by their velocity.
+def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+    """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
     x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
     ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the positions already [s];
-    look: whether to look anew where the sheet touches between its particles, to ``touches``; desk: scratch, (DESK, lanes).
+    desk: scratch, (DESK, lanes).  The others are for ``resolve``.
     """
     kinds = shapes.kinds
     for k in range(kinds.shape[0]):
@@ -79,6 +79,16 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, de
             if may_touch(x[p], collider, kinds[k]):
                 measure_in_world(x[p], desk, shapes, k)
                 _push_out(x[p], v[p], w[p], carried, desk)
+
+
+@kernel
+def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+    """The same for the whole sheet.
+
+    triangles: of the sheet; look: whether to look anew where it touches between its particles, to ``touches``.
+    """
+    resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk)
+    kinds = shapes.kinds
     if look:
         touches[2][0] = 0
         for k in range(kinds.shape[0]):
@@ -86,6 +96,10 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, de
                 lay_out(colliders[k], desk)
                 find_touches(x, triangles, shapes, k, touches, desk)
     press(x, v, w, triangles, colliders, touches, h, carried, desk)
+
+
+# the name that the main loop calls, for contact with the sheet and with its particles alone
+KERNELS = {"sheet": {"resolve": resolve}, "particles": {"resolve": resolve_particles}}
 
 
 @kernel
