@@ -18,6 +18,7 @@ from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
 from clothgym.collisions import DESK, Collider, SelfCollision, Solids, room_for_touches
 from clothgym.collisions.response import KERNELS as CONTACT
+from clothgym.collisions.response import needed
 from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
@@ -158,7 +159,8 @@ class Simulation(Observed):
         self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
-        parts = self.bending, strain_limit is not None, self._contact.options is not None, contact
+        touched = needed(contact, self._solids.shapes.kinds)
+        parts = self.bending, strain_limit is not None, self._contact.options is not None, touched
         self._advance = _compiled(self.integrator.substep, self.integrator.name, *parts)
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()

@@ -166,8 +166,8 @@ class State:
         contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
         contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
             ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
-        contact_tight: its pairs that may come no closer, (num_envs,); contact_ties, contact_planes: see there, (num_envs, pairs,
-            ...).
+        contact_tight: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,); contact_ties,
+            contact_planes: see there, (num_envs, pairs, ...).
         steps: control steps since the environment's reset, (num_envs,).
         diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
         sheet: digest of the mesh and of what bends, the same for all, ().
@@ -201,6 +201,7 @@ class State:
     contact_figures: NDArray
     contact_impulses: NDArray
     contact_tight: NDArray
+    contact_looks: NDArray
     contact_ties: NDArray
     contact_planes: NDArray
     steps: NDArray

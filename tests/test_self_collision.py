@@ -175,7 +175,7 @@ def test_three_layers_on_a_table_rest_at_their_thickness():
     simulation.reset(positions=three_layers(mesh, 1.6 * thickness))
     simulation.step(180)
     x, v = simulation.positions[0], simulation.velocities[0]
-    assert np.sqrt((v**2).sum(axis=1).mean()) < 1e-3
+    assert np.sqrt((v**2).sum(axis=1).mean()) < 2e-4  # 1e-3 where contacts push apart all that is too close at once
     flat = np.abs(x[:, 0] - x[:, 0].mean()) < 0.05  # away from the folds
     layers = [x[flat & (np.round((x[:, 2] - 0.001) / thickness) == k), 2].mean() for k in range(3)]
     np.testing.assert_allclose(np.diff(layers), thickness, rtol=0.2)

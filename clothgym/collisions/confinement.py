@@ -9,11 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import kernel
-from clothgym.collisions.proximity import CLAMPED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
+from clothgym.collisions.proximity import CLAMPED, JAMMED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
 
 INSIDE = 0.999  # of a bound that is used, for rounding
 REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
+PATIENCE = 4  # looks at all tied pairs after which a query, which frees the vertices again, is the cheaper
+PASSING = 8  # tied pairs passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
 
 
 @kernel
@@ -27,18 +29,22 @@ def confine(x, v, w, sheet, block, h):
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
     out = np.zeros(lanes, np.bool_)
     if lanes == 1:
-        out[0] = _leaves(x, start, bounds, samples, 0)
+        out[0] = _leaves(x, start, bounds, samples)
     else:
         _leave(x, start, bounds, samples, out)
+    beyond = np.empty(x.shape[0], np.bool_)
     for l in range(memory.used[block]):
         if not out[l]:
             continue
         # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
-        if not (_leaves(x, start, limits, samples, l) or (setting.strict and _comes_close(x, memory, block, l))):
-            continue
-        _renew(x, v, w, sheet, block, l)
-        if setting.strict:
-            _hold_apart(x, v, w, sheet, block, l)
+        due, close = _mark(x, start, bounds, limits, samples, l, beyond), False
+        if not due and setting.strict:
+            due, close = _comes_close(x, memory, block, l, beyond)
+        if due:
+            _renew(x, v, w, sheet, block, l)
+            beyond[:] = True
+        if setting.strict and (due or close):
+            _hold_apart(x, v, w, sheet, block, l, beyond)
     for p in range(x.shape[0]):
         for c in range(3):
             xc, oc = x[p, c], old[p, c]
@@ -66,8 +72,8 @@ def _leave(x, start, bounds, samples, beyond):
 
 
 @kernel
-def _leaves(x, start, bounds, samples, l):
-    """The same for one lane, without loops of one round."""
+def _shift(x, start, samples, l):
+    """The motion of one lane that all its vertices share [m]: it changes no distance."""
     share = x.dtype.type(1 / samples.shape[0])
     mx, my, mz = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
     for s in range(samples.shape[0]):
@@ -75,12 +81,33 @@ def _leaves(x, start, bounds, samples, l):
         mx += (x[p, 0, l] - start[p, 0, l]) * share
         my += (x[p, 1, l] - start[p, 1, l]) * share
         mz += (x[p, 2, l] - start[p, 2, l]) * share
+    return mx, my, mz
+
+
+@kernel
+def _leaves(x, start, bounds, samples):
+    """Whether a vertex of the one lane there is has left its bound; without loops of one round."""
+    mx, my, mz = _shift(x, start, samples, 0)
     beyond = False
     for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
-        inside = dx * dx + dy * dy + dz * dz <= bounds[p, l]
+        dx, dy, dz = x[p, 0, 0] - start[p, 0, 0] - mx, x[p, 1, 0] - start[p, 1, 0] - my, x[p, 2, 0] - start[p, 2, 0] - mz
+        inside = dx * dx + dy * dy + dz * dz <= bounds[p, 0]
         beyond |= not inside
     return beyond
+
+
+@kernel
+def _mark(x, start, bounds, limits, samples, l, beyond):
+    """Mark the vertices of one lane that have left their bounds; returns whether one is beyond its limit."""
+    mx, my, mz = _shift(x, start, samples, l)
+    due = False
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+        square = dx * dx + dy * dy + dz * dz
+        inside, allowed = square <= bounds[p, l], square <= limits[p, l]
+        beyond[p] = not inside
+        due |= not allowed
+    return due
 
 
 @kernel
@@ -150,36 +177,57 @@ def _gap(x, ties, planes, t, l):
 
 
 @kernel
-def _comes_close(x, memory, block, l):
-    """Whether a tied pair of one lane is closer than it may be."""
-    ties, planes = memory.ties[block, l], memory.planes[block, l]
-    close = False
-    for t in range(memory.tight[block, l]):
-        # not what is not a number: that has diverged, and is not held
-        close |= _gap(x, ties, planes, t, l) < planes[t, KEPT]
-    return close
+def _some(ties, t, beyond):
+    """Whether a vertex of tied pair t is beyond its bound: only then can the pair be closer than it may."""
+    some = beyond[ties[t, 3]] | beyond[ties[t, 4]] | beyond[ties[t, 5]] | beyond[ties[t, 6]]
+    if ties[t, 1] == 8:
+        some |= beyond[ties[t, 7]] | beyond[ties[t, 8]] | beyond[ties[t, 9]] | beyond[ties[t, 10]]
+    return some
 
 
 @kernel
-def _hold_apart(x, v, w, sheet, block, l):
-    """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; those of others may follow.
-    Returns whether any stayed."""
+def _comes_close(x, memory, block, l, beyond):
+    """Whether a query is due for tied pairs of one lane, and whether one with a vertex beyond its bound is closer than it may be.
+
+    Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
+    looked at than it is worth.
+    """
+    ties, planes = memory.ties[block, l], memory.planes[block, l]
+    tight = memory.tight[block, l]
+    due, close, looks = False, False, tight // PASSING
+    for t in range(tight):
+        if _some(ties, t, beyond):
+            looks += 1
+            # not what is not a number: that has diverged, and is not held
+            if _gap(x, ties, planes, t, l) < planes[t, KEPT]:
+                close = True
+                due |= ties[t, 2] != JAMMED
+    memory.looks[block, l] += looks
+    return due or memory.looks[block, l] > PATIENCE * tight, close
+
+
+@kernel
+def _hold_apart(x, v, w, sheet, block, l, beyond):
+    """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; others may follow."""
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
     ties, planes = memory.ties[block, l], memory.planes[block, l]
     zero = x.dtype.type(0)
     stay = np.zeros(x.shape[0], np.bool_)
-    some, going = False, True
+    tight = memory.tight[block, l]
+    for t in range(tight):
+        if _some(ties, t, beyond) and _gap(x, ties, planes, t, l) < planes[t, KEPT]:
+            ties[t, 2] = JAMMED
+    going = True
     while going:
         going = False
-        for t in range(memory.tight[block, l]):
-            if _gap(x, ties, planes, t, l) < planes[t, KEPT]:
+        for t in range(tight):
+            if _some(ties, t, beyond) and _gap(x, ties, planes, t, l) < planes[t, KEPT]:
                 for m in range(ties[t, 1]):
                     p = ties[t, 3 + m]
                     if stay[p]:
                         continue
-                    stay[p] = True
-                    some, going = True, True
+                    stay[p] = beyond[p] = going = True
                     report[CLAMPED] += 1
                     for c in range(3):
                         if w[p, l] <= zero:
@@ -187,9 +235,7 @@ def _hold_apart(x, v, w, sheet, block, l):
                         else:
                             v[p, c, l] = zero
                         x[p, c, l] = old[p, c, l]
-    if some:
-        _note_lag(w, memory, block, l)
-    return some
+    _note_lag(w, memory, block, l)
 
 
 @kernel
@@ -224,6 +270,8 @@ def look_around(x, w, sheet, block, l):
     # what is not finite, or beyond all cloth, has diverged, and is told of as that
     if setting.single and farthest > FARTHEST and farthest < 1e3:
         report[UNCERTAIN] = 1
+    before = memory.contacts[block, l]
+    known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
     count, tight = query(
         p, sheet.pairs, sheet.reach, held, room, free, memory.particles[block, l], memory.figures[block, l], memory.ties[block, l],
         memory.planes[block, l], report,
@@ -235,7 +283,29 @@ def look_around(x, w, sheet, block, l):
     for k in range(particles):
         bounds[k, l] = (INSIDE * room[k]) ** 2
         memory.limits[block, k, l] = (INSIDE * free[k]) ** 2
-    memory.impulses[block, l, :count, :] = 0
+    _take_over(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
     memory.contacts[block, l] = count
     memory.choices[block, l] = -1
+    memory.looks[block, l] = 0
     report[ROWS] = count
+
+
+@kernel
+def _take_over(known, impulses, particles, fresh, count, vertices):
+    """Give the contacts that a query has found the impulses which the same contacts had before it, so that stacks stay at rest.
+
+    known, impulses: those of before; particles, fresh: of now, of which there are ``count``.
+    """
+    last, before = np.full(vertices, -1, np.int32), np.empty(len(known), np.int32)
+    for k in range(len(known)):
+        before[k] = last[known[k, 0]]
+        last[known[k, 0]] = k
+    for k in range(count):
+        fresh[k, 0] = fresh[k, 1] = fresh[k, 2] = 0
+        old = last[particles[k, 0]]
+        while old >= 0:
+            if known[old, 1] == particles[k, 1] and known[old, 2] == particles[k, 2] and known[old, 3] == particles[k, 3]:
+                for c in range(3):
+                    fresh[k, c] = impulses[old, c]
+                break
+            old = before[old]

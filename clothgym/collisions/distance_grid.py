@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
+from clothgym.collisions.closest import closest_on_triangle
 
 BAND = 2  # cells around a triangle's bounds in which distances to it are exact
 MARGIN = 3  # cells around the mesh's bounds
@@ -56,23 +57,9 @@ def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> Dis
 
 @kernel
 def distance_to_triangle(px, py, pz, a, b, c):
-    """Distance of a point to a triangle (Ericson 2005, 5.1.5)."""
-    bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    qx, qy, qz = px - a[0], py - a[1], pz - a[2]
-    bb, bc, cc = bx * bx + by * by + bz * bz, bx * cx + by * cy + bz * cz, cx * cx + cy * cy + cz * cz
-    qb, qc = qx * bx + qy * by + qz * bz, qx * cx + qy * cy + qz * cz
-    scale = 1 / (bb * cc - bc * bc)
-    s, t = (cc * qb - bc * qc) * scale, (bb * qc - bc * qb) * scale
-    if s < 0 or t < 0 or s + t > 1:
-        best = 1e300
-        on_b, on_c = min(max(qb / bb, 0.0), 1.0), min(max(qc / cc, 0.0), 1.0)
-        on_s = min(max((qc - qb - bc + bb) / (bb - 2 * bc + cc), 0.0), 1.0)
-        for u, v in ((on_b, 0.0), (0.0, on_c), (1 - on_s, on_s)):
-            dx, dy, dz = qx - u * bx - v * cx, qy - u * by - v * cy, qz - u * bz - v * cz
-            best = min(best, dx * dx + dy * dy + dz * dz)
-        return np.sqrt(best)
-    dx, dy, dz = qx - s * bx - t * cx, qy - s * by - t * cy, qz - s * bz - t * cz
+    """Distance of a point to a triangle."""
+    u, v, w = closest_on_triangle(px, py, pz, a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+    dx, dy, dz = px - u * a[0] - v * b[0] - w * c[0], py - u * a[1] - v * b[1] - w * c[1], pz - u * a[2] - v * b[2] - w * c[2]
     return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 

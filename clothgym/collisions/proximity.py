@@ -10,9 +10,9 @@ the largest ``n.b`` of the other is a lower bound of the distance for any n at a
 being right.  (Closest points of slivers in float32 overestimate by half a millimetre.)
 
 Where layers touch, their distance is small, and bounds that are a share of it would call for a query with every step that
-they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are tied: as soon as a vertex has left its bound,
-their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits, follows from the
-other pairs alone.  Every state is certified either by the bounds, or by the limits and the ties.
+they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are tied: once one of their vertices has left its
+bound, their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits, follows from
+the other pairs alone.  So each pair is certified in every state: by the bounds of its vertices, or by their limits, or by its tie.
 
 Per-vertex bounds instead of continuous collision detection: Chen, Hsu, Liu, Macklin, Yang and Yuksel, Offset Geometric
 Contact, ACM Transactions on Graphics 44(4), 2025.
@@ -24,6 +24,7 @@ import numpy as np
 
 from clothgym._jit import kernel
 from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
+from clothgym.collisions.closest import closest_on_segments, closest_on_triangle
 
 LAYERED = 0.6  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
 LOOSE = 0.8  # of the reach below which pairs are tied
@@ -33,74 +34,14 @@ ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 
 REPORT = 8
 # what is kept of a contact beside its four particles, (room, 4): the gap is n.(sum of weights times positions), with n a unit
 # vector from the second primitive to the first; the thickness is the gap at which it acts [m]
-WEIGHTS, NORMAL, THICKNESS = 0, 4, 7
+NORMAL, THICKNESS = 4, 7  # after the weights
 FIGURES = 8
 ROUNDING = 1e-9  # of a distance in float64 [m]
 # of a tight pair: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
 KEPT = 3
-# and how many vertices are the first primitive's, how many all are, the pair of leaves or -1, and the vertices, (room, TIE)
-TIE = 11
+# and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or JAMMED, and the vertices, (room, TIE)
+TIE, JAMMED = 11, -2
 MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
-
-
-@kernel
-def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
-    """Barycentric weights of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
-    abx, aby, abz = bx - ax, by - ay, bz - az
-    acx, acy, acz = cx - ax, cy - ay, cz - az
-    apx, apy, apz = px - ax, py - ay, pz - az
-    d1 = abx * apx + aby * apy + abz * apz
-    d2 = acx * apx + acy * apy + acz * apz
-    if d1 <= 0.0 and d2 <= 0.0:
-        return 1.0, 0.0, 0.0
-    bpx, bpy, bpz = px - bx, py - by, pz - bz
-    d3 = abx * bpx + aby * bpy + abz * bpz
-    d4 = acx * bpx + acy * bpy + acz * bpz
-    if d3 >= 0.0 and d4 <= d3:
-        return 0.0, 1.0, 0.0
-    cpx, cpy, cpz = px - cx, py - cy, pz - cz
-    d5 = abx * cpx + aby * cpy + abz * cpz
-    d6 = acx * cpx + acy * cpy + acz * cpz
-    if d6 >= 0.0 and d5 <= d6:
-        return 0.0, 0.0, 1.0
-    vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        t = d1 / (d1 - d3)
-        return 1.0 - t, t, 0.0
-    vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        t = d2 / (d2 - d6)
-        return 1.0 - t, 0.0, t
-    va = d3 * d6 - d5 * d4
-    if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        return 0.0, 1.0 - t, t
-    scale = 1.0 / (va + vb + vc)
-    v, w = vb * scale, vc * scale
-    return 1.0 - v - w, v, w
-
-
-@kernel
-def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
-    """Where on segments ab and cd they are closest, each from 0 to 1 (Ericson 2005, 5.1.9)."""
-    ux, uy, uz = bx - ax, by - ay, bz - az
-    vx, vy, vz = dx - cx, dy - cy, dz - cz
-    rx, ry, rz = ax - cx, ay - cy, az - cz
-    a = ux * ux + uy * uy + uz * uz
-    e = vx * vx + vy * vy + vz * vz
-    f = vx * rx + vy * ry + vz * rz
-    c = ux * rx + uy * ry + uz * rz
-    b = ux * vx + uy * vy + uz * vz
-    denominator = a * e - b * b
-    s = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 0.0 else 0.0
-    t = (b * s + f) / e if e > 0.0 else 0.0
-    if t < 0.0:
-        t = 0.0
-        s = min(max(-c / a, 0.0), 1.0) if a > 0.0 else 0.0
-    elif t > 1.0:
-        t = 1.0
-        s = min(max((b - c) / a, 0.0), 1.0) if a > 0.0 else 0.0
-    return s, t
 
 
 @kernel
@@ -273,8 +214,11 @@ def tie_layers(p, corners, leaves, gaps, closest, loose, stop, standoff, held, r
     for t in range(tight):
         if ties[t, 2] >= 0 and layered[ties[t, 2]]:
             continue
-        ties[kept] = ties[t]
-        planes[kept] = planes[t]
+        if kept < t:
+            for c in range(TIE):
+                ties[kept, c] = ties[t, c]
+            for c in range(4):
+                planes[kept, c] = planes[t, c]
         kept += 1
     for pair in range(leaves.shape[0]):
         if not layered[pair]:

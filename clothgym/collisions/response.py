@@ -98,8 +98,20 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, de
     press(x, v, w, triangles, colliders, touches, h, carried, desk)
 
 
-# the name that the main loop calls, for contact with the sheet and with its particles alone
-KERNELS = {"sheet": {"resolve": resolve}, "particles": {"resolve": resolve_particles}}
+@kernel
+def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+    """The same where there are no solids."""
+
+
+# the name that the main loop calls, for contact with the sheet, with its particles alone, and with nothing
+KERNELS = {"sheet": {"resolve": resolve}, "particles": {"resolve": resolve_particles}, "nothing": {"resolve": resolve_nothing}}
+
+
+def needed(contact: str, kinds: NDArray) -> str:
+    """The least of ``KERNELS`` that does for solids of these kinds: less is to be compiled.  A plane touches particles first."""
+    if not len(kinds):
+        return "nothing"
+    return contact if np.any(kinds != PLANE) else "particles"
 
 
 @kernel

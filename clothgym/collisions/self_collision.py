@@ -60,6 +60,7 @@ class Memory(NamedTuple):
     tight: NDArray
     ties: NDArray
     planes: NDArray
+    looks: NDArray
     chosen: NDArray
     choices: NDArray
     used: NDArray

@@ -162,6 +162,7 @@ class SelfCollision:
         memory.behind[block, lane] = 0
         memory.contacts[block, lane] = 0
         memory.tight[block, lane] = 0
+        memory.looks[block, lane] = 0
         memory.report[block, lane] = 0
         self._reported[block * self.layout.lanes + lane] = False
 
@@ -178,6 +179,7 @@ class SelfCollision:
             "contact_figures": np.zeros((num_envs, 0, FIGURES)),
             "contact_impulses": np.zeros((num_envs, 0, 3)),
             "contact_tight": np.zeros(num_envs, np.int32),
+            "contact_looks": np.zeros(num_envs, np.int32),
             "contact_ties": np.zeros((num_envs, 0, TIE), np.int32),
             "contact_planes": np.zeros((num_envs, 0, 4)),
         }
@@ -194,6 +196,7 @@ class SelfCollision:
             "contact_lag": public(memory.lag),
             "contact_count": public(memory.contacts),
             "contact_tight": public(memory.tight),
+            "contact_looks": public(memory.looks),
         }
         for name, counted in ROW_ARRAYS.items():
             array, count = getattr(memory, name), state[f"contact_{counted}"]
@@ -218,6 +221,7 @@ class SelfCollision:
         memory.limits[:] = blocks(state.contact_limits, self.dtype)
         memory.contacts[block, lane] = state.contact_count
         memory.tight[block, lane] = state.contact_tight
+        memory.looks[block, lane] = state.contact_looks
         for name in ROW_ARRAYS:
             array = getattr(state, f"contact_{name}")
             getattr(memory, name)[block, lane, : array.shape[1]] = array
@@ -265,6 +269,7 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         tight=np.zeros(shape, np.int32),
         ties=np.empty((*shape, TIGHT * particles, TIE), np.int32),
         planes=np.empty((*shape, TIGHT * particles, 4)),
+        looks=np.zeros(shape, np.int32),
         impulses=np.zeros((*shape, room, 3), dtype),
         chosen=np.empty((*shape, room), np.int32),
         choices=np.zeros(shape, np.int32),
