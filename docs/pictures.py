@@ -18,6 +18,7 @@ import numpy as np
 
 from clothgym import Box, MeshCollider, Plane, Simulation, grid
 from clothgym.crumpling import MANOEUVRES
+from clothgym.envs.pictures import draw, renderer_of
 from clothgym.render.camera import Camera
 from clothgym.render.renderer import Renderer
 from clothgym.render.solids import Solid
@@ -30,15 +31,15 @@ def strip(env_id: str, moments: tuple[int, ...], seed: int, options: dict[str, A
     """One episode of a scripted agent as a row of moments, the last of which is its end, (height, width, 3)."""
     env = gym.make(f"clothgym:{env_id}").unwrapped
     env.reset(seed=seed, options=options)
-    renderer = env.task.renderer(SIZE, SIZE, antialias=3)
+    renderer = renderer_of(env.task, SIZE, SIZE, antialias=3)
     frames, step, terminated = [], 0, False
     while not terminated:
         if step in moments:
-            frames.append(env.task.draw(renderer, "rgb_array", [0])[0])
+            frames.append(draw(env.task, renderer, "rgb_array", [0])[0])
         action = env.task.careless_actions()[0] if careless else env.expert_action()
         *_, terminated, _, _ = env.step(action)
         step += 1
-    return np.concatenate([*frames[: len(moments)], env.task.draw(renderer, "rgb_array", [0])[0]], axis=1)
+    return np.concatenate([*frames[: len(moments)], draw(env.task, renderer, "rgb_array", [0])[0]], axis=1)
 
 
 def draw_strips() -> None:
@@ -139,7 +140,8 @@ def main() -> None:
 
     folder = Path(options.run[0])
     config = policies.read_config(folder)
-    report.film(HERE / options.run[1], config["env"], policies.learnt(folder, config["env"]), config["env_kwargs"], episodes=3)
+    policy = policies.learnt(folder, config["env"])
+    report.film(HERE / options.run[1], config["env"], policy, config["env_kwargs"], episodes=3, stride=2)
 
 
 if __name__ == "__main__":

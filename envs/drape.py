@@ -239,7 +239,7 @@ class DrapeTask(Task):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.2, 0.27), vertical_fov=36.0)
+        return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.19, 0.27), vertical_fov=33.0)
 
 
 def _centring(off_center: NDArray) -> NDArray:
@@ -322,7 +322,8 @@ class ClothDrapeEnv(ClothEnv):
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
+    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 5 % on |
 
     ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
     rest is drawn), and ``"material"``, a dict of figures for one episode.

@@ -167,7 +167,7 @@ class DrapeGripperTask(DrapeTask):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.35, 0.22), vertical_fov=40.0)
+        return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.33, 0.24), vertical_fov=36.0)
 
     def markers(self, env: int) -> list[Any]:
         from clothgym.render import Solid  # imported here: training draws nothing
@@ -264,7 +264,8 @@ class ClothDrapeGripperEnv(ClothEnv):
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
+    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 5 % on |
 
     ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
     rest is drawn), ``"rumpled"``, True or False, and ``"material"``, a dict of figures for one episode.

@@ -153,7 +153,7 @@ class ReachTask(Task):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.85), vertical_fov=40.0)
+        return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.84), vertical_fov=36.0)
 
 
 def _calm(velocity: NDArray) -> NDArray:
@@ -231,7 +231,8 @@ class ClothReachEnv(ClothEnv):
     | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
     | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
+    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 5 % on |
 
     ``reset(options=...)`` takes ``"goal"``, three coordinates [m], and ``"material"``, a dict of figures for one episode.
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import TaskState
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
 
-RENDER_MODES = ["rgb_array", "depth_array"]
 IMAGE_SIZE = 480
 
 
@@ -21,9 +21,9 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
     task_class: ClassVar[type[Task]]
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30}  # noqa: RUF012 - Gymnasium's own
 
-    def __init__(self, render_mode: str | None = None, **kwargs: Any) -> None:
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
+    def __init__(self, render_mode: str | None = None, render_color: str = "fabric", **kwargs: Any) -> None:
+        check_render_mode(render_mode, render_color)
+        self.render_mode, self.render_color = render_mode, render_color
         kwargs.setdefault("threads", 1)
         self.task = self.task_class(1, **kwargs)
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.physics.time_step)}
@@ -53,8 +53,8 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
             gym.logger.warn("render() without a render_mode does nothing; use gym.make(..., render_mode='rgb_array')")
             return None
         if self._renderer is None:
-            self._renderer = self.task.renderer(IMAGE_SIZE, IMAGE_SIZE)
-        return self.task.draw(self._renderer, self.render_mode, [0])[0]
+            self._renderer = renderer_of(self.task, IMAGE_SIZE, IMAGE_SIZE)
+        return draw(self.task, self._renderer, self.render_mode, [0], self.render_color)[0]
 
     def get_state(self) -> TaskState:
         """All that is needed to continue the episode bit for bit."""
@@ -63,11 +63,6 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
     def set_state(self, state: TaskState) -> None:
         self.task.set_state(state)
         self._np_random = self.task.generators[0]
-
-
-def check_render_mode(render_mode: str | None) -> None:
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r}: must be None or one of {', '.join(RENDER_MODES)}")
 
 
 def pick(info: dict[str, Any], env: int) -> dict[str, Any]:

@@ -67,6 +67,7 @@ class StrainTask(Task):
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
     )
     acting_steps = 150
+    strain_shown = 0.1
     key_particles = key_particles(SHEET)
     position_bound = FAR
 
@@ -292,7 +293,7 @@ class StrainTask(Task):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.85), vertical_fov=40.0)
+        return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.82), vertical_fov=37.0)
 
 
 def checked_penalty(value: float) -> float:
@@ -408,7 +409,8 @@ class ClothStrainEnv(ClothEnv):
     | ``strain_limit`` | ``None`` | anything else is refused, see above |
     | ``self_collision`` | ``False`` | or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more |
     | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``viewer``) |
+    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
+    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 10 % on |
 
     ``reset(options=...)`` takes ``"material"``, a dict of figures for one episode.
 

@@ -26,7 +26,7 @@ from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
 from clothgym.simulation import Simulation
 
 if TYPE_CHECKING:
-    from clothgym.render import Camera, Renderer, Solid
+    from clothgym.render import Camera, Solid
 
 REWARD_MODES = ("delta", "sparse")
 FAILURE_PENALTY = 0.5
@@ -62,6 +62,7 @@ class Task(ABC):
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
     position_bound: ClassVar[float] = POSITION_BOUND
     reset_options: ClassVar[tuple[str, ...]] = ("material",)
+    strain_shown: ClassVar[float] = 0.05  # where the colours of render_color="strain" end
 
     def __init__(
         self,
@@ -392,23 +393,6 @@ class Task(ABC):
         self._origin[block, :, lane] = origin
 
     # --- pictures -------------------------------------------------------------------------------------------------------
-
-    def renderer(self, width: int, height: int, antialias: int = 2) -> Renderer:
-        """A renderer for this task's sheet and camera."""
-        from clothgym.render import Renderer  # imported here: training draws nothing
-
-        mesh = self.physics.mesh
-        return Renderer(
-            mesh.triangles, mesh.rest_positions[:, :2], self.camera(), width, height, antialias, self.threads, grid_shape=mesh.shape
-        )
-
-    def draw(self, renderer: Renderer, mode: str, envs: Sequence[int]) -> NDArray:
-        """Frames: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array"."""
-        positions = self.simulation.positions[list(envs)]
-        solids, markers = [self.solids(env) for env in envs], [self.markers(env) for env in envs]
-        if mode == "depth_array":
-            return renderer.depth_batch(positions, solids, markers)
-        return renderer.rgb_batch(positions, solids, markers)
 
     def markers(self, env: int) -> list[Any]:
         """What is drawn and casts no lift on the sheet: hands that hold it, and what else a task shows."""

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import TaskState
-from clothgym.envs.single import RENDER_MODES, check_render_mode
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
 
 IMAGE_SIZE = 240
@@ -24,6 +24,7 @@ class ClothVectorEnv(VectorEnv):
         num_envs: environments in the batch; environment ``i`` of a batch seeded ``s`` equals a single one seeded ``s + i``.
         autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
         render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
+        render_color: "fabric", or "strain" for its colours.
         kwargs: those of the task.
     """
 
@@ -34,6 +35,7 @@ class ClothVectorEnv(VectorEnv):
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        render_color: str = "fabric",
         **kwargs: Any,
     ) -> None:
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
@@ -43,8 +45,8 @@ class ClothVectorEnv(VectorEnv):
         except ValueError:
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
-        check_render_mode(render_mode)
-        self.render_mode = render_mode
+        check_render_mode(render_mode, render_color)
+        self.render_mode, self.render_color = render_mode, render_color
         self.metadata = {
             "render_modes": RENDER_MODES,
             "render_fps": round(1 / self.task_class.physics.time_step),
@@ -115,8 +117,8 @@ class ClothVectorEnv(VectorEnv):
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = self.task.renderer(IMAGE_SIZE, IMAGE_SIZE, antialias=1)
-        return tuple(self.task.draw(self._renderer, self.render_mode, list(range(self.num_envs))))
+            self._renderer = renderer_of(self.task, IMAGE_SIZE, IMAGE_SIZE, antialias=1)
+        return tuple(draw(self.task, self._renderer, self.render_mode, list(range(self.num_envs)), self.render_color))
 
     # --- what users of Gymnasium's own vector environments rely on ------------------------------------------------------
 

@@ -303,3 +303,22 @@ def test_a_sheet_thrown_out_of_the_arena_ends_the_episode(env_id):
     *_, terminated, _, info = env.step(still(env))
     assert terminated and info["failure"] == "out_of_bounds"
     assert info["normalized_performance"] == 0 and not info["is_success"]
+
+
+@every_id
+def test_render_color_shows_the_strain(env_id):
+    """With strain the picture differs from the fabric's where the sheet is, and nowhere else; a batch shows the same."""
+    fabric, hot = (make(env_id, render_mode="rgb_array", render_color=color) for color in ("fabric", "strain"))
+    images = []
+    for env in (fabric, hot):
+        env.reset(seed=3)
+        for _ in range(3):
+            env.step(env.unwrapped.expert_action())
+        images.append(env.render().astype(int))
+    differs = np.abs(images[0] - images[1]).max(axis=2) > 40
+    assert 0.005 < differs.mean() < 0.5
+    batch = make_vec(env_id, num_envs=2, render_mode="rgb_array", render_color="strain")
+    batch.reset(seed=3)
+    assert len({picture.tobytes() for picture in batch.render()}) == 2
+    with pytest.raises(ValueError, match="render_color='heat': must be 'fabric' or 'strain'"):
+        make(env_id, render_color="heat")

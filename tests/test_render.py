@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from clothgym.mesh import grid
-from clothgym.render import Camera, Renderer, Solid, write_video
+from clothgym.render import Camera, Renderer, Solid
 from clothgym.render.surface import push_out
 
 SIDE = 0.6
@@ -194,62 +194,6 @@ def test_smooth_surface_passes_through_the_particles():
         assert depth[round(row), round(column)] == pytest.approx(z, abs=2e-3)
 
 
-# colour
-
-
-def red_over_blue(image):
-    middle = image[50:70, 50:70].reshape(-1, 3).astype(float).mean(axis=0)
-    return middle[0] / middle[2]
-
-
-@pytest.mark.parametrize("smooth", [False, True])
-def test_front_and_back_differ_in_colour(smooth):
-    draw = renderer(FACING, smooth=smooth, front=(200, 40, 40), back=(40, 40, 200))
-    front = upright()
-    back = front * (-1, 1, 1)
-    assert red_over_blue(draw.rgb(front)) > 1.33
-    assert red_over_blue(draw.rgb(back)) < 0.75
-
-
-def test_pattern_follows_the_material():
-    draw = renderer(FACING, width=240, height=240, check=SIDE / 4, front=(200, 40, 40))
-    image = draw.rgb(upright()).astype(float)
-    # the sheet's edge is about 67 pixels from the middle: stripes of about 33, in both directions
-    middle_row = image[120 - 17, 60:180, 2]
-    jumps = np.flatnonzero(np.abs(np.diff(middle_row)) > 10) + 60
-    assert np.all(np.min(np.abs(jumps[:, None] - 120 - 33.6 * np.arange(-2, 3)), axis=1) < 3)
-    assert len(jumps) >= 3
-
-
-def test_cloth_and_solids_darken_the_floor():
-    draw = renderer()
-    empty = draw.rgb(FAR_AWAY).astype(int)
-    shadow = draw.rgb(sheet(z=0.3)).astype(int)
-    on_floor = np.isfinite(draw.depth(FAR_AWAY)) & (draw.depth(sheet(z=0.3)) == draw.depth(FAR_AWAY))
-    change = (shadow - empty)[on_floor]
-    assert np.all(change.min(axis=0) < -20)
-    assert change.max() <= 0
-
-
-def test_markers_are_spheres_of_their_colour():
-    draw = renderer(FACING, width=121, height=121)
-    image = draw.rgb(FAR_AWAY, (), [((0, 0, 0.5), (20, 200, 20))])
-    assert image[60, 60, 1] > 1.5 * image[60, 60, 0]
-    large = draw.rgb(FAR_AWAY, (), [Solid(kind="sphere", center=(0, 0, 0.5), radius=0.1, color=(20, 200, 20))])
-    assert large[60, 70, 1] > 1.5 * large[60, 70, 0]
-
-
-def test_supersampling_averages_linear_light():
-    """Doubling the samples keeps the mean light: what is bright once is not lost to the gamma curve."""
-    x, ball = sheet(z=0.2), [Solid(kind="sphere", center=(0, 0, 0.1), radius=0.1)]
-
-    def light(antialias):
-        c = renderer(antialias=antialias).rgb(x, ball) / 255
-        return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).mean()
-
-    assert light(3) == pytest.approx(light(1), rel=0.01)
-
-
 # sameness
 
 
@@ -261,10 +205,13 @@ def test_a_batch_equals_single_pictures(threads):
     solids = [[Solid(kind="sphere", center=(0, 0, 0.1), radius=0.1)] * (i % 3) for i in range(5)]
     markers = [[(x[i, 0], (250, 250, 250))] for i in range(5)]
     images, depths = draw.rgb_batch(x, solids, markers), draw.depth_batch(x, solids, markers)
+    hot = rng.uniform(0, 1, (5, 81))
+    heated = draw.rgb_batch(x, solids, markers, hot)
     assert images.shape == (5, 48, 64, 3) and images.dtype == np.uint8
     assert depths.shape == (5, 48, 64) and depths.dtype == np.float32
     for i in range(5):
         assert np.array_equal(images[i], draw.rgb(x[i], solids[i], markers[i]))
+        assert np.array_equal(heated[i], draw.rgb(x[i], solids[i], markers[i], hot[i]))
         assert np.array_equal(depths[i], draw.depth(x[i], solids[i], markers[i]))
 
 
@@ -371,52 +318,11 @@ def test_wrong_scenes_are_refused():
         renderer().rgb_batch(np.stack([sheet(), sheet()]), [[]])
     with pytest.raises(ValueError, match="must be a clothgym"):
         renderer().rgb(sheet(), ["ball"])
+    for values in (np.zeros(80), np.full(81, np.nan)):
+        with pytest.raises(ValueError, match=r"values have shape .* one for each particle"):
+            renderer().rgb(sheet(), values=values)
     with pytest.raises(ValueError, match=r"marker \(0, 0, 0\)"):
         renderer().rgb(sheet(), (), [(0, 0, 0)])
-
-
-# video
-
-
-def frames():
-    return [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(5)]
-
-
-def test_gif_keeps_frames_and_loops(tmp_path):
-    image = pytest.importorskip("PIL.Image")
-    write_video(tmp_path / "a.gif", frames(), fps=10)
-    with image.open(tmp_path / "a.gif") as gif:
-        assert (gif.n_frames, gif.size, gif.info["loop"], gif.info["duration"]) == (5, (48, 32), 0, 100)
-        gif.seek(4)
-        assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - 80).max() <= 4
-
-
-def test_mp4_keeps_frames(tmp_path):
-    ffmpeg = pytest.importorskip("imageio_ffmpeg").get_ffmpeg_exe()
-    write_video(str(tmp_path / "a.mp4"), [np.full((31, 47, 3), 90, np.uint8)] * 6, fps=30)
-    command = [ffmpeg, "-i", tmp_path / "a.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
-    raw = np.frombuffer(subprocess.run(command, capture_output=True, check=True).stdout, np.uint8)
-    # a row and a column more: players want even numbers
-    assert raw.size == 6 * 32 * 48 * 3
-    assert np.abs(raw.astype(int) - 90).max() <= 8
-
-
-def test_wrong_videos_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"must end in .gif or .mp4"):
-        write_video(tmp_path / "a.avi", frames())
-    with pytest.raises(ValueError, match="empty"):
-        write_video(tmp_path / "a.gif", [])
-    with pytest.raises(ValueError, match="fps=0"):
-        write_video(tmp_path / "a.gif", frames(), fps=0)
-    with pytest.raises(ValueError, match="frame 1 has shape"):
-        write_video(tmp_path / "a.gif", [frames()[0], np.zeros((3, 3, 3), np.uint8)])
-
-
-@pytest.mark.parametrize(("ending", "package"), [("gif", "PIL"), ("mp4", "imageio_ffmpeg")])
-def test_a_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=r"clothgym\[video\]"):
-        write_video(tmp_path / f"a.{ending}", frames())
 
 
 def test_import_is_light():

@@ -4,8 +4,18 @@ It sees triangles, positions and named solids; it knows nothing of simulations o
 """
 
 from clothgym.render.camera import Camera
-from clothgym.render.export import write_video
+from clothgym.render.export import write_picture, write_video
+from clothgym.render.meshes import MeshSequence, write_animation, write_meshes
 from clothgym.render.renderer import Renderer
 from clothgym.render.solids import Solid
 
-__all__ = ["Camera", "Renderer", "Solid", "write_video"]
+__all__ = [
+    "Camera",
+    "MeshSequence",
+    "Renderer",
+    "Solid",
+    "write_animation",
+    "write_meshes",
+    "write_picture",
+    "write_video",
+]

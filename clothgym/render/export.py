@@ -1,16 +1,44 @@
-"""Frames to a file."""
+"""Frames to a file, which stands there whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import io
+import itertools
+import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 
+def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
+    """Write an image, (height, width, 3) uint8, as a ``.png``.
+
+    Raises:
+        ValueError: another ending, or no such image.
+        ImportError: pillow is missing.
+    """
+    path = Path(path)
+    if path.suffix != ".png":
+        raise ValueError(f"picture path={str(path)!r}: must end in .png")
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        raise ValueError(f"image has shape {image.shape} and dtype {image.dtype}: must be (height, width, 3) uint8")
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise ImportError("a .png needs pillow: pip install 'clothgym[video]'") from error
+    content = io.BytesIO()
+    Image.fromarray(image).save(content, "png", optimize=True)
+    replace_file(path, content.getvalue())
+
+
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
     """Write frames, (height, width, 3) uint8 each, as a looped ``.gif`` or an ``.mp4``.
+
+    Frames may be a generator, from which an ``.mp4`` is written as they come.  If it raises, the frames before are kept beside
+    ``path``, as ``NAME.part.mp4``, and the error says so.
 
     Raises:
         ValueError: another ending, no frames, frames of different sizes, or an fps that is not positive.
@@ -21,46 +49,77 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
         raise ValueError(f"video path={str(path)!r}: must end in .gif or .mp4")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps={fps!r}: must be positive and finite")
-    images = [np.asarray(frame) for frame in frames]
-    if not images:
+    images = _checked(frames)
+    first = next(images, None)
+    if first is None:
         raise ValueError("frames are empty: a video needs at least one")
-    for number, image in enumerate(images):
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.shape != images[0].shape:
+    scratch = path.with_name(f"{path.stem}.part{path.suffix}")
+    try:
+        (_write_gif if path.suffix == ".gif" else _write_mp4)(scratch, first, images, fps)
+    except BaseException as error:
+        if scratch.exists():
+            error.add_note(f"the frames before it are kept in {scratch}")
+        raise
+    os.replace(scratch, path)
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file beside ``path`` and give it that name: half a file is never seen under it."""
+    scratch = path.with_name(f".{path.name}.part")
+    scratch.write_bytes(content)
+    os.replace(scratch, path)
+
+
+def _checked(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    shape = None
+    for number, frame in enumerate(frames):
+        image = np.asarray(frame)
+        shape = image.shape if shape is None else shape
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.shape != shape:
             raise ValueError(
                 f"frame {number} has shape {image.shape} and dtype {image.dtype}: all must be (height, width, 3) uint8 of one size"
             )
-    if path.suffix == ".gif":
-        _write_gif(path, images, fps)
-    else:
-        _write_mp4(path, images, fps)
+        yield image
 
 
-def _write_gif(path: Path, images: list[NDArray[np.uint8]], fps: float) -> None:
+def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
     try:
         from PIL import Image
     except ImportError as error:
         raise ImportError("a .gif needs pillow: pip install 'clothgym[video]'") from error
-    # one palette for all frames, learned from some of them: with one each, the floor would flicker
-    sample = np.concatenate(images[:: max(1, len(images) // 8)], axis=0)
-    palette = Image.fromarray(sample).quantize(256, method=Image.Quantize.MEDIANCUT)
-    pages = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
-    # a gif counts in hundredths of a second; players slow down anything below two of them
-    hundredths = max(2, round(100 / fps))
-    pages[0].save(path, save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
+    images = [first]
+    try:
+        for image in others:
+            images.append(image)
+    finally:
+        # one palette for all frames, learned from some of them: with one each, the floor would flicker
+        sample = np.concatenate(images[:: max(1, len(images) // 8)], axis=0)
+        palette = Image.fromarray(_with_rare_colours(sample)).quantize(256, method=Image.Quantize.MEDIANCUT)
+        pages = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
+        # a gif counts in hundredths of a second; players slow down anything below two of them
+        hundredths = max(2, round(100 / fps))
+        pages[0].save(path, save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
 
 
-def _write_mp4(path: Path, images: list[NDArray[np.uint8]], fps: float) -> None:
+def _with_rare_colours(sample: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image, and below it, on as much room, every colour that it has, each on about as many pixels: small things keep theirs."""
+    _, first = np.unique((sample.reshape(-1, 3) >> 3).astype(np.uint32) @ [1024, 32, 1], return_index=True)
+    colours = sample.reshape(-1, 3)[first]
+    return np.concatenate([sample, np.resize(colours, sample.shape)], axis=0)
+
+
+def _write_mp4(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
     try:
         from imageio_ffmpeg import write_frames
     except ImportError as error:
         raise ImportError("an .mp4 needs imageio-ffmpeg: pip install 'clothgym[video]'") from error
-    height, width = images[0].shape[:2]
+    height, width = first.shape[:2]
     # players want an even number of rows and columns
     extra = ((0, height % 2), (0, width % 2), (0, 0))
     writer = write_frames(str(path), (width + width % 2, height + height % 2), fps=fps, quality=8, macro_block_size=1)
     writer.send(None)
     try:
-        for image in images:
+        for image in itertools.chain([first], others):
             writer.send(np.ascontiguousarray(np.pad(image, extra, mode="edge")))
     finally:
         writer.close()

@@ -20,6 +20,8 @@ NOTHING = -1e6  # nearness where a ray of light meets no surface [m]
 CONTACT_HEIGHTS = (0.02, 0.14)  # a surface this high above the floor darkens it by half: touching, and hanging over it [m]
 CONTACT_BLUR = (0.012, 0.05)  # half widths of the two shadows' soft edges [m]
 SKY_BLUR = 0.03  # [m]
+CAST_BLUR = (0.008, 0.04)  # half widths of the lamp's shadow on the floor, of what stands on it and of what is far above [m]
+FAR_ABOVE = 0.6  # [m]
 FAINTEST = 1 / 512  # contact shadow that no byte shows
 DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 UP = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -48,13 +50,15 @@ class Rig(NamedTuple):
 
 
 class Maps(NamedTuple):
-    """shadow: nearness to the light [m], (size, size).  heights, (size, size, 3): the floor's two contact shadows, 0 to 1,
-    and the blurred height of the topmost surface [m].  The boxes: lowest and highest column and row where a look at
-    the map can tell anything.  floor_box: lowest and highest x and y [m] of what they tell about the floor; most of the
-    floor lies outside and is spared the look."""
+    """shadow: nearness to the light [m], (size, size).  cast: the lamp's shadow on the floor along the same rays, 0 to 1, at half
+    that size.  heights, (size, size, 3): the floor's two contact shadows, 0 to 1, and the blurred height of the topmost surface
+    [m].  The boxes: lowest and highest column and row where a look at the map can tell anything.  floor_box: lowest and highest
+    x and y [m] of what they tell about the floor; most of the floor lies outside and is spared the look."""
 
     shadow: NDArray[np.float32]
     shadow_box: Box
+    cast: NDArray[np.float32]
+    cast_box: Box
     heights: NDArray[np.float32]
     heights_box: Box
     floor_box: Box
@@ -75,19 +79,19 @@ def studio_rig(camera: Camera, pixels: int) -> Rig:
     across /= np.linalg.norm(across)
     axes = as_tuple(across), as_tuple(np.cross(direction, across)), as_tuple(direction)
     width = 2.8 * camera.reach
-    shadow_size, height_size = min(max(pixels // 2, 160), 512), min(max(pixels // 4, 72), 128)
+    shadow_size, height_size = min(max(pixels // 4 * 2, 160), 512), min(max(pixels // 4, 72), 128)
     return Rig(axes, camera.target, shadow_size, shadow_size / width, height_size, height_size / width)
 
 
 @kernel
 def blur_turned(source, radius, out):
     """Mean over 2 radius + 1 neighbours along a row, written to the transposed place: four calls blur both ways twice."""
-    size = source.shape[0]
+    height, width = source.shape
     share = np.float32(1 / (2 * radius + 1))
-    for row in range(size):
+    for row in range(height):
         total = np.float32(0)
-        for column in range(-radius, size):
-            if column + radius < size:
+        for column in range(-radius, width):
+            if column + radius < width:
                 total += source[row, column + radius]
             if column - radius - 1 >= 0:
                 total -= source[row, column - radius - 1]
@@ -104,22 +108,74 @@ def contact_shadow(lowest, half_height, out):
             out[row, column] = 1 / (1 + h * h)
 
 
+@kernel
+def split_shadow(shadow, axes, center, scale, left, top, near, far):
+    """The lamp's shadow on the floor at half the size of ``shadow``, from column ``left`` and row ``top`` on, as two parts that add
+    up to it, each 0 to 1: what casts it is near the floor, and ``FAR_ABOVE`` it along the ray or more."""
+    size = shadow.shape[0] // 2
+    for row in range(top, top + near.shape[0]):
+        for column in range(left, left + near.shape[1]):
+            right, up = (2 * column + 1 - size) / scale, (size - 2 * row - 1) / scale
+            floor = -(center[2] + right * axes[0][2] + up * axes[1][2]) / axes[2][2]
+            covered, share = np.float32(0), np.float32(0)
+            for r in range(2 * row, 2 * row + 2):
+                for c in range(2 * column, 2 * column + 2):
+                    gap = shadow[r, c] - floor
+                    if gap > 0:
+                        covered += np.float32(0.25)
+                        share += np.float32(0.25) * np.float32(min(gap / FAR_ABOVE, 1))
+            near[row - top, column - left], far[row - top, column - left] = covered - share, share
+
+
 def _blur(field: NDArray[np.float32], radius: int) -> None:
-    other = np.empty_like(field)
+    other = np.empty(field.shape[::-1], np.float32)
     for _ in range(2):
         blur_turned(field, radius, other)
         blur_turned(other, radius, field)
 
 
-def _box(filled: NDArray[np.bool_], before: int, after: int) -> Box:
+@kernel
+def filled(field, threshold, channels):
+    """First and last column, first and last row where one of the first ``channels`` is above the threshold; none: first > last."""
+    rows, columns, _ = field.shape
+    left, right, top, bottom = columns, -1, rows, -1
+    for row in range(rows):
+        for column in range(columns):
+            for channel in range(channels):
+                if field[row, column, channel] > threshold:
+                    left, right = min(left, column), max(right, column)
+                    top, bottom = min(top, row), max(bottom, row)
+    return left, right, top, bottom
+
+
+def _box(ends: tuple[int, int, int, int], before: int, after: int, size: int) -> Box:
     """Coordinates (columns, then rows) whose neighbours, ``before`` to ``after`` texels on, include a filled one."""
-    ends: list[float] = []
-    for axis in (0, 1):
-        places = np.flatnonzero(filled.any(axis=axis))
-        if len(places) == 0:
-            return NOWHERE
-        ends += [max(places[0] - after, before), min(places[-1] + before + 1, filled.shape[0] - after)]
-    return float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3])
+    if ends[0] > ends[1]:
+        return NOWHERE
+    low, high = (
+        (max(float(end - after), before) for end in ends[::2]),
+        (min(float(end + before + 1), size - after) for end in ends[1::2]),
+    )
+    (left, top), (right, bottom) = low, high
+    return left, right, top, bottom
+
+
+def _floor_shadow(rig: Rig, shadow: NDArray[np.float32], ends: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], Box]:
+    """The lamp's shadow on the floor, blurred the more the farther above it is what casts it, and its box."""
+    size = rig.shadow_size // 2
+    cast = np.zeros((size, size, 1), np.float32)
+    if ends[0] > ends[1]:
+        return cast, NOWHERE
+    radii = [max(1, round(0.5 * width * rig.shadow_scale)) for width in CAST_BLUR]
+    margin = 2 * max(radii) + 1
+    left, top = (max(end // 2 - margin, 0) for end in ends[::2])
+    right, bottom = (min(end // 2 + margin, size - 1) for end in ends[1::2])
+    parts = np.empty((2, bottom + 1 - top, right + 1 - left), np.float32)
+    split_shadow(shadow, rig.axes, rig.center, rig.shadow_scale, left, top, parts[0], parts[1])
+    for part, radius in zip(parts, radii):
+        _blur(part, radius)
+    np.add(parts[0], parts[1], out=cast[top : bottom + 1, left : right + 1, 0])
+    return cast, _box((left, right, top, bottom), 0, 1, size)
 
 
 def _corners_on_floor(box: Box, axes: Axes, center: Vector, scale: float, size: int) -> list[tuple[float, float]]:
@@ -156,12 +212,14 @@ def draw_maps(rig: Rig, x: NDArray[np.float32], triangles: NDArray[np.int32], nu
         contact_shadow(lowest, half_height, fields[0])
         _blur(fields[0], max(1, math.ceil(width * rig.height_scale)))
     heights = np.stack(fields, axis=-1)
-    shadow_box = _box(shadow > NOTHING, 1, 2)
-    heights_box = _box((fields[0] > FAINTEST) | (fields[1] > FAINTEST) | (fields[2] > FAINTEST), 0, 1)
-    corners = _corners_on_floor(shadow_box, rig.axes, rig.center, rig.shadow_scale, rig.shadow_size)
+    ends = filled(shadow[:, :, None], NOTHING, 1)
+    shadow_box = _box(ends, 1, 2, rig.shadow_size)
+    cast, cast_box = _floor_shadow(rig, shadow, ends)
+    heights_box = _box(filled(heights, FAINTEST, 3), 0, 1, rig.height_size)
+    corners = _corners_on_floor(cast_box, rig.axes, rig.center, 0.5 * rig.shadow_scale, rig.shadow_size // 2)
     corners += _corners_on_floor(heights_box, UP, on_floor, rig.height_scale, rig.height_size)
     floor_box = NOWHERE
     if corners:
         along, across = zip(*corners)
         floor_box = (min(along), max(along), min(across), max(across))
-    return Maps(shadow, shadow_box, heights, heights_box, floor_box)
+    return Maps(shadow, shadow_box, cast, cast_box, heights, heights_box, floor_box)

@@ -139,16 +139,15 @@ def sample_weights(screen, triangles, inverse_depth, t, px, py):
 
 
 @kernel
-def clear_to_floor(rays, buffer, owner):
-    """Start a picture: the floor z = 0 wherever a ray meets it, nothing (nearness 0) elsewhere; no owner.
+def floor_nearness(rays, out):
+    """Nearness [1/m], (height, width), of the floor z = 0 wherever a ray meets it, 0 elsewhere: what a picture starts with.
 
-    With rays of length 1 along the view axis the floor's nearness is ``-ray_z / eye_z``, linear on the image.
+    With rays of length 1 along the view axis it is ``-ray_z / eye_z``, linear on the image.
     """
-    for row in range(buffer.shape[0]):
-        for column in range(buffer.shape[1]):
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
             z = rays[1][2] + (column + 0.5) * rays[2][2] + (row + 0.5) * rays[3][2]
-            buffer[row, column] = max(-z / rays[0][2], 0)
-            owner[row, column] = -1
+            out[row, column] = max(-z / rays[0][2], 0)
 
 
 @kernel

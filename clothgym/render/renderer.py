@@ -11,11 +11,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym._jit import default_threads, run_spans
 from clothgym.render.camera import Camera, View
+from clothgym.render.heat import heat_palette
 from clothgym.render.maps import draw_maps, studio_rig
-from clothgym.render.raster import clear_to_floor, depth_image, project_perspective, rasterise
-from clothgym.render.shading import CORAL, INDIGO, cloth_and_floor_palette, draw_studio, encode, shade_floor, shade_surfaces
+from clothgym.render.raster import depth_image, floor_nearness, project_perspective, rasterise
+from clothgym.render.shading import (
+    CORAL,
+    INDIGO,
+    STEEPEST,
+    cloth_and_floor_palette,
+    draw_studio,
+    encode,
+    shade_floor,
+    shade_surfaces,
+    survey,
+)
 from clothgym.render.solids import Color, Solid, check_color, linear_color
-from clothgym.render.surface import place_vertices, plain_surface, push_out, smooth_surface, vertex_normals
+from clothgym.render.surface import place_vertices, plain_surface, push_out, smooth_surface, vertex_curvature, vertex_normals
 
 Marker = Solid | tuple[Sequence[float], Color]
 
@@ -24,13 +35,16 @@ BIAS = 0.006  # the cloth is drawn this much nearer to the eye than it is [m]
 HIGHEST_LIFT, DEEPEST = 0.006, 0.03  # smooth cloth less than 3 cm deep in a solid is drawn on top of it, so far above [m]
 FINE_CELLS, COARSE_CELLS = 64, 32  # cells along the drawn cloth's longer side, for large and for small pictures
 LARGE_PICTURE = 400  # samples along its shorter side
+HEAT = heat_palette()
 
 
 class _Things(NamedTuple):
-    """What stands beside the cloth of one frame: solids, which hold it up, and markers, which need not."""
+    """What comes with the cloth's positions in one frame: solids, which hold it up, markers, which need not, and a number of each
+    drawn vertex to be shown as a colour, (vertices,), or none."""
 
     solids: list[Solid]
     markers: list[Solid]
+    values: NDArray[np.float32]
 
 
 class _Scene(NamedTuple):
@@ -96,26 +110,36 @@ class Renderer:
         self._particles = len(uv)
         self._check = float(np.ptp(uv, axis=0).max()) / 12 or 1.0 if check is None else float(check)
         samples = min(width, height) * antialias
+        self._coarse = samples < LARGE_PICTURE
         if grid_shape is None:
             self._cloth = plain_surface(triangles, uv)
         else:
-            cells = FINE_CELLS if samples >= LARGE_PICTURE else COARSE_CELLS
+            cells = COARSE_CELLS if self._coarse else FINE_CELLS
             self._cloth = smooth_surface(triangles, uv, grid_shape, cells)
         self._palette = cloth_and_floor_palette(front, back)
         self._rig = studio_rig(camera, samples)
         self._pixel_view = camera.view(self.width, self.height)
         self._sample_view = camera.view(self.width * self.antialias, self.height * self.antialias)
+        self._pixel_floor, self._sample_floor = _floor(self._pixel_view), _floor(self._sample_view)
         self._studio = np.empty((self.height, self.width, 3), np.float32)
         draw_studio(self._sample_view.rays, camera.reach, self._rig.center, self._palette, self.antialias, self._studio)
 
-    def rgb(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.uint8]:
+    def rgb(
+        self,
+        positions: ArrayLike,
+        solids: Sequence[Solid] = (),
+        markers: Sequence[Marker] = (),
+        values: ArrayLike | None = None,
+    ) -> NDArray[np.uint8]:
         """A picture, (height, width, 3) sRGB.
 
         positions: of the particles [m], (particles, 3).  markers: small spheres, each a (position [m], color), or solids.
+        values: a number of each particle, (particles,), that colours the fabric instead of its pattern, from ``heat.heat_colors``'s
+        cream at 0 and below to its violet at 1 and above.
         """
         x = self._checked_positions(positions, 2)
         out = np.empty((self.height, self.width, 3), np.uint8)
-        self._draw_rgb(x, self._checked_things(solids, markers), out)
+        self._draw_rgb(x, self._checked_things(solids, markers, self._checked_values(values, x.shape[:1])), out)
         return out
 
     def depth(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.float32]:
@@ -133,12 +157,14 @@ class Renderer:
         positions: ArrayLike,
         solids: Sequence[Sequence[Solid]] | None = None,
         markers: Sequence[Sequence[Marker]] | None = None,
+        values: ArrayLike | None = None,
     ) -> NDArray[np.uint8]:
         """Pictures of many environments, (environments, height, width, 3): the pixels that ``rgb`` gives for each.
 
-        positions [m], (environments, particles, 3).  solids, markers: a sequence for each environment, or None.
+        positions [m], (environments, particles, 3).  solids, markers: a sequence for each environment, or None.  values:
+        (environments, particles), or None.
         """
-        x, things = self._checked_batch(positions, solids, markers)
+        x, things = self._checked_batch(positions, solids, markers, values)
         out = np.empty((len(x), self.height, self.width, 3), np.uint8)
         self._spread(self._draw_rgb, x, things, out)
         return out
@@ -165,26 +191,31 @@ class Renderer:
     def _draw_rgb(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.uint8]) -> None:
         scene = self._scene(x, things)
         cloth, rig, view = self._cloth, self._rig, self._sample_view
-        screen, inverse_depth, _, owner = self._rasterised(scene, view)
+        screen, inverse_depth, buffer, owner = self._rasterised(scene, view, self._sample_floor)
         maps = draw_maps(rig, scene.x, scene.triangles, len(cloth.uv), BIAS)
+        curvature = np.empty(len(cloth.uv), np.float32)
+        vertex_curvature(scene.x, scene.normals, cloth.triangles, curvature)
         palette = np.concatenate([self._palette, *(linear_color(solid.color)[None] for solid in [*things.solids, *things.markers])])
-        mesh = (screen, inverse_depth, scene.triangles, scene.normals, cloth.uv, scene.surface)
+        mesh = (screen, inverse_depth, scene.triangles, scene.normals, cloth.uv, scene.surface, curvature, things.values)
         # a texel of the shadow map is flat: a slanted surface must not shade itself
         slack = BIAS + 2.0 / rig.shadow_scale
         places = (rig.axes, rig.center, rig.shadow_scale, rig.height_scale, slack)
-        light = np.empty((self.height, self.width, 3), np.float32)
-        shade_floor(view.rays, tuple(maps), places, self._studio, self.antialias, owner, light)
-        shade_surfaces(view.rays, palette, self._check, mesh, tuple(maps), places, self.antialias, owner, light)
+        look = (palette, self._check, HEAT)
+        light, seen = np.empty((self.height, self.width, 3), np.float32), np.empty((self.height, self.width), np.int32)
+        survey(screen, owner, buffer, scene.surface, self.antialias, STEEPEST * self.antialias / view.scale, seen)
+        lens = (self._pixel_view.axes, self._pixel_view.scale, self.camera.near)
+        shade_floor(view.rays, lens, tuple(maps), places, self._studio, self.antialias, seen, light)
+        shade_surfaces(view.rays, look, mesh, tuple(maps), places, self.antialias, owner, seen, light)
         encode(light, out)
 
     def _draw_depth(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.float32]) -> None:
         scene = self._scene(x, things)
-        screen, inverse_depth, buffer, owner = self._rasterised(scene, self._pixel_view)
+        screen, inverse_depth, buffer, owner = self._rasterised(scene, self._pixel_view, self._pixel_floor)
         depth_image(screen, inverse_depth, scene.triangles, buffer, owner, out)
 
     def _scene(self, x: NDArray[np.float32], things: _Things) -> _Scene:
         cloth = self._cloth
-        meshes = [solid.mesh() for solid in [*things.solids, *things.markers]]
+        meshes = [solid.mesh(self._coarse) for solid in [*things.solids, *things.markers]]
         first = np.cumsum([len(cloth.uv), *(len(mesh.positions) for mesh in meshes)])
         vertices = np.empty((first[-1], 3), np.float32)
         normals = np.empty((first[-1], 3), np.float32)
@@ -200,16 +231,15 @@ class Renderer:
         counts = [len(cloth.triangles), *(len(mesh.triangles) for mesh in meshes)]
         return _Scene(vertices, normals, triangles, np.repeat(np.arange(len(counts), dtype=np.int32), counts))
 
-    def _rasterised(self, scene: _Scene, view: View) -> tuple[NDArray[Any], ...]:
-        """screen and inverse depth of the vertices; nearness and triangle of the samples."""
+    def _rasterised(self, scene: _Scene, view: View, floor: NDArray[np.float32]) -> tuple[NDArray[Any], ...]:
+        """screen and inverse depth of the vertices; nearness and triangle of the samples.  floor: nearness to start with."""
         cloth, count = self._cloth, len(scene.x)
         screen, inverse_depth, nearness = np.empty((count, 2), np.int32), np.empty(count, np.float32), np.empty(count, np.float32)
         project_perspective(
             scene.x, view.axes, view.rays[0], view.scale, view.width, view.height, self.camera.near, len(cloth.uv), BIAS,
             screen, inverse_depth, nearness,
         )  # fmt: skip
-        buffer, owner = np.empty((view.height, view.width), np.float32), np.empty((view.height, view.width), np.int32)
-        clear_to_floor(view.rays, buffer, owner)
+        buffer, owner = floor.copy(), np.full(floor.shape, -1, np.int32)
         rasterise(screen, nearness, scene.triangles, len(cloth.triangles), buffer, owner)
         return screen, inverse_depth, buffer, owner
 
@@ -229,7 +259,17 @@ class Renderer:
             )
         return x
 
-    def _checked_things(self, solids: Sequence[Solid], markers: Sequence[Marker]) -> _Things:
+    def _checked_values(self, values: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
+        if values is None:
+            return None
+        numbers = np.asarray(values, np.float32)
+        if numbers.shape != shape or not np.all(np.isfinite(numbers)):
+            raise ValueError(f"values have shape {numbers.shape}: must be finite numbers, {shape}, one for each particle")
+        return numbers
+
+    def _checked_things(
+        self, solids: Sequence[Solid], markers: Sequence[Marker], values: NDArray[np.float32] | None = None
+    ) -> _Things:
         for solid in solids:
             if not isinstance(solid, Solid):
                 raise ValueError(f"solid {solid!r}: must be a clothgym.render.Solid")
@@ -241,10 +281,16 @@ class Renderer:
                 center, color = marker
                 marker = Solid(kind="sphere", center=tuple(center), radius=MARKER_RADIUS, color=color)  # type: ignore[arg-type]
             spheres.append(marker)
-        return _Things(list(solids), spheres)
+        cloth = self._cloth
+        drawn = np.empty(0, np.float32) if values is None else np.sum(cloth.weight * values[cloth.index], axis=1)
+        return _Things(list(solids), spheres, drawn)
 
     def _checked_batch(
-        self, positions: ArrayLike, solids: Sequence[Sequence[Solid]] | None, markers: Sequence[Sequence[Marker]] | None
+        self,
+        positions: ArrayLike,
+        solids: Sequence[Sequence[Solid]] | None,
+        markers: Sequence[Sequence[Marker]] | None,
+        values: ArrayLike | None = None,
     ) -> tuple[NDArray[np.float32], list[_Things]]:
         x = self._checked_positions(positions, 3)
         solids = [()] * len(x) if solids is None else solids
@@ -252,7 +298,15 @@ class Renderer:
         for name, lists in (("solids", solids), ("markers", markers)):
             if len(lists) != len(x):
                 raise ValueError(f"{name} has {len(lists)} entries for {len(x)} environments: give one sequence for each")
-        return x, [self._checked_things(*pair) for pair in zip(solids, markers)]
+        numbers = self._checked_values(values, x.shape[:2])
+        each = [None] * len(x) if numbers is None else list(numbers)
+        return x, [self._checked_things(*one) for one in zip(solids, markers, each)]
+
+
+def _floor(view: View) -> NDArray[np.float32]:
+    nearness = np.empty((view.height, view.width), np.float32)
+    floor_nearness(view.rays, nearness)
+    return nearness
 
 
 def _checked_mesh(

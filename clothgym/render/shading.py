@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.render.raster import HALF_PIXEL, SUBPIXEL, sample_weights
+from clothgym.render.raster import HALF_PIXEL, NOT_DRAWN, SUBPIXEL, sample_weights
 from clothgym.render.solids import linear_color
 
 # rows of the palette
@@ -19,8 +19,8 @@ CORAL, CREAM = (206, 64, 50), (247, 228, 206)
 INDIGO = (54, 68, 132)
 STUDIO = ((226, 222, 214), (205, 200, 191), (240, 238, 234), (222, 227, 232))  # floor, its lines, horizon, zenith
 
-KEY = (0.84, 0.80, 0.74)  # light from the lamp, before the cosine
-SKY = (0.47, 0.47, 0.49)  # from straight above
+KEY = (0.90, 0.86, 0.79)  # light from the lamp, before the cosine
+SKY = (0.43, 0.43, 0.45)  # from straight above
 BOUNCE = (0.40, 0.36, 0.32)  # from the floor
 TILES = 10.0  # on a metre of the floor
 LINE_WIDTH = 0.0016  # [m]
@@ -30,9 +30,18 @@ TRANSLUCENCE = 0.30  # of the fabric
 SHEEN, GLOSS = 0.35, 0.10  # light scattered along a silhouette; highlight of a solid
 CLOTH = 0  # surface number of the cloth; solids are 1, 2, ...
 SHADE = (0.50, 0.48, 0.43)  # what the lamp's shadow takes from the floor
+TOUCHED, HUNG_OVER = 0.55, 0.45  # what a surface takes that touches the floor, and one that hangs over it
+ROOFED = 0.55  # share of the sky that a surface above takes from one below
+HOLLOW, MOST_HOLLOW, MOST_RIDGE = 0.012, 0.5, 0.25  # share of the sky that a hollow loses, by its curvature [m], and bounds
+THREADS, RELIEF = 20.0, 0.12  # threads of a stripe; how much brighter those of the warp are than those of the weft
+COVER = 0.85  # share of a crossing that the upper thread hides; the lower one shows at its sides
+FINEST = 2.0  # threads in a footprint from which on they are not told apart
+STEEPEST = 2.0  # slope to the eye up to which one look at a surface does for all samples of a pixel
 TONES = 8192
+SHOULDER, BRIGHTEST = 0.70, 2.0  # light above the shoulder is compressed, as film does it, so that bright folds keep their form
 
-_curve = np.linspace(0, 1, TONES)
+_curve = np.linspace(0, BRIGHTEST, TONES)
+_curve = np.where(_curve < SHOULDER, _curve, 1 - (1 - SHOULDER) * np.exp(-np.maximum(_curve - SHOULDER, 0) / (1 - SHOULDER)))
 _srgb = np.where(_curve <= 0.0031308, 12.92 * _curve, 1.055 * _curve ** (1 / 2.4) - 0.055)
 SRGB: NDArray[np.uint8] = np.round(255 * _srgb).astype(np.uint8)
 
@@ -116,10 +125,10 @@ def _background(up, palette):
 
 
 @kernel
-def _tile_ink(x, y, depth, dx, dy, dz, rays):
-    """Share of a sample's footprint on the floor at (x, y) [m] that is covered by the lines between tiles."""
-    # how far the point moves from one sample to the next, right and down
-    sx, sy, tiles = rays[2][2] / dz, rays[3][2] / dz, depth * TILES
+def _tile_ink(x, y, depth, dx, dy, dz, rays, antialias):
+    """Share of a pixel's footprint on the floor at (x, y) [m] that is covered by the lines between tiles."""
+    # how far the point moves from one pixel to the next, right and down
+    sx, sy, tiles = rays[2][2] / dz, rays[3][2] / dz, depth * TILES * antialias
     wide_x = tiles * (abs(rays[2][0] - dx * sx) + abs(rays[3][0] - dx * sy))
     wide_y = tiles * (abs(rays[2][1] - dy * sx) + abs(rays[3][1] - dy * sy))
     ink_x, ink_y = _line(x * TILES, LINE_WIDTH * TILES, wide_x), _line(y * TILES, LINE_WIDTH * TILES, wide_y)
@@ -146,39 +155,118 @@ def draw_studio(rays, reach, center, palette, antialias, studio):
             away = np.sqrt((x - center[0]) ** 2 + (y - center[1]) ** 2) / reach
             fade = min(max((away - 0.9) / 3.2, 0), 1)
             fade = fade * (2 - fade)
-            ink = _tile_ink(x, y, depth, dx, dy, dz, rays)
+            ink = _tile_ink(x, y, depth, dx, dy, dz, rays, antialias)
             for c in range(3):
                 tile = floor[c] + ink * (line[c] - floor[c])
                 studio[row, column, c] = tile + fade * (horizon[c] - tile)
 
 
 @kernel
-def shade_floor(rays, maps, rig, studio, antialias, owner, light):
+def _cast_on_floor(cast, box, axes, center, scale, x, y):
+    """The lamp's shadow on the floor at (x, y) [m], 0 to 1, bilinear."""
+    dx, dy, dz = x - center[0], y - center[1], -center[2]
+    size = cast.shape[0]
+    u = 0.5 * size + scale * (axes[0][0] * dx + axes[0][1] * dy + axes[0][2] * dz) - 0.5
+    v = 0.5 * size - scale * (axes[1][0] * dx + axes[1][1] * dy + axes[1][2] * dz) - 0.5
+    if not (box[0] <= u < box[1] and box[2] <= v < box[3]):
+        return 0.0
+    column, row = int(u), int(v)
+    return _bilinear(cast, row, column, 0, u - column, v - row)
+
+
+@kernel
+def _tone(u, v, check, footprint):
+    """0 where the fabric has its own colour, 1 where it is light, and how bright its threads are: gingham as it is woven.
+
+    Stripes of warp cross stripes of weft; a thread of one lies over and under those of the other in turn.  Where threads are
+    too fine to be seen half of each is.  u, v, check, footprint [m].
+    """
+    width = max(footprint / check, 1e-6)
+    warp, weft = _stripes(u / check, width), _stripes(v / check, width)
+    over, fine = 0.5, THREADS * width
+    if fine < FINEST:
+        over += (4 * COVER - 2) * (_stripes(u / check * THREADS, fine) - 0.5) * (_stripes(v / check * THREADS, fine) - 0.5)
+    return weft + over * (warp - weft), 1 + RELIEF * (over - 0.5)
+
+
+@kernel
+def _fabric(uv, values, triangles, t, w0, w1, w2, footprint, check, palette, heat, front):
+    """Linear colour of the cloth at a point of triangle t."""
+    i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+    if len(values) > 0:
+        value = w0 * values[i] + w1 * values[j] + w2 * values[k]
+        step = int(min(max(value, 0), 1) * (len(heat) - 1) + 0.5)
+        return heat[step, 0], heat[step, 1], heat[step, 2]
+    u = w0 * uv[i, 0] + w1 * uv[j, 0] + w2 * uv[k, 0]
+    v = w0 * uv[i, 1] + w1 * uv[j, 1] + w2 * uv[k, 1]
+    tone, thread = _tone(u, v, check, footprint)
+    dark, light = palette[FRONT if front else BACK], palette[FRONT_CHECK if front else BACK_CHECK]
+    r, g, b = dark[0] + tone * (light[0] - dark[0]), dark[1] + tone * (light[1] - dark[1]), dark[2] + tone * (light[2] - dark[2])
+    return thread * r, thread * g, thread * b
+
+
+@kernel
+def survey(screen, owner, buffer, surface, antialias, smoothness, seen):
+    """How many samples of each pixel show a surface, or -1 where all show one even piece of it: ``seen``, (height, width) int32.
+
+    Where nearness differs within a pixel by more than the share ``smoothness`` the surface is not even.
+    """
+    height, width = seen.shape
+    left, right, top, bottom = width, -1, height, -1
+    for v in range(screen.shape[0]):
+        if screen[v, 0] != NOT_DRAWN:
+            column, row = screen[v, 0] // (SUBPIXEL * antialias), screen[v, 1] // (SUBPIXEL * antialias)
+            left, right = min(left, column), max(right, column)
+            top, bottom = min(top, row), max(bottom, row)
+    seen[:] = 0
+    for row in range(max(top, 0), min(bottom + 1, height)):
+        for column in range(max(left, 0), min(right + 1, width)):
+            t = owner[row * antialias, column * antialias]
+            low = high = buffer[row * antialias, column * antialias]
+            kind = surface[t] if t >= 0 else -1
+            full, same = 0, kind >= 0
+            for s in range(row * antialias, (row + 1) * antialias):
+                for q in range(column * antialias, (column + 1) * antialias):
+                    t = owner[s, q]
+                    if t >= 0:
+                        full += 1
+                        same &= surface[t] == kind
+                        low, high = min(low, buffer[s, q]), max(high, buffer[s, q])
+            even = same and full == antialias * antialias and high - low <= smoothness * low
+            seen[row, column] = -1 if even else full
+
+
+@kernel
+def shade_floor(rays, view, maps, rig, studio, antialias, seen, light):
     """The studio, darkened by shadows, into ``light``, (height, width, 3); what surfaces cover of a pixel is left to them.
 
     A shadow on the floor is smooth: one look in the middle of a pixel does for all its samples.
     """
-    shadow, shadow_box, heights, heights_box, floor_box = maps
-    axes, center, shadow_scale, height_scale, slack = rig
+    _, _, cast, cast_box, heights, heights_box, floor_box = maps
+    axes, center, shadow_scale, height_scale, _ = rig
+    height, width, _ = light.shape
+    left, right, top, bottom = _pixels_of_floor(floor_box, rays[0], view, width, height)
     share = 1 / (antialias * antialias)
-    for row in range(light.shape[0]):
-        for column in range(light.shape[1]):
-            empty = 0
-            for s in range(row * antialias, (row + 1) * antialias):
-                for q in range(column * antialias, (column + 1) * antialias):
-                    empty += owner[s, q] < 0
-            part = empty * share
+    for row in range(height):
+        for column in range(width):
+            shadowed = top <= row <= bottom and left <= column <= right
+            if seen[row, column] == 0 and not shadowed:
+                light[row, column, 0] = studio[row, column, 0]
+                light[row, column, 1] = studio[row, column, 1]
+                light[row, column, 2] = studio[row, column, 2]
+                continue
+            part = 1 - share * seen[row, column] if seen[row, column] >= 0 else 0.0
             r, g, b = part, part, part
             px, py = (column + 0.5) * antialias, (row + 0.5) * antialias
             dz = rays[1][2] + px * rays[2][2] + py * rays[3][2]
-            if empty > 0 and dz < 0:
+            if shadowed and part > 0 and dz < 0:
                 depth = -rays[0][2] / dz
                 x = rays[0][0] + depth * (rays[1][0] + px * rays[2][0] + py * rays[3][0])
                 y = rays[0][1] + depth * (rays[1][1] + px * rays[2][1] + py * rays[3][1])
                 if floor_box[0] <= x <= floor_box[1] and floor_box[2] <= y <= floor_box[3]:
-                    dark = 1 - _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x, y, 0.0)
+                    dark = _cast_on_floor(cast, cast_box, axes, center, 0.5 * shadow_scale, x, y)
                     touching, hanging, _ = _heights_at(heights, heights_box, center, height_scale, x, y)
-                    part *= (1 - 0.55 * touching) * (1 - 0.45 * hanging)
+                    part *= (1 - TOUCHED * touching) * (1 - HUNG_OVER * hanging)
                     r, g, b = part * (1 - SHADE[0] * dark), part * (1 - SHADE[1] * dark), part * (1 - SHADE[2] * dark)
             light[row, column, 0] = r * studio[row, column, 0]
             light[row, column, 1] = g * studio[row, column, 1]
@@ -186,48 +274,53 @@ def shade_floor(rays, maps, rig, studio, antialias, owner, light):
 
 
 @kernel
-def _fabric_tone(u, v, check, footprint):
-    """0 where the fabric has its own colour, 1 where two light stripes cross: gingham. u, v, check, footprint [m]."""
-    width = max(footprint / check, 1e-6)
-    return 0.5 * (_stripes(u / check, width) + _stripes(v / check, width))
+def _pixels_of_floor(box, eye, view, width, height):
+    """First and last column, first and last row where a rectangle of the floor (lowest and highest x, then y [m]) may be seen."""
+    axes, scale, near = view
+    left, right, top, bottom = width - 1, 0, height - 1, 0
+    for corner in range(4):
+        dx, dy = box[corner & 1] - eye[0], box[2 + (corner >> 1)] - eye[1]
+        depth = axes[2][0] * dx + axes[2][1] * dy - axes[2][2] * eye[2]
+        if depth < near:  # it reaches behind the eye
+            return 0, width - 1, 0, height - 1
+        along, up = axes[0][0] * dx + axes[0][1] * dy - axes[0][2] * eye[2], axes[1][0] * dx + axes[1][1] * dy - axes[1][2] * eye[2]
+        column = int(min(max(0.5 * width + scale * along / depth, -1), width))
+        row = int(min(max(0.5 * height - scale * up / depth, -1), height))
+        left, right, top, bottom = min(left, column - 1), max(right, column + 1), min(top, row - 1), max(bottom, row + 1)
+    return left, right, top, bottom
 
 
 @kernel
-def _fabric(uv, triangles, t, w0, w1, w2, footprint, check, palette, front):
-    """Linear colour of the cloth at a sample of triangle t."""
-    i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-    u = w0 * uv[i, 0] + w1 * uv[j, 0] + w2 * uv[k, 0]
-    v = w0 * uv[i, 1] + w1 * uv[j, 1] + w2 * uv[k, 1]
-    # gingham: 0 where the fabric has its own colour, 1 where two light stripes cross
-    width = max(footprint / check, 1e-6)
-    tone = 0.5 * (_stripes(u / check, width) + _stripes(v / check, width))
-    dark, light = palette[FRONT if front else BACK], palette[FRONT_CHECK if front else BACK_CHECK]
-    return dark[0] + tone * (light[0] - dark[0]), dark[1] + tone * (light[1] - dark[1]), dark[2] + tone * (light[2] - dark[2])
-
-
-@kernel
-def shade_surfaces(rays, palette, check, mesh, maps, rig, antialias, owner, light):
+def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
     """Add cloth and solids, linear, to ``light``, (height, width, 3): the mean over each pixel's antialias^2 samples.
 
-    owner: triangle seen by a sample or -1, (height antialias, width antialias).  rays: of the samples' image.
+    owner: triangle seen by a sample or -1, (height antialias, width antialias).  seen: see ``survey``.  rays: of the samples'
+    image.  Light and pattern are smooth: where all samples show one piece of surface, one look in their middle does for them.
     """
-    screen, inverse_depth, triangles, normals, uv, surface = mesh
-    shadow, shadow_box, heights, heights_box, _ = maps
+    screen, inverse_depth, triangles, normals, uv, surface, curvature, values = mesh
+    palette, check, heat = look
+    shadow, shadow_box, _, _, heights, heights_box, _ = maps
     axes, center, shadow_scale, height_scale, slack = rig
-    share = 1 / (antialias * antialias)
-    sample_slope = np.sqrt(rays[2][0] ** 2 + rays[2][1] ** 2 + rays[2][2] ** 2)
-    for s in range(owner.shape[0]):
-        for q in range(owner.shape[1]):
-            t = owner[s, q]
+    slope = np.sqrt(rays[2][0] ** 2 + rays[2][1] ** 2 + rays[2][2] ** 2)
+    width = seen.shape[1]
+    for place in range(seen.shape[0] * width):
+        row, column = place // width, place % width
+        if seen[row, column] == 0:
+            continue
+        across = antialias if seen[row, column] < 0 else 1  # samples that one look is for
+        looks = 1 if seen[row, column] < 0 else antialias * antialias
+        for n in range(looks):
+            s, q = row * antialias + n // antialias, column * antialias + n % antialias
+            t = owner[s + across // 2, q + across // 2]
             if t < 0:
                 continue
-            px, py = np.int64(q) * SUBPIXEL + HALF_PIXEL, np.int64(s) * SUBPIXEL + HALF_PIXEL
+            px, py = (2 * q + across) * HALF_PIXEL, (2 * s + across) * HALF_PIXEL
             w0, w1, w2, inverse, clockwise = sample_weights(screen, triangles, inverse_depth, t, px, py)
             i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-            depth = 1 / inverse
-            dx = rays[1][0] + (q + 0.5) * rays[2][0] + (s + 0.5) * rays[3][0]
-            dy = rays[1][1] + (q + 0.5) * rays[2][1] + (s + 0.5) * rays[3][1]
-            dz = rays[1][2] + (q + 0.5) * rays[2][2] + (s + 0.5) * rays[3][2]
+            depth, fx, fy = 1 / inverse, q + 0.5 * across, s + 0.5 * across
+            dx = rays[1][0] + fx * rays[2][0] + fy * rays[3][0]
+            dy = rays[1][1] + fx * rays[2][1] + fy * rays[3][1]
+            dz = rays[1][2] + fx * rays[2][2] + fy * rays[3][2]
             x, y, z = rays[0][0] + depth * dx, rays[0][1] + depth * dy, rays[0][2] + depth * dz
             nx = w0 * normals[i, 0] + w1 * normals[j, 0] + w2 * normals[k, 0]
             ny = w0 * normals[i, 1] + w1 * normals[j, 1] + w2 * normals[k, 1]
@@ -243,14 +336,17 @@ def shade_surfaces(rays, palette, check, mesh, maps, rig, antialias, owner, ligh
             aside = TEXELS_ASIDE / shadow_scale if lamp > 0 else -TEXELS_ASIDE / shadow_scale
             lit = _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x + aside * nx, y + aside * ny, z + aside * nz)
             _, hanging, roof = _heights_at(heights, heights_box, center, height_scale, x, y)
-            open_sky = 1 - 0.55 * min(max((roof - z) / ROOF_HEIGHT, 0), 1)
+            open_sky = 1 - ROOFED * min(max((roof - z) / ROOF_HEIGHT, 0), 1)
             direct = max(lamp, 0) * lit
             rim = SHEEN * (1 - facing) * (1 - facing) * (1 - facing)
             if surface[t] == CLOTH:
-                footprint = depth * sample_slope / max(facing, 0.15)
-                r, g, b = _fabric(uv, triangles, t, w0, w1, w2, footprint, check, palette, not clockwise)
+                footprint = depth * across * slope / max(facing, 0.15)
+                r, g, b = _fabric(uv, values, triangles, t, w0, w1, w2, footprint, check, palette, heat, not clockwise)
                 # some of the lamp's light comes through the fabric
                 direct += TRANSLUCENCE * max(-lamp, 0) * lit
+                # less of the sky is seen from a hollow, more from a ridge
+                bent = w0 * curvature[i] + w1 * curvature[j] + w2 * curvature[k]
+                open_sky *= 1 - min(max(HOLLOW * (-bent if clockwise else bent), -MOST_RIDGE), MOST_HOLLOW)
                 gloss = 0.0
             else:
                 base = palette[SOLIDS - 1 + surface[t]]
@@ -262,13 +358,10 @@ def shade_surfaces(rays, palette, check, mesh, maps, rig, antialias, owner, ligh
                     shine *= shine
                 gloss = GLOSS * shine * lit
             sky, bounce, edge = (0.5 + 0.5 * nz) * open_sky, (0.5 - 0.5 * nz) * (1 - 0.6 * hanging), rim * open_sky
-            r = r * (KEY[0] * direct + SKY[0] * sky + BOUNCE[0] * bounce) + SKY[0] * edge + gloss
-            g = g * (KEY[1] * direct + SKY[1] * sky + BOUNCE[1] * bounce) + SKY[1] * edge + gloss
-            b = b * (KEY[2] * direct + SKY[2] * sky + BOUNCE[2] * bounce) + SKY[2] * edge + gloss
-            row, column = s // antialias, q // antialias
-            light[row, column, 0] += share * r
-            light[row, column, 1] += share * g
-            light[row, column, 2] += share * b
+            share = across * across / (antialias * antialias)
+            light[row, column, 0] += share * (r * (KEY[0] * direct + SKY[0] * sky + BOUNCE[0] * bounce) + SKY[0] * edge + gloss)
+            light[row, column, 1] += share * (g * (KEY[1] * direct + SKY[1] * sky + BOUNCE[1] * bounce) + SKY[1] * edge + gloss)
+            light[row, column, 2] += share * (b * (KEY[2] * direct + SKY[2] * sky + BOUNCE[2] * bounce) + SKY[2] * edge + gloss)
 
 
 @kernel
@@ -278,4 +371,4 @@ def encode(light, out):
         for column in range(light.shape[1]):
             for c in range(3):
                 value = light[row, column, c]
-                out[row, column, c] = SRGB[int(min(value, 1) * (TONES - 1) + 0.5)] if value > 0 else 0
+                out[row, column, c] = SRGB[int(min(value / BRIGHTEST, 1) * (TONES - 1) + 0.5)] if value > 0 else 0

@@ -17,7 +17,9 @@ KINDS = {"sphere": ("radius",), "box": ("half_sides",), "capsule": ("radius", "h
 WARM_GREY = (196, 189, 178)
 SMALL = 0.03  # radius of a round solid, a marker say, that is drawn with the fewer segments [m]
 BOX_EDGE = 0.01  # radius to which the edges of a box are rounded [m]
-SEGMENTS, FEW_SEGMENTS = 48, 20  # around; 48 chords lie within 0.2 % of the radius of the circle
+# around large solids and small ones, in large pictures and in small ones: 48 chords lie within 0.2 % of the radius, 32 within 0.5 %
+SEGMENTS, FEW_SEGMENTS = (48, 20), (32, 12)
+CREASE = 0.8  # cosine of the angle between a vertex's normal and a triangle's beyond which a mesh is drawn with an edge there
 
 Vector = tuple[float, float, float]
 Color = tuple[int, int, int]
@@ -74,7 +76,8 @@ class Solid:
             raise ValueError(f"capsule height={self.height!r}: must be at least twice the radius {self.radius!r}")
         if not math.isfinite(self.yaw):
             raise ValueError(f"{self.kind} yaw={self.yaw!r}: must be finite")
-        turned(f"{self.kind} rotation", self.rotation)
+        if self.rotation is not UNTURNED:
+            turned(f"{self.kind} rotation", self.rotation)
         check_color(f"{self.kind} color", self.color)
 
     def _check_size(self, name: str, size: float | Vector | None) -> None:
@@ -99,7 +102,8 @@ class Solid:
     def axes(self) -> NDArray[np.float32]:
         """The solid's own axes in the world, (3, 3), an axis a row."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
-        return (np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)]) @ turned("rotation", self.rotation)).astype(np.float32)
+        about_z = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
+        return (about_z if self.rotation is UNTURNED else about_z @ turned("rotation", self.rotation)).astype(np.float32)
 
     @property
     def upright(self) -> bool:
@@ -113,21 +117,21 @@ class Solid:
         straight = 0.0 if self.kind == "sphere" else self.height / 2 - self.radius  # type: ignore[operator]
         return (0.0, 0.0, float(straight)), float(self.radius)  # type: ignore[arg-type]
 
-    def mesh(self) -> Mesh:
-        """The solid's surface in the world; a box is drawn with its edges rounded a little."""
+    def mesh(self, coarse: bool = False) -> Mesh:
+        """The solid's surface in the world, in fewer triangles for a small picture; a box has its edges rounded a little."""
         if self.kind == "mesh":
             corners = np.asarray(self.vertices, np.float32)[np.asarray(self.triangles)] @ self.axes
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-20))
+            normals = _creased_normals(corners, np.asarray(self.triangles), len(self.vertices))  # type: ignore[arg-type]
             positions = corners.reshape(-1, 3) + np.asarray(self.center, np.float32)
-            return Mesh(positions, np.repeat(normals, 3, axis=0), np.arange(len(positions), dtype=np.int32).reshape(-1, 3))
+            return Mesh(positions, normals, np.arange(len(positions), dtype=np.int32).reshape(-1, 3))
         half, radius = self.rounded_box()
         if self.kind == "box":
             radius = min(BOX_EDGE, 0.25 * min(half))
             half = (half[0] - radius, half[1] - radius, half[2] - radius)
-        ball = _ball_in_parts(FEW_SEGMENTS if radius <= SMALL else SEGMENTS)
+        ball = _ball_in_parts((FEW_SEGMENTS if coarse else SEGMENTS)[radius <= SMALL])
         local = ball.octants * np.asarray(half, np.float32) + np.float32(radius) * ball.normals
-        return Mesh(local @ self.axes + np.asarray(self.center, np.float32), ball.normals @ self.axes, ball.triangles)
+        axes = self.axes
+        return Mesh(local @ axes + np.asarray(self.center, np.float32), ball.normals @ axes, ball.triangles)
 
 
 def check_color(name: str, color: Color) -> None:
@@ -140,6 +144,21 @@ def linear_color(color: Sequence[float]) -> NDArray[np.float32]:
     """An sRGB color, 0 to 255, as linear light, 0 to 1, (3,) (IEC 61966-2-1)."""
     c = np.asarray(color, np.float64) / 255
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _creased_normals(corners: NDArray[np.float32], triangles: NDArray, vertices: int) -> NDArray[np.float32]:
+    """Unit normals at the corners of triangles, (3 triangles, 3): the vertex's, by the area of its triangles, or the triangle's
+    own where those of the vertex meet in a crease.  corners: [m], (triangles, 3, 3)."""
+    faces, place = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), triangles.ravel()
+    joint = np.stack([np.bincount(place, np.repeat(faces[:, c], 3), vertices) for c in range(3)], axis=1)
+    own, smooth = np.repeat(_unit(faces), 3, axis=0), _unit(joint.astype(np.float32))[place]
+    least = np.ones(vertices, np.float32)
+    np.minimum.at(least, place, np.sum(own * smooth, axis=1))
+    return np.where(least[place, None] > CREASE, smooth, own)
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.float32(1e-20))
 
 
 class _Ball(NamedTuple):

@@ -149,3 +149,24 @@ def vertex_normals(x, triangles, out):
                 out[v, c] /= length
         else:
             out[v, 2] = 1  # a collapsed patch has no direction of its own
+
+
+@kernel
+def vertex_curvature(x, normals, triangles, out):
+    """Mean curvature [1/m], (vertices,), positive where the neighbours lie above the tangent plane: in a hollow of the front.
+
+    A neighbour at e lies H |e|^2 / 2 above the plane: each edge is asked, and the longer ones count for more.
+    """
+    squares = np.zeros(len(out), np.float32)
+    out[:] = 0
+    for t in range(triangles.shape[0]):
+        for corner in range(3):
+            i, j = triangles[t, corner], triangles[t, (corner + 1) % 3]
+            ex, ey, ez = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+            square = ex * ex + ey * ey + ez * ez
+            out[i] += 2 * (ex * normals[i, 0] + ey * normals[i, 1] + ez * normals[i, 2])
+            out[j] -= 2 * (ex * normals[j, 0] + ey * normals[j, 1] + ez * normals[j, 2])
+            squares[i] += square
+            squares[j] += square
+    for v in range(len(out)):
+        out[v] = out[v] / squares[v] if squares[v] > 0 else 0
