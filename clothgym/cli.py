@@ -1,4 +1,4 @@
-"""The command line: what there is, how fast it is here, how integrators compare, and compiling ahead of time."""
+"""The command line: what there is, a page to play with it, exports, its speed here, how integrators compare, compiling."""
 
 from __future__ import annotations
 
@@ -26,13 +26,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compare.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/compare_SCENE)")
     compare.add_argument("--quick", action="store_true", help="fewer settings")
     compare.add_argument("--fresh", action="store_true", help="measure again what the folder has")
+    view = commands.add_parser("view", help="a page in the browser, where cloth can be touched")
+    view.add_argument(
+        "what", nargs="?", default="", metavar="SCENE", help="a scene or an environment's id (default: patch); see list"
+    )
+    view.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone can reach it)")
+    view.add_argument("--port", type=int, default=8080, help="port, or the next that is free; 0 for any (default: 8080)")
+    view.add_argument(
+        "--policy", nargs="+", default=[], metavar="RUN", help="folders of training runs, which then act in their tasks"
+    )
+    view.add_argument("--replay", type=Path, metavar="FILE", help="a recording that the page saved (.npz), to be shown again")
+    export = commands.add_parser("export", help="a scene or an environment as a picture, a film or meshes for Blender")
+    export.add_argument("name", metavar="NAME", help="a scene or an environment id, see list")
+    export.add_argument("--out", required=True, help=".png, .gif, .mp4 or .glb; without an ending a folder of meshes")
+    export.add_argument("--kind", default="obj", help="of the meshes in a folder: obj (default) or glb")
+    export.add_argument("--seconds", type=float, help="5 of a scene, and all of an episode by default")
+    export.add_argument("--fps", type=float, help="frames a second (30 by default, or as many as there are)")
+    export.add_argument("--size", type=int, help="pixels of a side")
+    export.add_argument("--seed", type=int, default=0)
+    export.add_argument("--color", default="fabric", help="of pictures and films: fabric (default) or strain")
+    export.add_argument("--policy", default="expert", help="who acts: expert (default), nothing, chance, or a run's folder")
+    export.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings: gravity=3 fabric=silk wind=4 ...")
     options = parser.parse_args(arguments)
     if options.command == "list":
         _list()
+    elif options.command == "export":
+        _export(options, export)
     elif options.command == "warmup":
         _warm_up(options.all)
     elif options.command == "compare":
         _compare(options, compare)
+    elif options.command == "view":
+        _view(options, view)
     else:
         _bench(options.json, options.quick)
     return 0
@@ -41,11 +66,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _list() -> None:
     from clothgym.integrators import INTEGRATORS
     from clothgym.material import PRESETS
+    from clothgym.playground.scenes import TITLES
     from clothgym.registration import ENVIRONMENTS
 
     print("environments")
     for env_id in ENVIRONMENTS:
         print(f"  clothgym:{env_id}")
+    print("scenes")
+    for name, title in TITLES.items():
+        print(f"  {name:<22} {title}")
     print("integrators")
     for name, integrator in INTEGRATORS.items():
         order = f"order {integrator.order}" if integrator.order else "no order"
@@ -108,3 +137,44 @@ def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> No
     folder = options.out or Path("runs") / f"compare_{options.scene}"
     print(compare.table(compare.run(plan, folder, options.fresh)))
     print(f"written to {folder}: results.json, table.txt, work_precision.png, sheets.png")
+
+
+def _view(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    from clothgym.playground.server import policies_of, serve
+
+    try:
+        start, policies = policies_of(options.policy, options.what)
+        playground = serve(start, options.host, options.port, options.replay, policies)
+    except (ValueError, OSError, ImportError) as error:
+        parser.error(str(error))
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        print("closing")
+    finally:
+        playground.stop()
+
+
+def _export(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    from clothgym.playground.exporting import export, tell
+
+    given = {name: getattr(options, name) for name in ("seconds", "fps", "size", "seed", "color", "kind", "policy")}
+    try:
+        settings = dict(_setting(text) for text in options.set)
+        print(f"written: {export(options.name, options.out, settings=settings, say=tell, **given)}")
+    except (ValueError, OSError, ImportError) as error:
+        parser.error(str(error))
+    except (RuntimeError, KeyboardInterrupt) as error:
+        raise SystemExit("\n" + "\n".join([str(error) or "stopped", *getattr(error, "__notes__", [])])) from None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """``NAME=VALUE`` with a number where it is one."""
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ValueError(f"--set {text!r}: must be NAME=VALUE, for instance gravity=3")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value

@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.policies import ActorCriticPolicy
 
-import clothgym
+from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, learnt, load_tensors, read_config
 
-CHECKPOINT, BEST, CONFIG = "checkpoint.pt", "best.pt", "config.json"
-Policy = Callable[[Any, NDArray], NDArray]  # (vector env, observations) -> actions
+__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "learnt", "read_config"]
 
 
 def noop(env: Any, observations: NDArray) -> NDArray:
@@ -80,39 +76,6 @@ def parsed_kwargs(text: str) -> dict[str, Any]:
     return kwargs
 
 
-def read_config(folder: Path) -> dict[str, Any]:
-    folder = folder.parent if folder.name == CHECKPOINT else folder
-    if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():
-        raise FileNotFoundError(
-            f"{str(folder)!r} is neither noop, random, expert, careless nor a run's folder: it lacks {CONFIG} or {CHECKPOINT}. "
-            "Train one with: python training/train.py --env ClothDrape-v0"
-        )
-    config = json.loads((folder / CONFIG).read_text())
-    if config.get("clothgym") != clothgym.__version__:
-        raise ValueError(
-            f"{str(folder)!r} was trained with clothgym {config.get('clothgym')}, this is {clothgym.__version__}: "
-            "its scores would not be comparable; train anew, or install that version"
-        )
-    # runs from before there was a choice of learners were PPO's
-    return {"algo": "ppo", "lagrange": {}, "clone": {}} | config
-
-
-def learnt(folder: Path, env_id: str) -> Policy:
-    """The deterministic policy of a run: the best of its held-out evaluations, or the last while there is none."""
-    config = read_config(folder)
-    if config["env"] != env_id:
-        raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
-    env = gym.make_vec(f"clothgym:{env_id}", num_envs=1, **config["env_kwargs"])
-    policy = ActorCriticPolicy(
-        env.single_observation_space, env.single_action_space, lambda _: 0.0, **config["hyperparameters"].get("policy_kwargs", {})
-    )
-    env.close()
-    best = folder / BEST
-    policy.load_state_dict(_load(folder, BEST if best.exists() else CHECKPOINT)["policy"])
-    policy.set_training_mode(False)
-    return lambda env, observations: policy.predict(observations, deterministic=True)[0]
-
-
 def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
     """Write the learner's tensors; a crash in the middle leaves the previous checkpoint whole."""
     state = {
@@ -128,17 +91,8 @@ def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
 
 def load_checkpoint(folder: Path, model: PPO) -> None:
     """Put a run's tensors and counters into a learner built from its configuration."""
-    state = _load(folder)
+    state = load_tensors(folder)
     model.policy.load_state_dict(state["policy"])
     model.policy.optimizer.load_state_dict(state["optimizer"])
     model.num_timesteps = int(state["num_timesteps"])
     model._n_updates = int(state["num_updates"])
-
-
-def _load(folder: Path, name: str = CHECKPOINT) -> dict[str, Any]:
-    folder = folder.parent if folder.name == CHECKPOINT else folder
-    path = folder / name
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise ValueError(f"{str(path)!r} cannot be read as a checkpoint ({error}): train anew") from error

@@ -44,8 +44,8 @@ def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references:
     plt.close(figure)
 
 
-def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4) -> None:
-    """Some held-out episodes side by side, one after the other's end standing still."""
+def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, stride: int = 1) -> None:
+    """Some held-out episodes side by side, one after the other's end standing still; every so many frames of them."""
     env = gym.make_vec(f"clothgym:{env_id}", num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
     observations, _ = env.reset(seed=evaluate.HELD_OUT)
     frames, running = [], np.ones(episodes, bool)
@@ -58,4 +58,4 @@ def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str,
         running &= ~(terminated | truncated)
     frames += [np.concatenate(still, axis=1)] * 15
     env.close()
-    write_video(path, frames, fps=env.metadata["render_fps"])
+    write_video(path, frames[::stride], fps=env.metadata["render_fps"] / stride)

@@ -1,0 +1,307 @@
+"""Stages that are no scene of the gallery: an environment with somebody who acts in it, and a recording that is shown again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym.checks import indices, vector
+from clothgym.collisions.shapes import FRICTION
+from clothgym.envs.episode import within_ball
+from clothgym.envs.task import HELD
+from clothgym.material import PRESETS
+from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
+from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stability, visible
+from clothgym.playground.world import FIGURES as SLIDERS
+from clothgym.playground.world import Settings, hint
+from clothgym.registration import ENVIRONMENTS
+from clothgym.render import Solid
+from clothgym.render.renderer import MARKER_RADIUS
+from clothgym.simulation import Simulation
+from clothgym.wind import Wind
+
+Policy = Callable[[Any, NDArray], NDArray]  # (environment, observation) -> action
+BOXED = ("integrator", "bending", "strain_limit", "self_collision", "wind", "gust")  # what an environment is made with
+
+
+KEPT_NOTES = ("judgement", "run", "air")  # which a change of settings leaves true
+
+
+def expert(env: Any, observation: NDArray) -> NDArray:
+    """What the task's scripted expert does."""
+    return env.expert_action()
+
+
+def nothing(env: Any, observation: NDArray) -> NDArray:
+    """What keeps the hands where they are."""
+    return np.zeros(env.action_space.shape, np.float32)
+
+
+def chance(env: Any, observation: NDArray) -> NDArray:
+    """Random actions, drawn from the action space's own generator."""
+    return env.action_space.sample()
+
+
+POLICIES: dict[str, Policy] = {"expert": expert, "nothing": nothing, "chance": chance}
+
+
+def env_named(name: str) -> str:
+    """The id without its namespace.
+
+    Raises:
+        ValueError: no environment is registered under it.
+    """
+    bare = name.removeprefix("clothgym:")
+    if bare not in ENVIRONMENTS:
+        raise ValueError(f"no environment {name!r}{hint(bare, ENVIRONMENTS)} (there are: {', '.join(ENVIRONMENTS)})")
+    return bare
+
+
+class EpisodeStage(Stage):
+    """An environment, and who acts in it.
+
+    Args:
+        env_id: a registered id, with or without its namespace.
+        policies: who may act, by name, besides the expert, chance and nobody.
+        policy: who does at first.
+
+    Raises:
+        ValueError: no such environment or policy.
+    """
+
+    def __init__(self, env_id: str, policies: Mapping[str, Policy] | None = None, policy: str = "expert", seed: int = 0) -> None:
+        super().__init__()
+        self.name, self.seed = env_named(env_id), seed
+        self.policies = {**POLICIES, **(policies or {})}
+        self._given: dict[str, Any] | None = None
+        self.choose(policy)
+        if self._given is None:
+            self._begin({})
+
+    def _begin(self, given: Mapping[str, Any]) -> None:
+        """Open the environment with these options of its own, anew."""
+        self._options = dict(given)
+        self.env = self._made()
+        self._given = dict(given)
+        task = self.env.task
+        self.about = f"{(type(self.env).__doc__ or '').strip().splitlines()[0]}"
+        s = task.simulation
+        self._own = self.settings = settings_of(s, task.wind)
+        self.recording = Recording(self.name, s.mesh, s.time_step, task.camera(), (s.integrator.name,), task.strain_shown)
+        self.reset()
+
+    def _made(self) -> Any:
+        return gym.make(f"clothgym:{self.name}", **self._options).unwrapped
+
+    @property
+    def simulation(self) -> Simulation:
+        return self.env.task.simulation
+
+    @property
+    def over(self) -> bool:
+        return self._over
+
+    def choose(self, policy: str) -> None:
+        """Let somebody else act, from now on; who was trained with other options finds them in an environment that is made anew.
+
+        Raises:
+            ValueError: nobody has that name.
+        """
+        if policy not in self.policies:
+            raise ValueError(f"no policy {policy!r}{hint(policy, self.policies)} (there are: {', '.join(self.policies)})")
+        trained = getattr(self.policies[policy], "env_kwargs", None)
+        if trained is not None and trained != self._given:
+            self._begin(trained)
+            told = ", ".join(f"{name}={value!r}" for name, value in trained.items()) or "the environment's own options"
+            self.notes["run"] = f"As {policy} was trained, with {told}."
+        self.policy = policy
+
+    def reset(self, seed: int | None = None) -> None:
+        self.seed = self.seed if seed is None else int(seed)
+        self._observation, _ = self.env.reset(seed=self.seed)
+        self.env.action_space.seed(self.seed)
+        # an episode begins with the task's own figures
+        set_in_place(self.simulation, self._own, self.settings)
+        self._dragged: dict[int, NDArray] = {}
+        self._closed = np.full(len(self.hands()), self.env.task.hand_actions > 3 and not len(self.simulation.grippers))
+        self._over, self._time, self._cost, self.total = False, 0.0, 0.0, 0.0
+        self.notes.pop("judgement", None)
+        wind = self.env.task.wind
+        if wind is not None and wind.speed[0] != wind.speed[1]:
+            self.notes["air"] = "Each episode draws its wind, at most what the sliders show, from any side."
+        else:
+            self.notes.pop("air", None)
+        self.recording.frames[:] = [self._look({})]
+
+    def advance(self) -> Frame:
+        if self._over:
+            return self.frame
+        action = np.asarray(self.policies[self.policy](self.env, self._observation), np.float32)
+        if self._dragged:
+            action = self._steered(action)
+        begun = time.perf_counter()
+        self._observation, reward, terminated, truncated, info = self.env.step(action)
+        self._cost = time.perf_counter() - begun
+        self._time += self.simulation.time_step
+        self.total += reward
+        self._over = terminated or truncated
+        if self._over:
+            self.notes["judgement"] = _judgement(info, self.total)
+        return self._keep(self._look(info["reward_terms"]))
+
+    def _look(self, terms: Mapping[str, float]) -> Frame:
+        s, task = self.simulation, self.env.task
+        markers = [mark if isinstance(mark, Solid) else _dot(*mark) for mark in task.markers(0)]
+        return Frame(
+            time=self._time,
+            positions=visible(s.positions),
+            stiffness=stiffness(s)[None],
+            touching=touching(s)[None],
+            solids=(*task.solids(0), *markers),
+            readings={
+                name: np.array([value])
+                for name, value in read(s, self._cost, float(s.penetration()[0]) if s.colliders else 0.0).items()
+            },
+            terms={name: float(value) for name, value in terms.items()},
+        )
+
+    # --- settings -------------------------------------------------------------------------------------------------------
+
+    def change(self, **changes: Any) -> None:
+        before = self.settings
+        if changes.get("integrator", before.integrator) != before.integrator:
+            changes = {"substeps": "auto"} | changes  # the task's number is for its own method
+        after = before.changed(**changes)
+        self.notes = {k: v for k, v in self.notes.items() if k in KEPT_NOTES}
+        if any(getattr(after, name) != getattr(before, name) for name in BOXED):
+            self._rebuild(after)
+        unbounded = set_in_place(self.simulation, before, after)
+        if unbounded:
+            self.notes["substeps"] = unbounded
+        self.settings = after
+        self.recording.labels = (self.simulation.integrator.name,)
+
+    def _rebuild(self, after: Settings) -> None:
+        """Make the environment anew, and go on with the episode if its state fits; else begin it again."""
+        old, options, state = self.env, self._options, self.env.get_state()
+        self._options = (self._given or {}) | {
+            "integrator": after.integrator,
+            "bending": after.bending,
+            "strain_limit": after.strain_limit,
+            "self_collision": after.self_collision != "off" and after.self_collision,
+        }
+        if (after.wind, after.gust) != (self._own.wind, self._own.gust):
+            self._options["wind"] = {"speed": [after.wind, after.wind], "direction": [0.0, 0.0], "gust": after.gust}
+        try:
+            self.env = self._made()
+            self.env.reset(seed=self.seed)
+        except ValueError:
+            self.env, self._options = old, options
+            raise
+        blows = (after.wind, after.gust) != (self.settings.wind, self.settings.gust)  # an episode's wind is drawn as it begins
+        if blows or not self._goes_on(state):
+            self.reset()
+            self.notes["anew"] = "This cannot change within an episode: it has begun again."
+
+    def _goes_on(self, state: Any) -> bool:
+        """Take an episode over, if it fits."""
+        try:
+            self.env.set_state(state)
+        except ValueError:
+            return False
+        return True
+
+    def stabilities(self) -> list[Stability]:
+        return [stability(self.simulation)]
+
+    # --- hands ----------------------------------------------------------------------------------------------------------
+
+    def hands(self) -> list[Hand]:
+        s = self.simulation
+        anchors, grippers = len(s.anchors), len(s.grippers)
+        holds = [*s.attached[0], *(s.grippers.held[0] > 0 if grippers else [])]
+        names = [f"clip {k + 1}" for k in range(anchors)] + [f"gripper {k + 1}" for k in range(grippers)]
+        return [
+            Hand(name, x, bool(h), k >= anchors or bool(h)) for k, (name, x, h) in enumerate(zip(names, s.hand_positions[0], holds))
+        ]
+
+    def drag(self, hand: int, place: ArrayLike | None) -> None:
+        indices("hand", [hand], self.env.task.num_hands, "the hands of this task")
+        if place is None:
+            self._dragged.pop(hand, None)
+        else:
+            self._dragged[hand] = vector("place", place)
+
+    def hold(self, hand: int, holds: bool) -> None:
+        indices("hand", [hand], self.env.task.num_hands, "the hands of this task")
+        self._closed[hand] = holds
+        self._dragged.setdefault(hand, self.simulation.hand_positions[0, hand])
+
+    def _steered(self, action: NDArray) -> NDArray:
+        """The action in which dragged hands go where the visitor has them, as fast as the task lets them."""
+        task = self.env.task
+        moves = action.reshape(task.num_hands, task.hand_actions).copy()
+        for hand, place in self._dragged.items():
+            away = place - task.episode["targets"][0, hand]
+            moves[hand, :3] = within_ball(away / (task.physics.hand_speed * task.physics.time_step))
+            if task.hand_actions > 3:
+                moves[hand, 3] = -1.0 if self._closed[hand] else 1.0
+        return moves.ravel().astype(np.float32)
+
+
+class Replay(Stage):
+    """A recording, shown again: all its frames are there at once, and nothing in it can be changed."""
+
+    def __init__(self, recording: Recording, name: str = "replay") -> None:
+        super().__init__()
+        self.name, self.seed = name, 0
+        count = len(recording.frames)
+        self.about = f"A recording of {recording.title}: {count} frames, {count * recording.time_step:.1f} s."
+        self.settings, self.recording = Settings(), recording
+
+    @property
+    def over(self) -> bool:
+        return True
+
+    def advance(self) -> Frame:
+        return self.frame
+
+    def reset(self, seed: int | None = None) -> None:
+        """It begins where it begins."""
+
+    def change(self, **changes: Any) -> None:
+        raise ValueError("a recording cannot be changed: choose a scene or an environment")
+
+
+def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
+    """The settings that a task's simulation has; of a wind that each episode draws, the largest speed."""
+    material, state = simulation.material, simulation.get_state()
+    return Settings(
+        gravity=round(-float(state.gravity[0, 2]), 6),
+        wind=0.0 if wind is None else float(wind.speed[1]),
+        gust=0.0 if wind is None else float(wind.gust),
+        fabric=next(name for name, preset in PRESETS.items() if preset.source == material.source),
+        **{name: getattr(material, name) for name in SLIDERS},
+        friction=round(float(state.colliders[0, 0, FRICTION]), 6) if simulation.colliders else 0.4,
+        integrator=simulation.integrator.name,
+        bending=simulation.bending.name,
+        strain_limit=simulation.strain_limit,
+        substeps=simulation.substeps,
+    )
+
+
+def _dot(center: Any, color: tuple[int, int, int] = HELD) -> Solid:
+    x, y, z = np.asarray(center, float).tolist()
+    return Solid(kind="sphere", center=(x, y, z), radius=MARKER_RADIUS, color=color)
+
+
+def _judgement(info: Mapping[str, Any], total: float) -> str:
+    if info["failure"]:
+        return f"The episode failed: {info['failure'].replace('_', ' ')}. Return {total:.2f}."
+    outcome = "a success" if info["is_success"] else "no success"
+    return f"Judged: {outcome}, performance {info['normalized_performance']:.2f}, return {total:.2f}."

@@ -1,0 +1,78 @@
+"""What a visitor takes home: a picture, a film, meshes, or the recording itself."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from clothgym.playground.pictures import joined, painter, together, write_moving_mesh
+from clothgym.playground.recording import Frame, Recording
+from clothgym.playground.stage import Stage
+from clothgym.render import Camera, MeshSequence
+from clothgym.render.export import write_picture, write_video
+
+KINDS = {
+    "png": "picture (PNG)",
+    "gif": "film (GIF)",
+    "mp4": "film (MP4)",
+    "obj": "meshes (OBJ, zipped)",
+    "glb": "moving mesh (glTF)",
+    "npz": "recording (NPZ)",
+}
+PICTURE, FILM = 960, 480  # pixels of a side
+LONGEST = 300  # frames of a film or of meshes, the last of the recording
+
+
+def made(kind: str, stage: Stage, moment: int, camera: Any, color: str = "fabric") -> tuple[str, bytes]:
+    """A file's name and content: of the frame at ``moment``, or of the frames up to it, seen by a viewer's camera; color: of
+    pictures and films, "fabric" or "strain".
+
+    Raises:
+        ValueError: no such kind.
+        ImportError: a library that this kind needs is missing; the message says how to get it.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"file kind={kind!r}: must be one of {', '.join(KINDS)}")
+    recording = stage.recording
+    frames = recording.frames[max(0, moment + 1 - LONGEST) : moment + 1]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{stage.name}.{kind}"
+        if kind == "png":
+            write_picture(path, painter(recording, PICTURE, 3, color, _seen(camera))(frames[-1]))
+        elif kind in ("gif", "mp4"):
+            draw = painter(recording, FILM, 2, color, _seen(camera))
+            write_video(path, map(draw, frames), fps=1 / recording.time_step)
+        elif kind == "glb":
+            write_moving_mesh(path, recording, frames, 1 / recording.time_step)
+        elif kind == "npz":
+            recording.save(path)
+        else:
+            return f"{stage.name}_obj.zip", _zipped(_sequence(Path(folder) / "frames", recording, frames))
+        return path.name, path.read_bytes()
+
+
+def _seen(camera: Any) -> Camera:
+    """A viewer's camera, lifted above the floor."""
+    x, y, z = np.asarray(camera.position, float).tolist()
+    fov = float(np.degrees(camera.fov))
+    target = tuple(np.asarray(camera.look_at, float).tolist())
+    return Camera(eye=(x, y, max(z, 0.02)), target=target, vertical_fov=fov)  # type: ignore[arg-type]
+
+
+def _sequence(folder: Path, recording: Recording, frames: Sequence[Frame]) -> list[Path]:
+    sequence = MeshSequence(folder, *joined(recording), "obj")
+    return [sequence.add(together(frame), frame.solids) for frame in frames]
+
+
+def _zipped(paths: list[Path]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in paths:
+            archive.write(path, path.name)
+    return buffer.getvalue()

@@ -1,0 +1,425 @@
+"""The page of one visitor: controls, readings and what is saved.  It knows a viewer's interface, not the library behind it."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from queue import Empty, SimpleQueue
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.bending import BENDING
+from clothgym.integrators import INTEGRATORS
+from clothgym.material import PRESETS
+from clothgym.playground import files
+from clothgym.playground.plots import Plots
+from clothgym.playground.readings import legend, told
+from clothgym.playground.show import MODES, Show
+from clothgym.playground.stage import REBUILDS, SceneStage, Stage
+from clothgym.simulation import GRAVITY
+
+NONE = "none"
+SIDE_BY_SIDE = 0.55  # by which share of that it goes back for each sheet more
+NARROWER = 0.35  # and for each sheet more whose readings take from the view's width
+ROOM = 1.25  # the page's eye is so many times as far away as a picture's: panels take from its width
+HANDS = 4  # that a visitor can make take hold or let go
+MOST_SUBSTEPS = 400
+LEFT, COLUMN = 290, 75  # width of the left panel, and what it takes more for a third and a fourth sheet's readings [pixels]
+READ_EVERY = 0.2  # seconds between two looks at numbers and plots: nobody reads faster
+# sliders: setting, label, largest value, step, what a unit of the slider is in the setting's own, and a hint
+WORLD = (
+    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from nothing to the Earth's"),
+    ("wind", "wind m/s", 12.0, 0.1, 1.0, "its steady part, to the right"),
+    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "root mean square of each component"),
+    ("friction", "friction", 1.0, 0.01, 1.0, "Coulomb's coefficient of the solids"),
+)
+CLOTH = (
+    ("stretch_stiffness", "threads N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
+    ("shear_stiffness", "diagonals N/m", 1000.0, 1.0, 1.0, "shear stiffness: shear modulus times thickness"),
+    ("bend_rigidity", "bending µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
+    ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
+    ("air_drag", "calm N s/m³", 3.0, 0.01, 1.0, "linear drag, in which swings come to rest"),
+    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, kept by force; zero for none"),
+)
+
+
+class Page:
+    """One visitor's page.
+
+    Args:
+        client: viser's, or a ``NullClient``.
+        open_stage: makes the stage of a name.
+        choices: what there is to choose, names by title.
+        start: the name of the first.
+
+    ``tick`` is called by one thread alone; what a visitor does comes in a queue.
+    """
+
+    def __init__(self, client: Any, open_stage: Callable[[str], Stage], choices: Mapping[str, str], start: str) -> None:
+        self.client, self._open_stage, self.choices = client, open_stage, dict(choices)
+        self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self.playing, self.moment = True, 0
+        self._stale = True  # whether something is to be drawn
+        self._waiting: Any = None  # what tells that the next frame takes a while
+        self._fresh = False  # whether the stage has something that has not gone on yet, and may be compiled when it does
+        self.controls: dict[str, Any] = {}
+        self.stage: Stage
+        self.open(start)
+
+    # --- what a visitor does --------------------------------------------------------------------------------------------
+
+    def order(self, what: str, value: Any = None) -> None:
+        """Something that a visitor wants, to be done in the next tick."""
+        self._orders.put((what, value))
+
+    def tick(self) -> None:
+        """Do what was ordered, go on if it plays, and show what has changed."""
+        changes: dict[str, Any] = {}
+        drags: dict[int, NDArray | None] = {}
+        while True:
+            try:
+                what, value = self._orders.get_nowait()
+            except Empty:
+                break
+            if what == "drag":
+                # of several places on the way the last counts, but the end of it must not be lost
+                drags[value[0]] = value[1]
+                self._do(self.stage.drag, *value)
+            elif what == "change":
+                changes |= value
+            else:
+                self._do(getattr(self, f"_{what}"), value)
+        self._change(changes)
+        if self.playing and not self._at_the_end:
+            self.playing = self._do(self._advance)
+        if self._stale:
+            self._do(self._draw)
+            self._stale = False
+        if self._waiting is not None:
+            self._waiting.remove()
+            self._waiting = None
+
+    @property
+    def _at_the_end(self) -> bool:
+        """Whether nothing more is to come."""
+        return self.stage.over and self.moment == len(self.stage.recording.frames) - 1
+
+    def _advance(self) -> None:
+        """Go on to the next frame: of what is over, to one that there is."""
+        if self.stage.over:
+            self.moment = min(self.moment + 1, len(self.stage.recording.frames) - 1)
+            return
+        if self._fresh:
+            self._wait("Made anew.")
+        self._fresh = False
+        self.stage.advance()
+        self.moment = len(self.stage.recording.frames) - 1
+
+    def _wait(self, why: str) -> None:
+        """Tell the visitor to, until the next frame is there: what is new may have to be compiled before it goes on."""
+        self._fresh = True
+        if self._waiting is None:
+            words = f"{why} The first time on a machine it is compiled, which takes up to a minute."
+            self._waiting = self.client.add_notification("One moment", words, loading=True)
+
+    def _do(self, deed: Callable[..., Any], *values: Any) -> bool:
+        """Do something, and whether it could be done; what cannot be is told in a sentence."""
+        self._stale = True
+        try:
+            deed(*values)
+        except (ValueError, OSError, ImportError) as error:
+            self.client.add_notification("That cannot be", str(error), color="orange", auto_close_seconds=12.0)
+        except Exception as error:  # policies and recordings are anybody's
+            traceback.print_exc(file=sys.stderr)
+            self.playing = False
+            words = f"It stands still: {type(error).__name__}, {error}. Reset it, or choose who acts or another scene."
+            self.client.add_notification("Something failed", words, color="red", auto_close_seconds=20.0)
+        else:
+            return True
+        return False
+
+    def _change(self, changes: Mapping[str, Any]) -> None:
+        changes = {name: value for name, value in changes.items() if getattr(self.stage.settings, name) != value}
+        if not changes:
+            return
+        if any(name in REBUILDS for name in changes):
+            self._wait("Made anew.")
+        self._do(lambda: self.stage.change(**changes))
+        if "strain_limit" in changes and isinstance(self.stage, SceneStage):
+            self._do(self._compare)
+        self._fill()
+
+    def open(self, name: str) -> None:
+        """Show another scene, environment or recording."""
+        self.stage = self._open_stage(name)
+        self.playing, self.moment = True, 0
+        if not self.controls:
+            self._build()
+        self._suit()
+        self._see()
+
+    def _open(self, name: str) -> None:
+        if name != self.stage.name:
+            self._wait(f"Opening {name}.")
+            self.open(name)
+
+    def _press(self, button: str) -> None:
+        if button == "reset":
+            self.stage.reset(int(self.controls["seed"].value))
+            self.moment, self.playing = 0, True
+        elif button == "step":
+            self.playing = False
+            self._advance()
+        else:
+            self.playing = not self.playing
+
+    def _scrub(self, moment: float) -> None:
+        """Show a frame of the past."""
+        self.playing, self.moment = False, min(int(moment), len(self.stage.recording.frames) - 1)
+
+    def _compare(self, _: Any = None) -> None:
+        assert isinstance(self.stage, SceneStage)
+        names = [self.controls[f"compared {k}"].value for k in range(4)]
+        chosen = [name for name in names if name != NONE] if self.controls["compare"].value else []
+        limit = self.stage.settings.strain_limit
+        unlimited = bool(self.controls["unlimited"].value) and limit is not None and not chosen
+        if (tuple(chosen), unlimited) != (self.stage.compared, self.stage.unlimited):
+            self._wait("Comparing." if chosen or unlimited else "Made anew.")
+            self.stage.compare(chosen, unlimited)
+            self.moment = 0
+            self.controls["show"].value = "fabric"  # in which each method has a colour
+            more = len(self.stage.sheets) - 1
+            self._stand_back(1 + SIDE_BY_SIDE * more + NARROWER * max(0, more - 1))
+            self.panel.set_width(LEFT + COLUMN * max(0, more - 1))
+            self._see()
+
+    def _choose(self, policy: str) -> None:
+        before = self.stage.recording
+        self.stage.choose(policy)  # type: ignore[attr-defined]
+        if self.stage.recording is not before:  # it was trained in an environment with other options
+            self.moment = 0
+            self._see()
+
+    def _hold(self, value: tuple[int, bool]) -> None:
+        hand, holds = value
+        if self.stage.hands()[hand].holds != holds:
+            self.stage.hold(hand, holds)
+
+    def _look(self, _: Any = None) -> None:
+        """Only what is shown has changed."""
+
+    def _save(self, kind: str) -> None:
+        waiting = self.client.add_notification("One moment", f"Making {files.KINDS[kind]}.", loading=True)
+        color = "strain" if self.controls["show"].value == "strain" else "fabric"
+        try:
+            name, content = files.made(kind, self.stage, self.moment, self.client.camera, color)
+        finally:
+            waiting.remove()
+        self.client.send_file_download(name, content)
+
+    # --- controls -------------------------------------------------------------------------------------------------------
+
+    def _build(self) -> None:
+        """All controls, once; ``_suit`` shows those that the open stage has."""
+        gui, add = self.client.gui, self._add
+        add("about", gui.add_markdown(""))
+        add("scene", gui.add_dropdown("scene", tuple(self.choices)))
+        self._ordered(self.controls["scene"], "open", lambda title: self.choices[title])
+        add("notes", gui.add_markdown(""))
+        with gui.add_folder("Time"):
+            self._add_time(gui)
+        with add("World", gui.add_folder("World")):
+            self._add_sliders(gui, WORLD)
+        with add("Cloth", gui.add_folder("Cloth")):
+            self._menu(gui, "fabric", "fabric", PRESETS)
+            self._add_sliders(gui, CLOTH)
+            hint = "begins anew with a second, pale sheet: the same without the limit"
+            self._ordered(self._add("unlimited", gui.add_checkbox("without the limit, too", False, hint=hint)), "compare")
+        with add("Method", gui.add_folder("Method")):
+            self._add_method(gui)
+        with add("Compare", gui.add_folder("Compare")):
+            self._add_comparison(gui)
+        with gui.add_folder("Save"):
+            kinds = add("kind", gui.add_dropdown("as", tuple(files.KINDS.values()), initial_value=files.KINDS["png"]))
+            names = {told: kind for kind, told in files.KINDS.items()}
+            self._ordered(add("save", gui.add_button("Save")), "save", lambda _: names[kinds.value])
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(340)
+        panel = self.panel = gui.add_panel()
+        panel.dock_left()
+        panel.set_width(LEFT)
+        with panel.add_tab("What it does"):
+            self._add_view(gui)
+            add("readings", gui.add_markdown(""))
+            self.plots = Plots(gui)
+
+    def _suit(self) -> None:
+        """Show the controls that the open stage has, at its settings, and look at it from where it is seen well."""
+        stage, controls = self.stage, self.controls
+        simulated = bool(stage.stabilities())
+        controls["about"].content = stage.about
+        controls["scene"].value = next(title for title, name in self.choices.items() if name == stage.name)
+        for name, shown in (
+            ("World", simulated),
+            ("Cloth", simulated),
+            ("Method", simulated),
+            ("Compare", isinstance(stage, SceneStage)),
+        ):
+            controls[name].visible = shown
+        controls["compare"].value = controls["unlimited"].value = False
+        controls["seed"].value = stage.seed
+        policies = tuple(getattr(stage, "policies", ()))
+        controls["policy"].visible = bool(policies)
+        if policies:
+            controls["policy"].options = policies
+            controls["policy"].value = stage.policy  # type: ignore[attr-defined]
+        hands = dict(enumerate(hand for hand in stage.hands()[:HANDS] if hand.draggable))
+        controls["handles"].visible = bool(hands)
+        controls["handles"].value = any(hand.holds for hand in hands.values()) and isinstance(stage, SceneStage)
+        for number in range(HANDS):
+            controls[f"hand {number}"].visible = number in hands
+            if number in hands:
+                controls[f"hand {number}"].label = f"{hands[number].name} holds"
+                controls[f"hand {number}"].value = hands[number].holds
+        controls["show"].value = "strain" if stage.name == "patch" else "fabric"
+        self.panel.set_width(LEFT)
+        self._stand_back(1.0)
+
+    def _stand_back(self, share: float) -> None:
+        """Look at the stage from where it is seen well, so many times as far away."""
+        camera = self.stage.recording.camera
+        back = np.subtract(camera.eye, camera.target) * ROOM * share
+        self.client.camera.position, self.client.camera.look_at = tuple(camera.target + back), camera.target
+        self.client.camera.near = 0.1  # a sheet is near its solid: depth must tell them apart
+        self.client.camera.fov = float(np.radians(camera.vertical_fov))
+
+    def _add(self, name: str, control: Any) -> Any:
+        self.controls[name] = control
+        return control
+
+    def _ordered(self, control: Any, what: str, meant: Callable[[Any], Any] = lambda value: value) -> None:
+        """Let a control order something when a visitor turns it, and not when we put it somewhere."""
+
+        def turned(event: Any) -> None:
+            if event.client_id is not None:
+                self.order(what, meant(event.target.value))
+
+        (control.on_click if hasattr(control, "on_click") else control.on_update)(turned)
+
+    def _add_time(self, gui: Any) -> None:
+        buttons = gui.add_button_group("", ("play / pause", "step", "reset"))
+        self._ordered(self._add("time", buttons), "press")
+        self._add("state", gui.add_markdown(""))
+        self._add("seed", gui.add_number("seed", 0, min=0, step=1, hint="of the next reset"))
+        scrub = self._add(
+            "moment", gui.add_slider("moment", 0, 1, 1, 0, hint="frames that were shown; drag it back to see them again")
+        )
+        self._ordered(scrub, "scrub")
+        menu = self._add("policy", gui.add_dropdown("who acts", ("expert",)))
+        self._ordered(menu, "choose")
+
+    def _add_sliders(self, gui: Any, sliders: tuple[tuple[str, str, float, float, float, str], ...]) -> None:
+        for name, label, largest, step, unit, hint in sliders:
+            slider = self._add(name, gui.add_slider(label, 0.0, largest, step, 0.0, hint=hint))
+
+            def meant(value: float, name: str = name, unit: float = unit) -> dict[str, float | None]:
+                given = round(value * unit, 12)
+                return {name: None if name == "strain_limit" and not given else given}
+
+            self._ordered(slider, "change", meant)
+
+    def _menu(self, gui: Any, name: str, label: str, names: Any, hint: str | None = None) -> None:
+        menu = self._add(name, gui.add_dropdown(label, tuple(names), hint=hint))
+        self._ordered(menu, "change", lambda value: {name: value})
+
+    def _add_method(self, gui: Any) -> None:
+        self._menu(gui, "integrator", "integrator", INTEGRATORS)
+        self._menu(gui, "bending", "bending", BENDING)
+        self._menu(gui, "self_collision", "with itself", ("off", "fast", "strict"), "contact of the sheet with itself")
+        auto = self._add("auto", gui.add_checkbox("by the bound", True, hint="substeps follow the integrator's bound"))
+        substeps = self._add("substeps", gui.add_slider("substeps", 1, MOST_SUBSTEPS, 1, 1))
+
+        for control in (auto, substeps):
+            self._ordered(control, "change", lambda _: {"substeps": "auto" if auto.value else int(substeps.value)})
+
+    def _add_comparison(self, gui: Any) -> None:
+        on = self._add(
+            "compare", gui.add_checkbox("compare", False, hint="two to four integrators, a sheet each, with the same settings")
+        )
+        self._ordered(on, "compare")
+        for k, first in enumerate(("semi_implicit_euler", "xpbd", NONE, NONE)):
+            menu = self._add(f"compared {k}", gui.add_dropdown(f"sheet {k + 1}", (NONE, *INTEGRATORS), initial_value=first))
+            self._ordered(menu, "compare")
+
+    def _add_view(self, gui: Any) -> None:
+        self._add("show", gui.add_dropdown("colour by", MODES))
+        self._add("legend", gui.add_html(""))
+        self._add("diagonals", gui.add_checkbox("diagonals, too", False))
+        self._add("handles", gui.add_checkbox("handles to drag", False))
+        for name in ("show", "diagonals", "handles"):
+            self._ordered(self.controls[name], "look")
+        for number in range(HANDS):
+            box = self._add(f"hand {number}", gui.add_checkbox("holds", False))
+            self._ordered(box, "hold", lambda holds, number=number: (number, bool(holds)))  # type: ignore[misc]
+
+    # --- what is shown --------------------------------------------------------------------------------------------------
+
+    def _see(self) -> None:
+        """The nodes of the stage's recording."""
+        self.show = Show(self.client.scene, self.stage.recording, lambda hand, place: self.order("drag", (hand, place)))
+        self.plots.begin(self.stage.recording)
+        self._stale, self._read_at = True, -READ_EVERY
+        self._fill()
+
+    def _fill(self) -> None:
+        """Put the controls to the settings; those that are there already are no new orders."""
+        settings, controls = self.stage.settings, self.controls
+        for name, _, largest, _, unit, _ in (*WORLD, *CLOTH):
+            value = round((getattr(settings, name) or 0.0) / unit, 9)
+            controls[name].max = max(largest, value)
+            controls[name].value = value
+        for name in ("fabric", "integrator", "bending", "self_collision"):
+            controls[name].value = getattr(settings, name)
+        compared = isinstance(self.stage, SceneStage) and bool(self.stage.compared)
+        controls["unlimited"].visible = isinstance(self.stage, SceneStage) and settings.strain_limit is not None and not compared
+        controls["integrator"].visible = not compared
+        stabilities = self.stage.stabilities()
+        if stabilities:
+            now = round(stabilities[0].time_step / stabilities[0].substep)
+            controls["auto"].value = settings.substeps == "auto"
+            controls["substeps"].disabled = settings.substeps == "auto"
+            controls["substeps"].max = max(MOST_SUBSTEPS, now)
+            controls["substeps"].value = now
+
+    def _draw(self) -> None:
+        frames = self.stage.recording.frames
+        self.moment = min(self.moment, len(frames) - 1)
+        mode = self.controls["show"].value
+        with self.client.atomic():
+            self.show.draw(frames[self.moment], mode, bool(self.controls["diagonals"].value))
+            if self.moment == len(frames) - 1:
+                self.show.draw_hands(self.stage.hands(), bool(self.controls["handles"].value))
+        state = "■ over: reset to begin again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
+        if self.controls["state"].content != state:
+            self.controls["state"].content = state
+        now = time.monotonic()
+        if now - self._read_at >= READ_EVERY or not self.playing or self._at_the_end:
+            self._read_at = now
+            self._read(mode)
+
+    def _read(self, mode: str) -> None:
+        """Numbers, plots and notes."""
+        frames, controls = self.stage.recording.frames, self.controls
+        frame = frames[self.moment]
+        controls["moment"].max = max(1, len(frames) - 1)
+        controls["moment"].value = self.moment
+        controls["notes"].content = "\n\n".join(f"> {note}" for note in self.stage.notes.values())
+        controls["readings"].content = told(self.stage.recording, frame, self.stage.stabilities())
+        controls["legend"].content = legend(self.stage.recording, frame, mode)
+        for number, hand in enumerate(self.stage.hands()[:HANDS]):
+            controls[f"hand {number}"].value = hand.holds
+        self.plots.draw(frames[: self.moment + 1])

@@ -1,0 +1,251 @@
+"""The scenes of the playground."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.collisions import Box, Capsule, MeshCollider, Plane, Sphere
+from clothgym.mesh import ClothMesh, grid
+from clothgym.playground.world import Scene, Settings, Targets, hint
+from clothgym.render import Camera, Solid
+
+STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colours of solids
+CALM = 0.75  # linear drag in which slow swings come to rest [N s/m^3]
+
+
+def turned_on_a_lathe(profile: NDArray, segments: int = 40) -> tuple[NDArray, NDArray]:
+    """The solid that a profile of radii and heights [m], (points, 2), from the axis below to the axis above, makes as it turns:
+    vertices (vertices, 3) and triangles (triangles, 3), counter-clockwise from outside."""
+    angles = np.arange(segments) * 2 * np.pi / segments
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    inner = profile[1:-1]
+    rings = np.concatenate([inner[:, None, :1] * ring, np.broadcast_to(inner[:, None, 1:], (len(inner), segments, 1))], axis=2)
+    poles = [(0.0, 0.0, profile[0, 1]), (0.0, 0.0, profile[-1, 1])]
+    vertices = np.concatenate([rings.reshape(-1, 3), poles])
+    k, after = np.arange(segments), np.roll(np.arange(segments), -1)
+    triangles = []
+    for row in range(len(inner) - 1):
+        a, b = row * segments, (row + 1) * segments
+        triangles += [np.stack([a + k, a + after, b + after], 1), np.stack([a + k, b + after, b + k], 1)]
+    bottom, top, last = len(vertices) - 2, len(vertices) - 1, (len(inner) - 1) * segments
+    triangles.append(np.stack([np.full(segments, bottom), after, k], 1))
+    triangles.append(np.stack([np.full(segments, top), last + k, last + after], 1))
+    return vertices, np.concatenate(triangles)
+
+
+def pawn(height: float = 0.5) -> tuple[NDArray, NDArray]:
+    """A pawn of a game of chess, its foot at z = 0: vertices [m] and triangles."""
+    angles = np.linspace(-0.3, 0.5, 11)[:-1] * np.pi
+    ball = np.stack([0.16 * np.cos(angles), 0.84 + 0.16 * np.sin(angles)], axis=1)
+    rise = np.linspace(0, 1, 8)
+    waist = np.stack([0.12 + 0.2 * (1 - rise) ** 2, 0.2 + 0.42 * rise], axis=1)
+    foot = np.array([(0, 0), (0.36, 0), (0.38, 0.04), (0.36, 0.12), (0.33, 0.15)])
+    collar = np.array([(0.2, 0.64), (0.21, 0.665), (0.2, 0.69)])
+    return turned_on_a_lathe(height * np.concatenate([foot, waist, collar, ball, [(0, 1)]]))
+
+
+# --- what moves ---------------------------------------------------------------------------------------------------------
+
+
+def walk(time: float) -> tuple[NDArray, float]:
+    """Where somebody is who walks a figure of eight [m], (3,), and which way they face [rad]; they set out slowly."""
+    phase = 0.9 * (time - 1.2 * (1 - np.exp(-time / 1.2)))
+    place = np.array([0.5 * np.sin(phase), 0.22 * np.sin(2 * phase), 0.012 * np.sin(8 * phase)])
+    facing = np.arctan2(0.44 * np.cos(2 * phase), 0.5 * np.cos(phase))
+    return place, float(facing)
+
+
+COLLAR = np.linspace(-1.45, 1.45, 7)  # angles of the cape's anchors about the neck, from the back [rad]
+SHOULDERS, HEM, NECK = 0.16, 0.3, 1.08  # radii of the cape at the collar and at the hem, and the height of the collar [m]
+TORSO, HEAD = np.array([0.0, 0.0, 0.63]), np.array([0.0, 0.0, 1.26])
+
+
+def wear_the_cape(time: float) -> tuple[NDArray, Targets]:
+    """The collar's anchors about the neck of somebody who walks, and the torso and the head in it."""
+    place, facing = walk(time)
+    way = facing + np.pi + COLLAR
+    collar = np.stack([SHOULDERS * np.cos(way), SHOULDERS * np.sin(way), np.full(len(way), NECK)], axis=1)
+    return place + collar, {1: place + TORSO, 2: place + HEAD}
+
+
+def lay_down(time: float) -> tuple[NDArray, Targets]:
+    """Two corners that are lowered to the floor while they sway, so that the sheet comes to lie on itself."""
+    height = max(0.64 - 0.16 * time, 0.02)
+    sway = 0.13 * np.sin(2 * np.pi * time / 2.0) * min(time, 1.0)
+    return np.array([(-0.3, sway, height), (0.3, sway, height)]), {}
+
+
+TITLES = {
+    "patch": "Pinned patch",
+    "flag": "Flag in gusty wind",
+    "sphere": "Sheet over a sphere",
+    "box": "Sheet over a box",
+    "pawn": "Sheet over a mesh",
+    "cape": "Cape on moving shoulders",
+    "fold": "Cloth that folds on itself",
+}
+
+
+# --- the gallery --------------------------------------------------------------------------------------------------------
+
+
+def hung(mesh: ClothMesh, top: float) -> NDArray:
+    """A grid that hangs straight down from its last row, in the plane y = 0 [m], (particles, 3)."""
+    x = mesh.rest_positions[:, [0, 2, 1]].copy()
+    return x + (0, 0, top - x[:, 2].max())
+
+
+def pinned_patch() -> Scene:
+    mesh = grid(17, 17, 0.6, 0.6)
+    return Scene(
+        name="patch",
+        title=TITLES["patch"],
+        about="A little patch, pinned at two corners. Pull the gravity slider, and watch the threads take up the load.",
+        mesh=mesh,
+        start=mesh.rest_positions + (0, 0, 0.8),
+        settings=Settings(gravity=0.0, fabric="knit", air_drag=CALM),
+        anchors=mesh.corners[2:],
+        names=("left pin", "right pin"),
+        held=(0, 1),
+        handles=(0, 1),
+        camera=Camera(eye=(0.9, -1.3, 1.2), target=(0.0, 0.12, 0.5)),
+        strained=0.08,
+    )
+
+
+def flag() -> Scene:
+    mesh = grid(17, 25, 0.9, 0.6)
+    columns = mesh.grid_shape[1]
+    hoist = tuple(range((mesh.grid_shape[0] - 1) * columns, -1, -columns))
+    start = hung(mesh, 1.5)
+    pole = Solid(kind="capsule", center=(-0.462, 0.0, 0.79), radius=0.012, height=1.58, color=STEEL)
+    return Scene(
+        name="flag",
+        title=TITLES["flag"],
+        about="A flag of silk. The wind has a steady part and gusts; turn either down and it falls to the pole.",
+        mesh=mesh,
+        start=start,
+        settings=Settings(wind=6.0, gust=1.0, fabric="silk"),
+        anchors=(hoist,),
+        names=("hoist",),
+        held=(0,),
+        scenery=(pole,),
+        camera=Camera(eye=(0.35, -2.9, 1.45), target=(0.05, 0.0, 1.0)),
+        strained=0.03,
+    )
+
+
+def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, colour: tuple[int, int, int], top: float) -> Scene:
+    """A sheet that falls onto a solid; its corners can be taken."""
+    mesh = grid(25, 25, 0.9, 0.9)
+    return Scene(
+        name=name,
+        title=TITLES[name],
+        about=about,
+        mesh=mesh,
+        start=mesh.rest_positions + (0.02, 0.03, top + 0.14),
+        settings=Settings(air_drag=0.5),
+        anchors=mesh.corners,
+        names=("corner 1", "corner 2", "corner 3", "corner 4"),
+        handles=(0, 1, 2, 3),
+        colliders=(Plane(), solid),
+        colours={1: colour},
+        camera=Camera(eye=(1.25, -1.4, 0.95), target=(0.0, 0.0, 0.2)),
+        strained=0.03,
+    )
+
+
+def sphere() -> Scene:
+    about = "A sheet falls over a ball. Take a corner and pull it off."
+    return sheet_over("sphere", about, Sphere(center=(0, 0, 0.24), radius=0.22), SAGE, 0.46)
+
+
+def box() -> Scene:
+    solid = Box(center=(0, 0, 0.18), half_sides=(0.18, 0.18, 0.18), yaw=0.4)
+    return sheet_over("box", "A sheet falls over a box, and folds at its corners.", solid, OAK, 0.36)
+
+
+def sheet_over_pawn() -> Scene:
+    vertices, triangles = pawn()
+    solid = MeshCollider(vertices=vertices, triangles=triangles)
+    about = "A sheet falls over a chessman, which it knows as a mesh of triangles."
+    return sheet_over("pawn", about, solid, CLAY, 0.5)
+
+
+def cape() -> Scene:
+    mesh = grid(25, 25, 0.72, 0.8)
+    rows, columns = mesh.grid_shape
+    top = (rows - 1) * columns
+    row, column = np.divmod(np.arange(mesh.num_particles), columns)
+    across, down = 2 * column / (columns - 1) - 1, 1 - row / (rows - 1)
+    place, facing = walk(0.0)
+    # a part of a cone about the torso, wider at the hem
+    way, out = facing + np.pi + COLLAR[-1] * across, SHOULDERS + (HEM - SHOULDERS) * down
+    start = place + np.stack([out * np.cos(way), out * np.sin(way), NECK - 0.79 * down], axis=1)
+    return Scene(
+        name="cape",
+        title=TITLES["cape"],
+        about="A cape on the shoulders of somebody who walks a figure of eight.",
+        mesh=mesh,
+        start=start,
+        settings=Settings(fabric="wool", air_drag=0.2, friction=0.2),
+        anchors=tuple(np.linspace(top, top + columns - 1, len(COLLAR)).round().astype(int).tolist()),
+        names=tuple(f"collar {number + 1}" for number in range(len(COLLAR))),
+        held=tuple(range(len(COLLAR))),
+        colliders=(
+            Plane(),
+            Capsule(center=tuple(place + TORSO), radius=0.14, height=1.18),
+            Sphere(center=tuple(place + HEAD), radius=0.105),
+        ),
+        colours={1: STEEL, 2: (222, 190, 164)},
+        motion=wear_the_cape,
+        camera=Camera(eye=(-1.0, -3.1, 1.6), target=(0.0, 0.0, 0.66)),
+        strained=0.05,
+    )
+
+
+def folding() -> Scene:
+    mesh = grid(21, 21, 0.6, 0.6)
+    return Scene(
+        name="fold",
+        title=TITLES["fold"],
+        about="Two corners lower a sheet while they sway: it lies down on itself, and never passes through.",
+        mesh=mesh,
+        start=hung(mesh, 0.64),
+        settings=Settings(self_collision="strict", air_drag=0.5),
+        anchors=mesh.corners[2:],
+        names=("left corner", "right corner"),
+        held=(0, 1),
+        handles=(0, 1),
+        colliders=(Plane(),),
+        motion=lay_down,
+        rests=4.4,
+        camera=Camera(eye=(1.15, -1.35, 0.95), target=(0.0, 0.02, 0.24)),
+        strained=0.03,
+    )
+
+
+SCENES = {
+    "patch": pinned_patch,
+    "flag": flag,
+    "sphere": sphere,
+    "box": box,
+    "pawn": sheet_over_pawn,
+    "cape": cape,
+    "fold": folding,
+}
+
+
+@cache
+def scene_named(name: str) -> Scene:
+    """The scene of that name.
+
+    Raises:
+        ValueError: there is none; the message lists those that there are.
+    """
+    if name not in SCENES:
+        raise ValueError(f"no scene {name!r}{hint(name, SCENES)} (there are: {', '.join(SCENES)})")
+    return SCENES[name]()

@@ -1,0 +1,249 @@
+"""The server: a page for each visitor, who has a cloth of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import socket
+import sys
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from clothgym.playground.episode import EpisodeStage, Policy, Replay, env_named
+from clothgym.playground.page import Page
+from clothgym.playground.recording import Recording
+from clothgym.playground.scenes import SCENES, TITLES
+from clothgym.playground.show import furnish
+from clothgym.playground.stage import SceneStage, Stage
+from clothgym.playground.world import hint
+from clothgym.registration import ENVIRONMENTS
+
+LOOPBACK = "127.0.0.1"
+PORT = 8080
+REPLAY = "recording"
+EASE = 0.002  # shortest rest between two frames, in which the server's other threads have their turn [s]
+
+
+class Gallery:
+    """What can be shown, by name: scenes, environments, and a recording if there is one.
+
+    Args:
+        recording: to be shown again.
+        policies: who may act in an environment besides its expert: by the environment's id, and then by name.
+    """
+
+    def __init__(self, recording: Recording | None = None, policies: Mapping[str, Mapping[str, Policy]] | None = None) -> None:
+        self.recording, self.policies = recording, policies or {}
+        self.titles = {title: name for name, title in TITLES.items()} | {env_id: env_id for env_id in ENVIRONMENTS}
+        if recording is not None:
+            self.titles = {f"recording of {recording.title}": REPLAY} | self.titles
+
+    def checked(self, name: str) -> str:
+        """The name as it is kept.
+
+        Raises:
+            ValueError: there is nothing of that name.
+        """
+        bare = name.removeprefix("clothgym:")
+        known = list(self.titles.values())
+        if bare not in known:
+            raise ValueError(f"no scene or environment {name!r}{hint(bare, known)} (there are: {', '.join(known)})")
+        return bare
+
+    def open(self, name: str) -> Stage:
+        """The stage of that name, new."""
+        name = self.checked(name)
+        if name == REPLAY:
+            assert self.recording is not None
+            return Replay(self.recording, REPLAY)
+        if name in SCENES:
+            return SceneStage(name)
+        own = self.policies.get(env_named(name), {})
+        return EpisodeStage(name, own, next(iter(own), "expert"))
+
+
+class Visit:
+    """One visitor's page and the thread that it lives in, until they leave."""
+
+    def __init__(self, client: Any, gallery: Gallery, start: str) -> None:
+        self.page: Page | None = None
+        self.frames = 0
+        self.closed = threading.Event()
+        self._client, self._gallery, self._start = client, gallery, start
+        self.thread = threading.Thread(target=self._live, name=f"visit {client.client_id}", daemon=True)
+        self.thread.start()
+
+    def _live(self) -> None:
+        try:
+            self.page = Page(self._client, self._gallery.open, self._gallery.titles, self._start)
+            due = time.monotonic()
+            while not self.closed.is_set():
+                self.page.tick()
+                self.frames += 1
+                # a frame that is late is not made up for: the cloth is slow then, and no heap of frames waits
+                due = max(due + self.page.stage.recording.time_step, time.monotonic() + EASE)
+                self.closed.wait(due - time.monotonic())
+        except Exception:
+            # a visitor who has just left is no error; another one is told, and ends this visit alone
+            if not self.closed.wait(1.0):
+                traceback.print_exc(file=sys.stderr)
+                sorry = "Something went wrong, which the server's terminal shows. Load the page anew to begin again."
+                with contextlib.suppress(Exception):
+                    self._client.add_notification("This page has stopped", sorry, color="red")
+
+
+class Playground:
+    """A running server.
+
+    Attributes:
+        url: where the page is.
+        visits: the visitors', by the number of the client.
+    """
+
+    def __init__(self, gallery: Gallery, start: str, host: str = LOOPBACK, port: int = PORT) -> None:
+        viser = imported_viser()
+        free = free_port(host, port)
+        self.gallery, self.start = gallery, gallery.checked(start)
+        self.visits: dict[int, Visit] = {}
+        # a page that has just been closed may still be written to
+        warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+        with contextlib.redirect_stdout(io.StringIO()):  # its banner: our own line says where the page is
+            self.server = viser.ViserServer(host=host, port=free, label="clothgym", verbose=False)
+        # viser can open a tunnel to a server of its makers, for anyone who asks: not this one
+        self.server.request_share_url = lambda verbose=True: None
+        furnish(self.server.scene)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(206, 64, 50), control_width="large")
+        name = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        self.url = f"http://{name}:{free}"
+        self.server.on_client_connect(self._come)
+        self.server.on_client_disconnect(self._go)
+
+    async def _come(self, client: Any) -> None:
+        self.visits[client.client_id] = Visit(client, self.gallery, self.start)
+
+    async def _go(self, client: Any) -> None:
+        visit = self.visits.pop(client.client_id, None)
+        if visit is not None:
+            visit.closed.set()
+
+    def stop(self) -> None:
+        """Send everybody home, and close."""
+        for visit in list(self.visits.values()):
+            visit.closed.set()
+            visit.thread.join(10)
+        self.server.stop()
+
+
+def policies_of(runs: Sequence[str], start: str) -> tuple[str, dict[str, dict[str, Policy]]]:
+    """What is shown first, the first run's environment if nothing is asked; and the runs' policies, by environment and folder.
+
+    Raises:
+        ImportError: Stable-Baselines3 is missing; the message says how to get it.
+        FileNotFoundError, ValueError: a folder without a run that can be used here.
+    """
+    policies: dict[str, dict[str, Policy]] = {}
+    for run in runs:
+        try:
+            from clothgym.adapters.runs import learnt, read_config
+        except ImportError as error:
+            raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
+        try:
+            config = read_config(Path(run))
+        except FileNotFoundError as error:
+            raise FileNotFoundError(
+                f"policy {run!r}: is no folder of a training run, which holds config.json and checkpoint.pt. "
+                "Train one with: python training/train.py --env ClothDrape-v0"
+            ) from error
+        env_id = config["env"]
+        act = learnt(Path(run), env_id)
+        own = policies.setdefault(env_id, {})
+        name = Path(run).resolve().name
+        # runs of the same name are told apart by their whole paths
+        own[name if name not in own else str(Path(run).resolve())] = Learnt(act, config["env_kwargs"])
+        start = start or env_id
+    return start, policies
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A policy for batches, in a single environment, and what that was made with when the policy was trained."""
+
+    act: Policy
+    env_kwargs: Mapping[str, Any]
+
+    def __call__(self, env: Any, observation: NDArray) -> NDArray:
+        return self.act(env, observation[None])[0]
+
+
+def imported_viser() -> Any:
+    """viser.
+
+    Raises:
+        ImportError: it is missing; the message says how to get it.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise ImportError("the playground needs viser: pip install 'clothgym[view]'") from error
+    return viser
+
+
+def free_port(host: str, port: int, tries: int = 20) -> int:
+    """The first port from this one on that nobody listens at; 0 takes any.
+
+    Raises:
+        ValueError: a host that is none of this machine's, a port that is none, or no free one.
+    """
+    if not 0 <= port <= 65535:
+        raise ValueError(f"port={port}: must be from 0 to 65535, 0 for any that is free")
+    last: OSError | None = None
+    for candidate in range(port, min(port + tries, 65536)):
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, candidate))
+            except (socket.gaierror, OverflowError) as error:
+                raise ValueError(f"host={host!r}: is no address ({error})") from error
+            except OSError as error:
+                last = error
+                continue
+            return int(probe.getsockname()[1])
+    raise ValueError(f"host={host!r}, port={port}: cannot listen there ({last})")
+
+
+def say(line: str) -> None:
+    """Print at once, into a pipe too."""
+    print(line, flush=True)
+
+
+def serve(
+    start: str, host: str = LOOPBACK, port: int = PORT, replay: Path | None = None,
+    policies: Mapping[str, Mapping[str, Policy]] | None = None, tell: Callable[[str], None] = say,
+) -> Playground:  # fmt: skip
+    """Begin to serve, after a first look at what is shown first, which compiles what it needs.
+
+    Raises:
+        ImportError: viser is missing.
+        FileNotFoundError, ValueError: no such scene, environment, file or address; the message says what would do.
+    """
+    imported_viser()
+    recording = Recording.load(replay) if replay is not None else None
+    gallery = Gallery(recording, policies)
+    start = gallery.checked(REPLAY if recording is not None and not start else start or "patch")
+    free_port(host, port)
+    tell(f"opening {start} (the first time on a machine it is compiled, up to a minute, once) ...")
+    begun = time.perf_counter()
+    stage = gallery.open(start)
+    if not stage.over:
+        stage.advance()
+    playground = Playground(gallery, start, host, port)
+    tell(f"ready after {time.perf_counter() - begun:.1f} s: open {playground.url} in a browser; Ctrl+C ends it")
+    return playground

@@ -1,0 +1,438 @@
+"""One visitor's cloth: a scene whose settings change while it runs, with one sheet, or one for each of several integrators."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from clothgym import integrators
+from clothgym.checks import indices, vector
+from clothgym.collisions.shapes import FRICTION
+from clothgym.compare import BURST
+from clothgym.guards import refusal
+from clothgym.parameters import FIGURES, of_material
+from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
+from clothgym.playground.scenes import scene_named
+from clothgym.playground.world import FRAME, Scene, Settings, Targets, begin, drive
+from clothgym.render import Solid
+from clothgym.simulation import Simulation
+from clothgym.wind import Wind
+
+STEPS = 2  # control steps of a scene between two frames
+GUSTS = 3600  # control steps after which the gusts come again
+LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
+KEPT = 1800  # frames that can be scrubbed back to
+MOST_COMPARED = 4
+REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
+UNLIMITED = ", no limit"  # ends the label of a sheet without the others' strain limit
+SHREDS = 0.12  # a sheet that has blown up is drawn torn so far from where it was [m]: where it is, nobody could see
+EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
+# what the main loop is compiled with, or a method's plan depends on: changing it makes a new simulation of the same sheet
+REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
+
+
+class Hand(NamedTuple):
+    """What holds the cloth, as a visitor sees it: a name, where it is [m], whether it holds anything, and if it can be dragged."""
+
+    name: str
+    position: NDArray
+    holds: bool
+    draggable: bool
+
+
+class Stability(NamedTuple):
+    """The present substep [s], the largest that the integrator should be used with (0 if there is none), why, the control step
+    [s], and whether a sheet beyond the bound blows up, or is only inaccurate as it moves."""
+
+    substep: float
+    bound: float
+    why: str
+    time_step: float
+    explicit: bool = True
+
+    @property
+    def share(self) -> float:
+        """Of the bound that the substep takes; above 1 it is beyond it."""
+        return self.substep / self.bound if self.bound > 0 else np.inf
+
+    @property
+    def verdict(self) -> str:
+        """What the bound says of the substep."""
+        if self.explicit:
+            return "stable" if self.share <= 1 else "unstable"
+        return "accurate" if self.share <= 1 else "stable, coarse"
+
+
+def stability(simulation: Simulation) -> Stability:
+    explicit = simulation.integrator.name in EXPLICIT
+    return Stability(simulation.time_step / simulation.substeps, *simulation.largest_substep(), simulation.time_step, explicit)
+
+
+def why_it_burst(name: str, at: Stability) -> str:
+    """A sentence on a sheet that has blown up."""
+    if at.bound <= 0:
+        return f"**{name}** burst: it has no bound here, {at.why}."
+    step, bound = f"{1e3 * at.substep:.3g} ms", f"{1e3 * at.bound:.3g} ms"
+    if at.share > 1:
+        return f"**{name}** burst: its substep of {step} is beyond its bound of {bound}: {at.why}."
+    return f"**{name}** burst, though its substep of {step} is within the bound of {bound} for a sheet at rest."
+
+
+class Stage:
+    """What the page shows: something that goes on from frame to frame, and remembers what it showed.
+
+    Attributes:
+        name: as it was asked for; about: a sentence.
+        recording: the frames that it showed, the last of them where it stands.
+        notes: sentences for the visitor, by what they are about.
+    """
+
+    name: str
+    about: str
+    settings: Settings
+    recording: Recording
+    seed: int
+
+    def __init__(self) -> None:
+        self.notes: dict[str, str] = {}
+
+    @property
+    def frame(self) -> Frame:
+        """Where it stands."""
+        return self.recording.frames[-1]
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing happens any more until a reset."""
+        return False
+
+    def advance(self) -> Frame:
+        """Go on to the next frame."""
+        raise NotImplementedError
+
+    def reset(self, seed: int | None = None) -> None:
+        """Begin anew, with that seed or the same."""
+        raise NotImplementedError
+
+    def change(self, **changes: Any) -> None:
+        """Change settings.
+
+        Raises:
+            ValueError: an unknown name or a value that makes no sense; nothing is changed then.
+        """
+        raise NotImplementedError
+
+    def hands(self) -> list[Hand]:
+        """What holds the cloth."""
+        return []
+
+    def drag(self, hand: int, place: ArrayLike | None) -> None:
+        """Take a hand to a place [m], (3,), or leave it to itself again, with None."""
+        raise NotImplementedError
+
+    def hold(self, hand: int, holds: bool) -> None:
+        """Make a hand take hold, or let go."""
+        raise NotImplementedError
+
+    def stabilities(self) -> list[Stability]:
+        """Of each sheet; none where nothing is simulated."""
+        return []
+
+    def _keep(self, frame: Frame) -> Frame:
+        self.recording.frames.append(frame)
+        del self.recording.frames[:-KEPT]
+        return frame
+
+
+@dataclass
+class Sheet:
+    """One simulation on a stage.
+
+    Attributes:
+        name: of its integrator.
+        limited: whether it has the settings' strain limit.
+        simulation: a batch of one.
+        cost: of its last control step [s].
+        burst: why it has blown up; it stands still then.
+        penetration: how deep it was in a solid when that was last looked at [m].
+        shredded: whether it is shown as it is after that.
+        positions, touching, readings: as it was when last looked at, see ``Frame``.
+    """
+
+    name: str
+    simulation: Simulation
+    limited: bool = True
+    cost: float = 0.0
+    burst: str = ""
+    penetration: float = 0.0
+    shredded: bool = False
+    positions: NDArray[np.float32] = field(init=False)
+    touching: NDArray[np.bool_] = field(init=False)
+    readings: dict[str, float] = field(init=False)
+
+    @property
+    def label(self) -> str:
+        return self.name if self.limited else self.name + UNLIMITED
+
+    def step(self, n: int) -> None:
+        begun = time.perf_counter()
+        for _ in range(n):
+            self.simulation.step()
+        self.cost = (time.perf_counter() - begun) / n
+        with np.errstate(all="ignore"):
+            strain = self.simulation.strain().max()
+        if self.simulation.diverged[0] or not strain <= BURST:
+            self.burst = why_it_burst(self.name, stability(self.simulation))
+
+    def look(self, penetration: bool) -> None:
+        """See how it is now.  Of a sheet that has blown up the last readings stay, and shreds of it near to where it was."""
+        s = self.simulation
+        if self.burst:
+            if not self.shredded:
+                away = np.nan_to_num(s.positions[0] - self.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
+                self.positions, self.shredded = self.positions + np.clip(away, -SHREDS, SHREDS).astype(np.float32), True
+            return
+        if penetration and s.colliders:
+            self.penetration = float(s.penetration()[0])
+        self.positions, self.touching = visible(s.positions[0]), touching(s)
+        self.readings = read(s, self.cost, self.penetration)
+
+
+class SceneStage(Stage):
+    """A scene of the gallery.
+
+    Args:
+        scene: its name, or a ``Scene``.
+        settings: in place of the scene's own.
+        compared: two to four integrators, a sheet each; none for one sheet with the settings' integrator.
+
+    Raises:
+        ValueError: no such scene or integrator, or a number of them that cannot be compared.
+    """
+
+    def __init__(self, scene: str | Scene, settings: Settings | None = None, compared: Sequence[str] = (), seed: int = 0) -> None:
+        super().__init__()
+        self.scene = scene_named(scene) if isinstance(scene, str) else scene
+        self.name, self.about = self.scene.name, self.scene.about
+        self.settings = self.scene.settings if settings is None else settings
+        self.seed = seed
+        self.steps = 0
+        self._dragged: dict[int, NDArray] = {}
+        self._gusts = np.zeros((1, 3))
+        self._bounds: list[Stability] | None = None
+        self.sheets: list[Sheet] = []
+        self.compare(compared)
+
+    @property
+    def time(self) -> float:
+        """Since the start [s]."""
+        return self.steps * FRAME
+
+    # --- going on -------------------------------------------------------------------------------------------------------
+
+    def advance(self) -> Frame:
+        for _ in range(STEPS):
+            wind = np.array([self.settings.wind, 0, 0]) + self.settings.gust * self._gusts[self.steps % len(self._gusts)]
+            for sheet in self.sheets:
+                if not sheet.burst:
+                    drive(sheet.simulation, self.scene, self.time, self._targets())
+                    sheet.simulation.set_wind(wind)
+                    sheet.step(1)
+            self.steps += 1
+        bursts = [sheet.burst for sheet in self.sheets if sheet.burst]
+        if bursts:
+            self.notes["burst"] = " ".join([*bursts, REMEDY])
+        return self._keep(self._look())
+
+    def reset(self, seed: int | None = None) -> None:
+        self.seed = self.seed if seed is None else int(seed)
+        self.steps = 0
+        self._dragged.clear()
+        self.notes.pop("burst", None)
+        self._gusts = Wind(gust=1.0).series(np.random.default_rng(self.seed), GUSTS, FRAME)
+        for sheet in self.sheets:
+            sheet.burst, sheet.cost, sheet.penetration, sheet.shredded = "", 0.0, 0.0, False
+            begin(sheet.simulation, self.scene, self.seed or None)
+        self.recording.frames[:] = [self._look()]
+
+    def compare(self, names: Sequence[str], unlimited: bool = False) -> None:
+        """Begin anew with a sheet for each of these integrators, two to four; with none, one sheet with the settings' own, and with
+        ``unlimited`` the same without the strain limit beside it.
+
+        Raises:
+            ValueError: another number of integrators, or both are asked for.
+        """
+        names = list(dict.fromkeys(names))
+        if len(names) == 1 or len(names) > MOST_COMPARED:
+            raise ValueError(f"compared={names!r}: choose two to {MOST_COMPARED} integrators")
+        if names and unlimited:
+            raise ValueError(f"compared={names!r}, unlimited=True: compare integrators, or one with and without its strain limit")
+        methods = [(integrators.get(name).name, True) for name in names] or [(self.settings.integrator, True)]
+        if unlimited:
+            methods.append((self.settings.integrator, False))
+        settings = self.settings
+        self.sheets = [Sheet(name, self.scene.simulation(own(settings, name, limited)), limited) for name, limited in methods]
+        self.compared, self.unlimited = tuple(names), unlimited
+        apart = 1.25 * self.scene.mesh.size[0]
+        self.offsets = np.array([((k - (len(methods) - 1) / 2) * apart, 0.0, 0.0) for k in range(len(methods))])
+        labels = tuple(sheet.label for sheet in self.sheets)
+        self.recording = Recording(self.scene.title, self.scene.mesh, STEPS * FRAME, self.scene.camera, labels, self.scene.strained)
+        self._bounds = None
+        self.reset()
+
+    def _look(self) -> Frame:
+        due = not self.recording.frames or self.steps % (STEPS * LOOK_EVERY) == 0
+        for sheet in self.sheets:
+            sheet.look(due)
+        readings = [sheet.readings for sheet in self.sheets]
+        return Frame(
+            time=self.time,
+            positions=np.stack([sheet.positions for sheet in self.sheets]) + self.offsets[:, None].astype("f"),
+            stiffness=np.stack([stiffness(sheet.simulation) for sheet in self.sheets]),
+            touching=np.stack([sheet.touching for sheet in self.sheets]),
+            solids=tuple(
+                moved(solid, offset)
+                for sheet, offset in zip(self.sheets, self.offsets)
+                for solid in self.scene.solids(sheet.simulation)
+            ),
+            # without a limit a sheet has no strain before limiting
+            readings={name: np.array([one.get(name, np.nan) for one in readings]) for name in readings[0]},
+        )
+
+    # --- settings -------------------------------------------------------------------------------------------------------
+
+    def change(self, **changes: Any) -> None:
+        after = self.settings.changed(**changes)
+        before, self.notes = self.settings, {k: v for k, v in self.notes.items() if k == "burst"}
+        anew = {name for name in REBUILDS if getattr(after, name) != getattr(before, name)}
+        if after.self_collision != "off" and after.friction != before.friction:
+            anew.add("friction")
+        made = []
+        for sheet in self.sheets:
+            name = sheet.name if self.compared else after.integrator
+            figures = changed_figures(before, after)
+            ignored = figures & integrators.get(name).ignored
+            if ignored:
+                self.notes["ignored"] = refusal(integrators.get(name), sorted(ignored)[0]).capitalize() + "."
+            if anew or ignored:
+                made.append((name, carried_over(sheet.simulation, self.scene, own(after, name, sheet.limited))))
+            else:
+                unbounded = set_in_place(sheet.simulation, before, after)
+                if unbounded:
+                    self.notes["substeps"] = unbounded
+                made.append((name, sheet.simulation))
+        # what was seen of a sheet stays: one that has blown up is not looked at again before a reset
+        for sheet, (name, simulation) in zip(self.sheets, made):
+            sheet.name, sheet.simulation = name, simulation
+        self.settings, self._bounds = after, None
+        self.recording.labels = tuple(sheet.label for sheet in self.sheets)
+
+    def stabilities(self) -> list[Stability]:
+        if self._bounds is None:
+            self._bounds = [stability(sheet.simulation) for sheet in self.sheets]
+        return self._bounds
+
+    # --- hands ----------------------------------------------------------------------------------------------------------
+
+    def hands(self) -> list[Hand]:
+        s = self.sheets[0].simulation
+        held, places = s.attached[0], s.hand_positions[0]
+        # one that holds nothing is shown where its particle is
+        for hand in np.flatnonzero(~held):
+            places[hand] = s.positions[0, s.anchors[hand]]
+        return [
+            Hand(name, visible(place) + self.offsets[0], bool(holds), hand in self.scene.handles)
+            for hand, (name, place, holds) in enumerate(zip(self.scene.names, places, held))
+        ]
+
+    def drag(self, hand: int, place: ArrayLike | None) -> None:
+        self._checked(hand)
+        if place is None:
+            self._dragged.pop(hand, None)
+            return
+        self._dragged[hand] = vector("place", place) - self.offsets[0]
+        self.hold(hand, True)
+
+    def hold(self, hand: int, holds: bool) -> None:
+        self._checked(hand)
+        for sheet in self.sheets:
+            if holds and not sheet.simulation.attached[0, hand]:
+                sheet.simulation.attach([0], [hand])
+            elif not holds:
+                sheet.simulation.release([0], [hand])
+        if not holds:
+            self._dragged.pop(hand, None)
+
+    def _checked(self, hand: int) -> None:
+        indices("hand", [hand], len(self.scene.anchors), "the hands of this scene")
+
+    def _targets(self) -> Targets:
+        return self._dragged
+
+
+def own(settings: Settings, integrator: str, limited: bool) -> Settings:
+    """The settings of a sheet among others."""
+    return settings.changed(integrator=integrator, **({} if limited else {"strain_limit": None}))
+
+
+# --- changing a simulation ----------------------------------------------------------------------------------------------
+
+
+def changed_figures(before: Settings, after: Settings) -> set[str]:
+    """Figures of the fabric in which two settings differ."""
+    pairs = zip(FIGURES, of_material(before.material), of_material(after.material))
+    return {name for name, old, new in pairs if old != new}
+
+
+def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> str:
+    """Change what a running simulation can be told; a sentence if its substeps cannot follow a bound, and so stay."""
+    figures: dict[str, Any] = {name: getattr(after.material, name) for name in changed_figures(before, after)}
+    if after.gravity != before.gravity:
+        figures["gravity"] = (0, 0, -after.gravity)
+    if figures:
+        simulation.set_parameters(warn=False, **figures)
+    if after.friction != before.friction:
+        state = simulation.get_state()
+        state.colliders[:, :, FRICTION] = state.collider_homes[:, :, FRICTION] = after.friction
+        simulation.set_state(state)
+    if after.substeps != "auto":
+        simulation.substeps = after.substeps
+        return ""
+    largest, why = simulation.largest_substep()
+    if largest > 0:
+        simulation.substeps = simulation.integrator.automatic_substeps(simulation.time_step, largest)
+        return ""
+    return f"{simulation.integrator.name} has no bound here, {why}: it goes on with {simulation.substeps} substeps."
+
+
+def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Simulation:
+    """A new simulation of a scene's sheet with other settings, as the old one is now: where it is, how fast, and who holds it."""
+    old = simulation.get_state()
+    new = scene.simulation(settings)
+    finite = np.isfinite(old.positions).all() and np.isfinite(old.velocities).all()
+    if not finite:
+        return new
+    new.reset(positions=old.positions, velocities=old.velocities)
+    state = new.get_state()
+    for name in ("holder", "hand_positions", "hand_targets", "colliders", "collider_homes", "steps", "diverged"):
+        setattr(state, name, getattr(old, name))
+    state.colliders[:, :, FRICTION] = state.collider_homes[:, :, FRICTION] = settings.friction
+    new.set_state(state)
+    new.set_wind(old.wind)
+    return new
+
+
+def visible(x: NDArray) -> NDArray[np.float32]:
+    """Positions that can be drawn: what is not finite, or far away, is put at the edge of what can be seen [m]."""
+    return np.clip(np.nan_to_num(x, nan=0.0, posinf=9.0, neginf=-9.0), -9.0, 9.0).astype(np.float32)
+
+
+def moved(solid: Solid, offset: NDArray) -> Solid:
+    """The same solid somewhere else."""
+    x, y, z = (np.asarray(solid.center) + offset).tolist()
+    return replace(solid, center=(x, y, z))

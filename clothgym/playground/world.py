@@ -1,0 +1,220 @@
+"""What a visitor finds: a sheet, what holds and moves it, and the settings that can be turned."""
+
+from __future__ import annotations
+
+import difflib
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym import integrators
+from clothgym.bending import BENDING
+from clothgym.checks import count, not_negative, one_of
+from clothgym.collisions import Box, Capsule, Collider, MeshCollider, Plane, Sphere
+from clothgym.limiting import checked_limit
+from clothgym.material import Material
+from clothgym.mesh import ClothMesh
+from clothgym.render import Camera, Solid
+from clothgym.simulation import GRAVITY, Simulation
+
+FRAME = 1 / 60  # control step [s]
+Vector = tuple[float, float, float]
+FIGURES = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
+CLAY = (196, 189, 178)  # colour of solids
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All that a visitor can turn while it runs.
+
+    Attributes:
+        gravity: downwards [m/s^2].
+        wind: speed of its steady part [m/s], and gust, the root mean square of each of the gusts' components [m/s].
+        fabric: a name of ``material.PRESETS``, from which the figures come that are not given.
+        stretch_stiffness, shear_stiffness, bend_rigidity, damping_time, air_drag: see ``Material``.
+        friction: of the solids, and of the sheet on itself.
+        integrator, bending, strain_limit, self_collision, substeps: see ``Simulation``; self_collision is "off",
+            "fast" or "strict".
+
+    Raises:
+        ValueError: a value that makes no sense; the message names it and what would do.
+    """
+
+    gravity: float = GRAVITY
+    wind: float = 0.0
+    gust: float = 0.0
+    fabric: str = "cotton"
+    stretch_stiffness: float | None = None
+    shear_stiffness: float | None = None
+    bend_rigidity: float | None = None
+    damping_time: float | None = None
+    air_drag: float | None = None
+    friction: float = 0.4
+    integrator: str = "semi_implicit_euler"
+    bending: str = "springs"
+    strain_limit: float | None = None
+    self_collision: str = "off"
+    substeps: int | Literal["auto"] = "auto"
+
+    def __post_init__(self) -> None:
+        for name in ("gravity", "wind", "gust", "friction"):
+            not_negative(name, getattr(self, name))
+        integrators.get(self.integrator)
+        one_of("bending", self.bending, *BENDING)
+        one_of("self_collision", self.self_collision, "off", "fast", "strict")
+        checked_limit(self.strain_limit)
+        if self.substeps != "auto":
+            count("substeps", self.substeps, "'auto' or ")
+        fabric = Material.preset(self.fabric)
+        for name in FIGURES:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, getattr(fabric, name))
+        self.material  # noqa: B018 - a fabric that is none is refused here
+
+    @property
+    def material(self) -> Material:
+        return Material.preset(self.fabric, **{name: getattr(self, name) for name in FIGURES})
+
+    def changed(self, **changes: Any) -> Settings:
+        """The same with some changed; another fabric brings all its figures but the air's drag.
+
+        Raises:
+            ValueError: an unknown name, or a value that makes no sense.
+        """
+        known = [item.name for item in fields(self)]
+        for name in changes:
+            if name not in known:
+                raise ValueError(f"no setting {name!r}{hint(name, known)} (there are: {', '.join(known)})")
+        if "fabric" in changes and changes["fabric"] != self.fabric:
+            changes = {name: None for name in FIGURES if name != "air_drag"} | changes
+        return replace(self, **changes)
+
+
+Targets = Mapping[int, NDArray]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """A sheet and its world.
+
+    Attributes:
+        name, title: as it is asked for, and as it is shown.
+        about: what there is to see and to try, as a sentence.
+        mesh: the sheet at rest; ``start``: where it begins [m], (particles, 3).
+        settings: those that a visitor finds.
+        anchors: particles, or patches of them, that can be held; ``names`` of them; those ``held`` at first.
+        handles: anchors that can be dragged.
+        colliders: solids that the sheet feels; ``scenery``: solids that are drawn besides.
+        colours: of the colliders that are drawn, by number.
+        motion: where anchors are to be at a time [s], (anchors, 3) [m], and colliders, by number; None where nothing moves.
+        rests: when what the motion holds is let go [s].
+        camera: where it is seen from.
+        strained: the strain at which the colours end.
+    """
+
+    name: str
+    title: str
+    about: str
+    mesh: ClothMesh
+    start: NDArray
+    settings: Settings
+    camera: Camera
+    anchors: tuple[int | tuple[int, ...], ...] = ()
+    names: tuple[str, ...] = ()
+    held: tuple[int, ...] = ()
+    handles: tuple[int, ...] = ()
+    colliders: tuple[Collider, ...] = ()
+    colours: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
+    scenery: tuple[Solid, ...] = ()
+    motion: Callable[[float], tuple[NDArray, Targets]] | None = None
+    rests: float = np.inf
+    strained: float = 0.05
+
+    def simulation(self, settings: Settings | None = None, **options: Any) -> Simulation:
+        """The scene at its start, with its own settings or others; options: of ``Simulation``, in place of theirs."""
+        given = self.settings if settings is None else settings
+        apart = {"mode": given.self_collision, "friction": given.friction}
+        chosen: dict[str, Any] = {
+            "integrator": given.integrator,
+            "time_step": FRAME,
+            "substeps": given.substeps,
+            "gravity": (0, 0, -given.gravity),
+            "colliders": [replace(c, friction=given.friction) for c in self.colliders],
+            "anchors": self.anchors,
+            "bending": given.bending,
+            "strain_limit": given.strain_limit,
+            "self_collision": given.self_collision != "off" and apart,
+            "on_divergence": "ignore",
+        }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # substeps beyond a bound are among what is shown
+            s = Simulation(self.mesh, given.material, **(chosen | options))
+        begin(s, self)
+        return s
+
+    def solids(self, simulation: Simulation | None = None) -> list[Solid]:
+        """What is drawn beside the sheet and the floor: the solids where they are now, or at first."""
+        moved = None if simulation is None else simulation.collider_positions[0]
+        drawn = []
+        for number, collider in enumerate(self.colliders):
+            if not isinstance(collider, Plane):
+                center = collider.center if moved is None else tuple(moved[number].tolist())  # type: ignore[attr-defined]
+                drawn.append(solid_of(collider, center, self.colours.get(number, CLAY)))
+        return [*drawn, *self.scenery]
+
+
+def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None:
+    """Put a scene's simulation at its start; a seed shifts the free particles by about a thousandth of a spacing."""
+    x = scene.start.copy()
+    if seed is not None:
+        held = [particle for anchor in scene.held for particle in np.atleast_1d(scene.anchors[anchor])]
+        noise = np.random.default_rng(seed).normal(scale=1e-3 * scene.mesh.springs.rest_length.min(), size=x.shape)
+        noise[held] = 0
+        x += noise
+    simulation.reset(positions=x)
+    free = [anchor for anchor in range(len(scene.anchors)) if anchor not in scene.held]
+    if free:
+        simulation.release([0] * len(free), free)
+
+
+def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | None = None) -> None:
+    """Tell a scene's anchors and solids where to be at a time [s]; others: anchors that someone else moves, by number [m]."""
+    targets = simulation.hand_positions
+    if scene.motion is not None and time <= scene.rests:
+        targets[0], solids = scene.motion(time)
+        for number, place in solids.items():
+            simulation.move_colliders(number, targets=place)
+    for anchor, place in (others or {}).items():
+        targets[0, anchor] = place
+    if targets.size:
+        simulation.move_anchors(targets)
+    if scene.rests < time <= scene.rests + FRAME:
+        simulation.release([0] * len(scene.held), scene.held)
+
+
+def solid_of(collider: Collider, center: Vector, colour: tuple[int, int, int]) -> Solid:
+    """A collider as it is drawn."""
+    match collider:
+        case Sphere():
+            return Solid(kind="sphere", center=center, radius=collider.radius, color=colour)
+        case Capsule():
+            return Solid(kind="capsule", center=center, radius=collider.radius, height=collider.height, color=colour)
+        case Box():
+            turn = {"yaw": collider.yaw, "rotation": collider.rotation}
+            return Solid(kind="box", center=center, half_sides=collider.half_sides, color=colour, **turn)  # type: ignore[arg-type]
+        case MeshCollider():
+            vertices, triangles = collider.surface
+            return Solid(
+                kind="mesh", center=center, vertices=vertices, triangles=triangles, rotation=collider.rotation, color=colour
+            )
+    raise ValueError(f"collider={collider!r}: has no picture")
+
+
+def hint(name: str, known: Iterable[str]) -> str:
+    """A clause with the nearest name, if one is near."""
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,69 @@
+"""The picture of the playground's page, made anew: python docs/playground_pictures.py"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+from playwright.sync_api import sync_playwright
+
+from clothgym.playground.server import serve
+
+HERE = Path(__file__).parent
+FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+WINDOW = {"width": 1280, "height": 760}
+DEADLINE = 120.0  # [s]
+
+
+def wait(tab: Any, what: Any) -> None:
+    end = time.monotonic() + DEADLINE
+    while not what():
+        if time.monotonic() > end:
+            raise TimeoutError("the page did not get there")
+        tab.wait_for_timeout(50)
+
+
+def main() -> None:
+    playground = serve("patch", port=0)
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
+        tab = browser.new_page(viewport=WINDOW)
+        tab.goto(playground.url)
+        wait(tab, lambda: any(visit.page is not None for visit in playground.visits.values()))
+        page = next(iter(playground.visits.values())).page
+        assert page is not None
+        # the library's warning that the browser has no graphics card
+        tab.get_by_role("alert").get_by_role("button").first.dispatch_event("click")
+        shots = []
+        page.order("change", {"gravity": 9.81})
+        wait(tab, lambda: page.stage.frame.time > 4)
+        shots.append(shot(tab))
+        # three methods with as many substeps as one of them needs; then the threads are made stiffer than it bears
+        page.order("change", {"substeps": 8})
+        for k, name in enumerate(("semi_implicit_euler", "implicit_euler", "xpbd")):
+            page.controls[f"compared {k}"].value = name
+        page.controls["compare"].value = True
+        page.order("compare")
+        wait(tab, lambda: page.stage.compared and page.stage.frame.time > 2)
+        page.order("change", {"stretch_stiffness": 60.0})
+        wait(tab, lambda: "burst" in page.stage.notes and page.stage.frame.time > 4)
+        page.order("press", "play / pause")
+        shots.append(shot(tab))
+        browser.close()
+    playground.stop()
+    iio.imwrite(HERE / "playground.png", np.concatenate(shots, axis=0))
+    print(f"written to {HERE / 'playground.png'}")
+
+
+def shot(tab: Any) -> Any:
+    """What the window shows, (height, width, 3), once the browser has caught up."""
+    tab.wait_for_timeout(2500)
+    return iio.imread(tab.screenshot(), extension=".png")[:, :, :3]
+
+
+if __name__ == "__main__":
+    main()
