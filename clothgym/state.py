@@ -202,6 +202,9 @@ class State:
     contact_impulses: NDArray
     contact_tight: NDArray
     contact_looks: NDArray
+    contact_pressed: NDArray
+    contact_waited: NDArray
+    contact_span: NDArray
     contact_ties: NDArray
     contact_planes: NDArray
     steps: NDArray

@@ -285,8 +285,11 @@ def look_around(x, w, sheet, block, l):
         memory.limits[block, k, l] = (INSIDE * free[k]) ** 2
     _take_over(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
     memory.contacts[block, l] = count
+    # what has been found is swept over at once
     memory.choices[block, l] = -1
-    memory.looks[block, l] = 0
+    memory.looks[block, l] = memory.span[block, l] = 0
+    if count == 0:
+        memory.pressed[block, :, :, l] = 0
     report[ROWS] = count
 
 

@@ -28,6 +28,7 @@ from clothgym.collisions.closest import closest_on_segments, closest_on_triangle
 
 LAYERED = 0.6  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
 LOOSE = 0.8  # of the reach below which pairs are tied
+AT_ONCE = 1.0 / 0.99
 SHARE = 0.45  # of a pair's distance that each side may use; below a half
 # what is told of each environment, see ``self_collision.SelfContact``
 ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 5, 6, 7
@@ -90,7 +91,7 @@ def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ti
 
 @kernel
 def vertex_contacts(
-    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, thickness, margin, loose, stop, standoff, held, room,
+    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, thickness, kept, margin, loose, stop, standoff, held, room,
     free, closest, count, particles, figures, tight, ties, planes, report,
 ):  # fmt: skip
     """Certify vertices and triangles, lower the room of their vertices, and write the contacts down.  Returns the
@@ -145,7 +146,8 @@ def vertex_contacts(
         if not mine:
             continue
         if count < particles.shape[0]:
-            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, thickness, count, particles, figures)
+            own = min(thickness, max(kept, certified * AT_ONCE))
+            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, own, count, particles, figures)
             count += 1
         else:
             report[DROPPED] += 1
@@ -154,7 +156,7 @@ def vertex_contacts(
 
 @kernel
 def edge_contacts(
-    p, candidates, edges, ridges, reach, thickness, margin, loose, stop, standoff, held, room, free, count, particles, figures,
+    p, candidates, edges, ridges, reach, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles, figures,
     tight, ties, planes, report,
 ):  # fmt: skip
     """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same."""
@@ -182,7 +184,8 @@ def edge_contacts(
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
             if count < particles.shape[0]:
-                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, thickness, count, particles, figures)
+                own = min(thickness, max(kept, certified * AT_ONCE))
+                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, own, count, particles, figures)
                 count += 1
             else:
                 report[DROPPED] += 1
@@ -267,20 +270,20 @@ def query(p, pairs, reach, held, bounds, limits, particles, figures, ties, plane
     closest = np.zeros((1, 4))
     closest[0, 0] = reach.near
     count, tight = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.near, reach.near_thickness, margin, loose, stop,
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.near, reach.near_thickness, 0.0, margin, loose, stop,
         standoff, held, bounds, limits, closest, 0, particles, figures, 0, ties, planes, report,
     )  # fmt: skip
     # these belong to no pair of leaves
     ties[:tight, 2] = -1
     count, tight = edge_contacts(
-        p, sides, edges, ridges, reach.near, reach.near_thickness, margin, loose, stop, standoff, held, bounds, limits, count,
+        p, sides, edges, ridges, reach.near, reach.near_thickness, 0.0, margin, loose, stop, standoff, held, bounds, limits, count,
         particles, figures, tight, ties, planes, report,
     )  # fmt: skip
     leaves, gaps, corners = far_pairs(p, pairs, reach.far, faces)
     closest = np.zeros((leaves.shape[0], 4))
     closest[:, 0] = reach.far
     count, tight = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.far, reach.far_thickness, margin, loose, stop,
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.far, reach.far_thickness, reach.far_thickness, margin, loose, stop,
         standoff, held, bounds, limits, closest, count, particles, figures, tight, ties, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
@@ -289,7 +292,7 @@ def query(p, pairs, reach, held, bounds, limits, particles, figures, ties, plane
     )
     sides = far_sides(p, pairs, leaves, layered, ridges, stretch, reach.far)
     count, tight = edge_contacts(
-        p, sides, edges, ridges, reach.far, reach.far_thickness, margin, loose, stop, standoff, held, bounds, limits, count,
+        p, sides, edges, ridges, reach.far, reach.far_thickness, 0.0, margin, loose, stop, standoff, held, bounds, limits, count,
         particles, figures, tight, ties, planes, report,
     )  # fmt: skip
     least = unlisted

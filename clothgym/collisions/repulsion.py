@@ -16,41 +16,69 @@ from clothgym.collisions.proximity import NORMAL, THICKNESS, TOUCHING
 
 SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
+SPAN = 4  # substeps between two sweeps over contacts that are calm; over others a sweep goes in each
+CALM = 0.005  # thicknesses that the correction of a calm contact would move it by in the longest span
 CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act soon
 SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
 
 
 @kernel
-def press_again(x, v, w, sheet, block, step, h, carried):
-    """The impulses of the substep before, on one block's sheets; before the solids, so that these bear what lies on them."""
+def press_again(x, v, w, sheet, block, carried):
+    """What the contacts pressed at the last sweep, on one block's sheets; before the solids, so that these bear what lies on them.
+
+    Where nothing presses, every bit stays.
+    """
     memory = sheet.memory
+    zero, some = x.dtype.type(0), False
+    for l in range(memory.used[block]):
+        some |= memory.contacts[block, l] > 0
+    if not some:
+        return
+    lanes = x.shape[2]
+    for p in range(x.shape[0]):
+        wp = w[p]
+        for c in range(3):
+            xc, vc, pc = x[p, c], v[p, c], memory.pressed[block, p, c]
+            for l in range(lanes):
+                pressed = pc[l] if wp[l] > zero else zero
+                moved, faster = xc[l] + carried * pressed, vc[l] + pressed
+                xc[l] = moved if pressed != zero else xc[l]
+                vc[l] = faster if pressed != zero else vc[l]
+
+
+@kernel
+def repel(x, v, w, sheet, block, h, carried):
+    """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
+    memory, setting = sheet.memory, sheet.setting
     place, motion, mobility = np.empty(x.shape[:2], x.dtype), np.empty(x.shape[:2], x.dtype), np.empty(x.shape[0], x.dtype)
     for l in range(memory.used[block]):
         count = memory.contacts[block, l]
         if count == 0:
             continue
+        memory.waited[block, l] += 1
+        memory.aged[block, l] += 1
+        waited = memory.waited[block, l]
+        if waited < memory.span[block, l]:
+            continue
         particles, figures = memory.particles[block, l], memory.figures[block, l]
         impulses, chosen = memory.impulses[block, l], memory.chosen[block, l]
         _take(x, v, w, l, place, motion, mobility)
-        if step % CHOSEN_EVERY == 0 or memory.choices[block, l] < 0:
+        if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
             memory.choices[block, l] = _choose(place, motion, particles, figures, impulses, chosen, count, h)
-        _apply_again(place, motion, mobility, particles, figures, impulses, chosen, memory.choices[block, l], carried)
+            memory.aged[block, l] = 0
+        choices = memory.choices[block, l]
+        touching, most = _correct(
+            place, motion, mobility, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h,
+            waited,
+        )  # fmt: skip
         _put_back(x, v, l, place, motion)
-
-
-@kernel
-def repel(x, v, w, sheet, block, h, carried):
-    """Contacts of one block's sheets with themselves."""
-    memory, setting = sheet.memory, sheet.setting
-    place, motion, mobility = np.empty(x.shape[:2], x.dtype), np.empty(x.shape[:2], x.dtype), np.empty(x.shape[0], x.dtype)
-    for l in range(memory.used[block]):
-        if memory.contacts[block, l] > 0:
-            _take(x, v, w, l, place, motion, mobility)
-            memory.report[block, l, TOUCHING] = _correct(
-                place, motion, mobility, memory.particles[block, l], memory.figures[block, l], memory.impulses[block, l],
-                memory.chosen[block, l], memory.choices[block, l], carried, setting.friction, setting.push * h, h,
-            )  # fmt: skip
-            _put_back(x, v, l, place, motion)
+        _add_up(mobility, particles, figures, impulses, chosen, choices, motion)
+        for p in range(x.shape[0]):
+            for c in range(3):
+                memory.pressed[block, p, c, l] = motion[p, c]
+        memory.report[block, l, TOUCHING] = touching
+        memory.waited[block, l] = 0
+        memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
 
 
 @kernel
@@ -117,33 +145,42 @@ def _choose(x, v, particles, figures, impulses, chosen, count, h):
 
 
 @kernel
-def _apply_again(x, v, w, particles, figures, impulses, chosen, choices, carried):
-    """The impulses of the substep before."""
-    zero = x.dtype.type(0)
+def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
+    """What the impulses of a substep change each particle's velocity by [m/s], (particles, 3)."""
+    zero = pressed.dtype.type(0)
+    pressed[:] = zero
     for c in range(choices):
         k = chosen[c]
         jx, jy, jz = impulses[k, 0], impulses[k, 1], impulses[k, 2]
         if jx != zero or jy != zero or jz != zero:
-            _push(x, v, w, particles, figures, k, jx, jy, jz, carried, zero, zero, zero)
+            for m in range(4):
+                p = particles[k, m]
+                share = w[p] * figures[k, m]
+                pressed[p, 0] += share * jx
+                pressed[p, 1] += share * jy
+                pressed[p, 2] += share * jz
 
 
 @kernel
-def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, friction, push, h):
-    """Correct the impulses, normal and tangential, and push apart; returns how many contacts acted."""
+def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, friction, push, h, waited):
+    """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.  Returns how many contacts acted,
+    and the most that the velocity along one's normal had to be corrected by [m/s]."""
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)
-    touching = 0
+    since = x.dtype.type(waited)
+    reach = x.dtype.type(SPAN) * h + carried
+    touching, largest = 0, zero
     for c in range(choices):
         k = chosen[c]
         nx, ny, nz, thickness = figures[k, NORMAL], figures[k, NORMAL + 1], figures[k, NORMAL + 2], figures[k, THICKNESS]
-        jx, jy, jz = impulses[k, 0], impulses[k, 1], impulses[k, 2]
+        jx, jy, jz = since * impulses[k, 0], since * impulses[k, 1], since * impulses[k, 2]
         before = nx * jx + ny * jy + nz * jz
         gap, _, _, _ = _along(x, particles, figures, k, nx, ny, nz)
         un, ux, uy, uz = _along(v, particles, figures, k, nx, ny, nz)
-        # the velocity of approach that closes the gap by the next substep's end, and no sooner; what has been carried on is taken
-        # back
-        wanted = -max(gap - carried * un - sunk * thickness, zero) / (h + carried)
+        # the velocity of approach that closes the gap by the end of the longest span, and no sooner; what has been carried on is
+        # taken back
+        wanted = -max(gap - carried * un - sunk * thickness, zero) / reach
         if before == zero and un >= wanted and gap >= sunk * thickness:
             continue
         mobile = zero
@@ -160,10 +197,11 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
         most = friction * now
         share = min(most / (np.sqrt(tx * tx + ty * ty + tz * tz) + tiny), one)
         px, py, pz = now * nx + share * tx, now * ny + share * ty, now * nz + share * tz
-        impulses[k, 0], impulses[k, 1], impulses[k, 2] = px, py, pz
+        impulses[k, 0], impulses[k, 1], impulses[k, 2] = px / since, py / since, pz / since
+        largest = max(largest, abs(now - before) * mobile)
         # only what the impulse has not mended already is pushed
         lack = sunk * thickness - (gap + carried * (now - before) * mobile)
-        out = min(relaxed * max(lack, zero), push) * mass
+        out = since * min(relaxed * max(lack, zero), push) * mass
         _push(x, v, w, particles, figures, k, px - jx, py - jy, pz - jz, carried, out * nx, out * ny, out * nz)
         touching += 1
-    return touching
+    return touching, largest

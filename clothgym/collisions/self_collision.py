@@ -57,6 +57,10 @@ class Memory(NamedTuple):
     particles: NDArray
     figures: NDArray
     impulses: NDArray
+    pressed: NDArray
+    waited: NDArray
+    span: NDArray
+    aged: NDArray
     tight: NDArray
     ties: NDArray
     planes: NDArray
@@ -74,6 +78,7 @@ class Setting(NamedTuple):
     single: bool
     friction: Any
     push: Any
+    calm: Any
 
 
 class Sheet(NamedTuple):
@@ -90,13 +95,14 @@ def press(x, v, w, sheet, block, step, h, carried):
     """What happens to one block's sheets before the solids have their say; see the module."""
     memory = sheet.memory
     if step == 0:
+        memory.choices[block] = -1
         for l in range(memory.used[block]):
             report = memory.report[block, l]
             report[:] = 0
             report[GAP] = np.inf
             report[ROWS] = memory.contacts[block, l]
             report[LAG] = memory.behind[block, l]
-    press_again(x, v, w, sheet, block, step, h, carried)
+    press_again(x, v, w, sheet, block, carried)
 
 
 @kernel

@@ -27,6 +27,7 @@ from clothgym.collisions.proximity import (
     gap_of_vertex,
     vertex_contacts,
 )
+from clothgym.collisions.repulsion import CALM
 from clothgym.collisions.self_collision import PUSH, Memory, Setting, Sheet
 from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
@@ -120,7 +121,7 @@ class SelfCollision:
         reach = reach_of(mesh, pairs, self.options.thickness)
         self.thickness = reach.far_thickness
         real = dtype.type
-        setting = Setting(self.options.mode == "strict", dtype == np.float32, real(self.options.friction), real(PUSH))
+        setting = Setting(self.options.mode == "strict", dtype == np.float32, real(self.options.friction), real(PUSH), real(CALM * reach.far_thickness))
         self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
         self.check(mesh.rest_positions)
 
@@ -162,7 +163,8 @@ class SelfCollision:
         memory.behind[block, lane] = 0
         memory.contacts[block, lane] = 0
         memory.tight[block, lane] = 0
-        memory.looks[block, lane] = 0
+        memory.looks[block, lane] = memory.waited[block, lane] = memory.span[block, lane] = 0
+        memory.pressed[block, :, :, lane] = 0
         memory.report[block, lane] = 0
         self._reported[block * self.layout.lanes + lane] = False
 
@@ -180,6 +182,9 @@ class SelfCollision:
             "contact_impulses": np.zeros((num_envs, 0, 3)),
             "contact_tight": np.zeros(num_envs, np.int32),
             "contact_looks": np.zeros(num_envs, np.int32),
+            "contact_pressed": np.zeros((num_envs, particles, 3)),
+            "contact_waited": np.zeros(num_envs, np.int32),
+            "contact_span": np.zeros(num_envs, np.int32),
             "contact_ties": np.zeros((num_envs, 0, TIE), np.int32),
             "contact_planes": np.zeros((num_envs, 0, 4)),
         }
@@ -197,6 +202,9 @@ class SelfCollision:
             "contact_count": public(memory.contacts),
             "contact_tight": public(memory.tight),
             "contact_looks": public(memory.looks),
+            "contact_pressed": public(memory.pressed),
+            "contact_waited": public(memory.waited),
+            "contact_span": public(memory.span),
         }
         for name, counted in ROW_ARRAYS.items():
             array, count = getattr(memory, name), state[f"contact_{counted}"]
@@ -222,6 +230,9 @@ class SelfCollision:
         memory.contacts[block, lane] = state.contact_count
         memory.tight[block, lane] = state.contact_tight
         memory.looks[block, lane] = state.contact_looks
+        memory.pressed[:] = blocks(state.contact_pressed, self.dtype)
+        memory.waited[block, lane] = state.contact_waited
+        memory.span[block, lane] = state.contact_span
         for name in ROW_ARRAYS:
             array = getattr(state, f"contact_{name}")
             getattr(memory, name)[block, lane, : array.shape[1]] = array
@@ -271,6 +282,10 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         planes=np.empty((*shape, TIGHT * particles, 4)),
         looks=np.zeros(shape, np.int32),
         impulses=np.zeros((*shape, room, 3), dtype),
+        pressed=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        waited=np.zeros(shape, np.int32),
+        span=np.zeros(shape, np.int32),
+        aged=np.zeros(shape, np.int32),
         chosen=np.empty((*shape, room), np.int32),
         choices=np.zeros(shape, np.int32),
         used=used,
@@ -304,7 +319,7 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None) -> Reach:
     reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
     leaves, _, corners = far_pairs(p, pairs, reach, faces)
     sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach)
-    figures = reach, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    figures = reach, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
     none = np.empty((0, 4), np.int32), np.empty((0, FIGURES)), 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
     owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
     vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
