@@ -224,6 +224,17 @@ def kernel(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
+def inlined(function: Callable[..., Any]) -> Any:
+    """A part of the one kernel that calls it, by the same policy.
+
+    It is compiled there alone.  A kernel's code is optimised anew in each kernel above it, so a chain of long ones with one caller
+    each would be optimised as often as it is long.
+    """
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return function
+    return numba.njit(inline="always", **OPTIONS)(function)
+
+
 def specialize(function: Any, name: str, **callees: Any) -> Any:
     """A kernel with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
 

@@ -166,6 +166,8 @@ class State:
         contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
         contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
             ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
+        contact_pressed: what these change velocities by in a substep [m/s], (num_envs, particles, 3); contact_waited, contact_span:
+            substeps since they were last corrected, and after which they are again, (num_envs,).
         contact_tight: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,); contact_ties,
             contact_planes: see there, (num_envs, pairs, ...).
         steps: control steps since the environment's reset, (num_envs,).

@@ -44,9 +44,9 @@ def three_layers(mesh, gap):
 # --- the query, against brute force -----------------------------------------------------------------------------------------
 
 
-def distances_by_sampling(mesh, x, points=25):
-    """Of each vertex: the smallest distance of a pair of vertex and triangle, or of two edges, that it is in and that shares no
-    vertex, (particles,): of points on a fine grid, so a little too large."""
+def pairs_by_sampling(mesh, x, points=25):
+    """Every vertex and triangle, and every two edges, that share no vertex: the vertices of both, and their smallest distance, of
+    points on a fine grid, so a little too large."""
     triangles = mesh.triangles
     edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     share = np.linspace(0, 1, points)
@@ -55,38 +55,66 @@ def distances_by_sampling(mesh, x, points=25):
     inside = u + v <= 1 + 1e-9
     weights = np.stack([1 - u - v, u, v], axis=1)[inside]
     on_triangles = np.einsum("pc,tcd->tpd", weights, x[triangles])
-    room = np.full(len(x), np.inf)
     for e in range(len(edges)):
         for f in range(e + 1, len(edges)):
             if not set(edges[e]) & set(edges[f]):
-                gap = np.sqrt(((on_edges[e][:, None] - on_edges[f]) ** 2).sum(axis=-1).min())
-                members = [*edges[e], *edges[f]]
-                room[members] = np.minimum(room[members], gap)
+                yield edges[e], edges[f], np.sqrt(((on_edges[e][:, None] - on_edges[f]) ** 2).sum(axis=-1).min())
     for p in range(len(x)):
         for t in range(len(triangles)):
             if p not in triangles[t]:
-                gap = np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
-                members = [p, *triangles[t]]
-                room[members] = np.minimum(room[members], gap)
-    return room
+                yield np.array([p]), triangles[t], np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
+
+
+def looked_around(mesh, x, extra, ties):
+    """Bounds and limits of a query with a reach of 6 cm."""
+    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT)
+    room = np.empty((900, 4), np.int32), np.empty((900, FIGURES)), np.empty((ties, TIE), np.int32), np.empty((ties, 4))
+    held = np.zeros(len(x), bool)
+    _, tight = query(x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0), extra, held, bounds, limits, *room, report)
+    return bounds, limits, room[2][:tight]
+
+
+def crumpled_strip(seed):
+    """Folded in three, with far and near pairs that come close."""
+    mesh = clothgym.grid(4, 10, SIDE, 0.2)
+    x = three_layers(mesh, 0.025)
+    return mesh, x + np.random.default_rng(seed).normal(scale=0.004, size=x.shape)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_bound_is_no_larger_than_its_share_of_the_true_distance(seed):
-    """A strip folded in three and crumpled, in which far and near pairs come close."""
-    mesh = clothgym.grid(4, 10, SIDE, 0.2)
-    x = three_layers(mesh, 0.025)
-    x += np.random.default_rng(seed).normal(scale=0.004, size=x.shape)
-    truth = distances_by_sampling(mesh, x)
-    reach = Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0)
-    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT)
-    room = np.empty((900, 4), np.int32), np.empty((900, FIGURES)), np.empty((0, TIE), np.int32), np.empty((0, 4))
-    query(x, pairs_of(mesh), reach, np.zeros(len(x), bool), bounds, limits, *room, report)
+    mesh, x = crumpled_strip(seed)
+    truth = np.full(len(x), np.inf)
+    for one, other, gap in pairs_by_sampling(mesh, x):
+        members = [*one, *other]
+        truth[members] = np.minimum(truth[members], gap)
+    bounds, limits, _ = looked_around(mesh, x, np.zeros(len(x)), 0)
     near = truth < 0.03
     assert near.sum() >= 6  # the case is worth something
     assert np.all(bounds <= 0.45 * truth)
     # and not much smaller than it could be
     assert np.median(bounds[near] / (0.45 * truth[near])) > 0.55
+    assert np.array_equal(bounds, limits)  # nothing is tied
+
+
+@pytest.mark.parametrize("ties", [0, 4000])
+def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(ties):
+    """Some vertices are fast and may go farther: what they may go in all is less than the distance, but for tied pairs."""
+    mesh, x = crumpled_strip(0)
+    random = np.random.default_rng(1)
+    extra = np.where(random.random(len(x)) < 0.3, random.uniform(0, 0.06, len(x)), 0.0)
+    bounds, limits, tied = looked_around(mesh, x, extra, ties)
+    assert len(tied) < max(ties, 1)  # there was room
+    known = {frozenset(row[3 : 3 + row[1]].tolist()) for row in tied}
+    checked = 0
+    for one, other, gap in pairs_by_sampling(mesh, x, 13):
+        members = frozenset([*one.tolist(), *other.tolist()])
+        if not any(members <= pair for pair in known):
+            assert limits[one].max() + limits[other].max() <= 0.9 * gap
+            checked += gap < 0.12
+        assert bounds[one].max() + bounds[other].max() <= 0.9 * gap
+    assert checked > 100
+    assert ties == 0 or limits.max() > 0.05  # those that are fast gain by it
 
 
 # --- nothing passes through itself ------------------------------------------------------------------------------------------
@@ -160,7 +188,7 @@ def test_momentum_is_conserved_in_contact():
     for _ in range(12):
         simulation.step()
         touching = max(touching, simulation.self_contacts.touching[0])
-    assert touching > 10
+    assert touching > 5
     np.testing.assert_allclose(mass @ simulation.velocities[0], before, atol=1e-6)
 
 
@@ -208,7 +236,7 @@ def test_friction_between_layers(friction, slides):
     simulation.step(20)
     loose = (mesh.rest_positions[:, 1] > 0.05) & (mesh.rest_positions[:, 1] < 0.2)
     moved = (simulation.positions[0] - start)[loose, 0].mean()
-    assert (moved > 5e-3) == slides
+    assert (moved > 1e-2) == slides
 
 
 # --- hands ------------------------------------------------------------------------------------------------------------------
@@ -278,12 +306,11 @@ def test_other_integrators_take_part(name):
         mesh, integrator=name, substeps=16 if name == "projective_dynamics" else "auto",
         colliders=[clothgym.Plane(friction=0.5)], self_collision="strict",
     )  # fmt: skip
-    simulation.reset(positions=three_layers(mesh, 0.03))
-    for _ in range(30):
-        simulation.step()
+    simulation.reset(positions=three_layers(mesh, 0.06))
+    simulation.step(45)
     assert count_intersections(mesh.triangles, simulation.positions[0]) == 0
     assert not simulation.diverged[0]
-    assert np.ptp(simulation.positions[0, :, 2]) > 1.8 * 0.28 * SIDE / 8 / np.sqrt(2) * 0.6  # three layers
+    assert np.ptp(simulation.positions[0, :, 2]) > 1.8 * 0.28 * SIDE / 8 / np.sqrt(2)  # three layers
 
 
 def test_an_environment_takes_it_and_tells_of_it():

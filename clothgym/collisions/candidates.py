@@ -59,30 +59,37 @@ def stretches(p, edges, rest_edges, triangles, triangle_edges, stretch):
 
 
 @kernel
-def come_close(p, ends, slack, stretch, within, out):
+def come_close(p, ends, slack, stretch, near, wide, out):
     """Near pairs of vertices that are so close that some of their primitives may be within reach; returns how many."""
     count = 0
     for q in range(ends.shape[0]):
         i, j = ends[q, 0], ends[q, 1]
         dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
+        within = near + wide[i] + wide[j]
         out[count] = q
-        count += dx * dx + dy * dy + dz * dz <= within + slack[q] * max(stretch[i], stretch[j])
+        count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch[i], stretch[j])
     return count
 
 
 @kernel
-def near_candidates(p, pairs, near):
+def near_candidates(p, pairs, near, extra):
     """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), edges
     and edges, (candidates, 2), and the sheet's largest stretch."""
     near_pairs, begins, near_list, vertex_triangles = pairs.near_pairs, pairs.near, pairs.near_list, pairs.vertex_triangles
     stretch = np.empty(p.shape[0])
     largest = stretches(p, pairs.edges, pairs.rest_edges, pairs.triangles, pairs.triangle_edges, stretch)
+    # a primitive's extra is the largest of its vertices
+    wide = np.zeros(p.shape[0])
+    for t in range(pairs.triangles.shape[0]):
+        i, j, k = pairs.triangles[t, 0], pairs.triangles[t, 1], pairs.triangles[t, 2]
+        most = max(extra[i], max(extra[j], extra[k]))
+        wide[i], wide[j], wide[k] = max(wide[i], most), max(wide[j], most), max(wide[k], most)
     close = np.empty(pairs.ends.shape[0] + 1, np.int32)
-    number = come_close(p, pairs.ends, pairs.slack, stretch, near * near, close)
-    most = 0
+    number = come_close(p, pairs.ends, pairs.slack, stretch, near, wide, close)
+    room = 0
     for c in range(number):
-        most += begins[close[c] + 1] - begins[close[c]]
-    corners, edges = np.zeros((most, 3), np.int32), np.empty((most, 2), np.int32)
+        room += begins[close[c] + 1] - begins[close[c]]
+    corners, edges = np.zeros((room, 3), np.int32), np.empty((room, 2), np.int32)
     first, second = 0, 0
     seen = np.zeros(near_pairs.shape[0] if number > 0 else 0, np.bool_)
     for c in range(number):
@@ -101,21 +108,23 @@ def near_candidates(p, pairs, near):
 
 
 @kernel
-def enclose(p, corners, blocks, box, ball, hulls):
-    """Boxes, (6, leaves), and balls (centre and radius), (4, leaves), around leaves, and boxes around blocks, (6, blocks)."""
+def enclose(p, corners, blocks, extra, wide, box, ball, hulls):
+    """Boxes, (6, leaves), and balls (centre and radius), (4, leaves), around leaves, wider by their extra, ``wide``, (leaves,), and
+    boxes around blocks, (6, blocks)."""
     for leaf in range(corners.shape[0]):
         i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
+        wide[leaf] = max(max(extra[i], extra[j]), max(extra[k], extra[l]))
         for c in range(3):
             a, b, d, e = p[i, c], p[j, c], p[k, c], p[l, c]
-            box[c, leaf] = min(min(a, b), min(d, e))
-            box[3 + c, leaf] = max(max(a, b), max(d, e))
+            box[c, leaf] = min(min(a, b), min(d, e)) - wide[leaf]
+            box[3 + c, leaf] = max(max(a, b), max(d, e)) + wide[leaf]
             ball[c, leaf] = 0.25 * (a + b + d + e)
         square = 0.0
         for m in range(4):
             v = corners[leaf, m]
             dx, dy, dz = p[v, 0] - ball[0, leaf], p[v, 1] - ball[1, leaf], p[v, 2] - ball[2, leaf]
             square = max(square, dx * dx + dy * dy + dz * dz)
-        ball[3, leaf] = np.sqrt(square)
+        ball[3, leaf] = np.sqrt(square) + wide[leaf]
     for k in range(blocks.shape[0] - 1):
         for c in range(3):
             low, high = box[c, blocks[k]], box[3 + c, blocks[k]]
@@ -210,7 +219,7 @@ def between(p, corners, leaf, other, nx, ny, nz):
 
 
 @kernel
-def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, found, number, gaps):
+def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, wide, found, number, gaps):
     """Keep those of ``number`` pairs of leaves that no plane shows to be out of reach, with the distance that a plane shows, below
     zero if none does, and the plane's normal, (pairs, 4).  Returns how many.
 
@@ -224,7 +233,7 @@ def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, found,
         second = between(p, corners, leaf, other, faces[0, t], faces[1, t], faces[2, t])
         if second > gap:
             gap, s = second, t
-        if gap < far:
+        if gap < far + wide[leaf] + wide[other]:
             found[count, 0], found[count, 1] = leaf, other
             gaps[count, 0], gaps[count, 1], gaps[count, 2], gaps[count, 3] = gap, faces[0, s], faces[1, s], faces[2, s]
             count += 1
@@ -232,14 +241,14 @@ def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, found,
 
 
 @kernel
-def far_vertices(p, leaves, ball, far, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
+def far_vertices(p, leaves, ball, far, wide, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
     """Vertices and triangles of leaves' pairs that may be close, with the number of the pair; returns how many, though no more than
     fit are written."""
     count = 0
     for pair in range(leaves.shape[0]):
         for way in range(2):
             leaf, other = leaves[pair, way], leaves[pair, 1 - way]
-            r = ball[3, other] + far
+            r = ball[3, other] + far + wide[leaf]
             for m in range(leaf_vertices[leaf], leaf_vertices[leaf + 1]):
                 v = own_vertices[m]
                 dx, dy, dz = p[v, 0] - ball[0, other], p[v, 1] - ball[1, other], p[v, 2] - ball[2, other]
@@ -252,7 +261,7 @@ def far_vertices(p, leaves, ball, far, leaf_vertices, own_vertices, leaf_triangl
 
 
 @kernel
-def far_edges(p, leaves, layered, ridges, stretch, far, leaf_edges, own_edges, edges, half_edges, out):
+def far_edges(p, leaves, layered, ridges, stretch, far, extra, leaf_edges, own_edges, edges, half_edges, out):
     """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more than fit are
     written."""
     count = 0
@@ -264,14 +273,14 @@ def far_edges(p, leaves, layered, ridges, stretch, far, leaf_edges, own_edges, e
                 continue
             i, j = edges[e, 0], edges[e, 1]
             mx, my, mz = p[i, 0] + p[j, 0], p[i, 1] + p[j, 1], p[i, 2] + p[j, 2]
-            half = half_edges[e] * stretch + far
+            half = half_edges[e] * stretch + far + max(extra[i], extra[j])
             for n in range(leaf_edges[other], leaf_edges[other + 1]):
                 f = own_edges[n]
                 if some and not ridges[f]:
                     continue
                 k, l = edges[f, 0], edges[f, 1]
                 dx, dy, dz = p[k, 0] + p[l, 0] - mx, p[k, 1] + p[l, 1] - my, p[k, 2] + p[l, 2] - mz
-                r = half + half_edges[f] * stretch
+                r = half + half_edges[f] * stretch + max(extra[k], extra[l])
                 if dx * dx + dy * dy + dz * dz <= 4.0 * r * r:
                     if count < out.shape[0]:
                         out[count, 0], out[count, 1] = e, f
@@ -280,41 +289,41 @@ def far_edges(p, leaves, layered, ridges, stretch, far, leaf_edges, own_edges, e
 
 
 @kernel
-def far_pairs(p, pairs, far, faces):
+def far_pairs(p, pairs, far, extra, faces):
     """Pairs of leaves without a common vertex to look into, (pairs, 2), the distance that a plane shows them to have [m] and
     its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3)."""
     corners, size = pairs.corners, pairs.corners.shape[0]
     # the last block is looked at as if it were full
     box, ball = np.full((6, size + LEAVES), np.inf), np.zeros((4, size + LEAVES))
-    hulls = np.empty((6, pairs.blocks.shape[0] - 1))
-    enclose(p, corners, pairs.blocks, box, ball, hulls)
+    hulls, wide = np.empty((6, pairs.blocks.shape[0] - 1)), np.empty(size)
+    enclose(p, corners, pairs.blocks, extra, wide, box, ball, hulls)
     found = np.empty((16 * size, 2), np.int32)
     number = far_leaves(pairs, far, ball, box, hulls, found)
     if number > found.shape[0]:
         found = np.empty((number, 2), np.int32)
         far_leaves(pairs, far, ball, box, hulls, found)
     gaps = np.empty((number, 4))
-    number = gaps_of_leaves(p, corners, faces, pairs.leaf_triangles, pairs.own_triangles, far, found, number, gaps)
+    number = gaps_of_leaves(p, corners, faces, pairs.leaf_triangles, pairs.own_triangles, far, wide, found, number, gaps)
     leaves = found[:number]
     vertices = np.empty((4 * number, 3), np.int32)
     owned = pairs.leaf_vertices, pairs.own_vertices, pairs.leaf_triangles, pairs.own_triangles
-    count = far_vertices(p, leaves, ball, far, owned[0], owned[1], owned[2], owned[3], vertices)
+    count = far_vertices(p, leaves, ball, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
     if count > vertices.shape[0]:
         vertices = np.empty((count, 3), np.int32)
-        far_vertices(p, leaves, ball, far, owned[0], owned[1], owned[2], owned[3], vertices)
+        far_vertices(p, leaves, ball, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
     return leaves, gaps[:number], vertices[:count]
 
 
 @kernel
-def far_sides(p, pairs, leaves, layered, ridges, stretch, far):
+def far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra):
     """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges.
 
     stretch: the largest of an edge.
     """
     sides = np.empty((4 * leaves.shape[0], 2), np.int32)
     owned = pairs.leaf_edges, pairs.own_edges, pairs.edges, pairs.half_edges
-    count = far_edges(p, leaves, layered, ridges, stretch, far, owned[0], owned[1], owned[2], owned[3], sides)
+    count = far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
     if count > sides.shape[0]:
         sides = np.empty((count, 2), np.int32)
-        far_edges(p, leaves, layered, ridges, stretch, far, owned[0], owned[1], owned[2], owned[3], sides)
+        far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
     return sides[:count]

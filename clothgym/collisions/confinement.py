@@ -8,17 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.proximity import CLAMPED, JAMMED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
 
 INSIDE = 0.999  # of a bound that is used, for rounding
 REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
 PATIENCE = 4  # looks at all tied pairs after which a query, which frees the vertices again, is the cheaper
+AHEAD = 8  # substeps for which a query shall last: for fast vertices it looks farther
+FORESEEN = 1.0  # of the reach, the most that it looks beyond it for one
 PASSING = 8  # tied pairs passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
 
 
-@kernel
+@inlined
 def confine(x, v, w, sheet, block, h):
     """Keep one block's sheets within their bounds; see the module."""
     memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
@@ -41,7 +43,7 @@ def confine(x, v, w, sheet, block, h):
         if not due and setting.strict:
             due, close = _comes_close(x, memory, block, l, beyond)
         if due:
-            _renew(x, v, w, sheet, block, l)
+            _renew(x, v, w, sheet, block, l, h)
             beyond[:] = True
         if setting.strict and (due or close):
             _hold_apart(x, v, w, sheet, block, l, beyond)
@@ -133,12 +135,12 @@ def _catch_up(x, w, lag, l, h):
     return left
 
 
-@kernel
-def _renew(x, v, w, sheet, block, l):
+@inlined
+def _renew(x, v, w, sheet, block, l, h):
     """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it."""
     memory, setting = sheet.memory, sheet.setting
     start, bounds, old, lag = memory.start[block], memory.limits[block], memory.old[block], memory.lag[block]
-    look_around(old, w, sheet, block, l)
+    look_around(old, v, w, sheet, block, l, h)
     if not setting.strict:
         return
     zero, one = x.dtype.type(0), x.dtype.type(1)
@@ -250,14 +252,15 @@ def _note_lag(w, memory, block, l):
     memory.report[block, l, LAG] = max(memory.report[block, l, LAG], np.float64(memory.behind[block, l]))
 
 
-@kernel
-def look_around(x, w, sheet, block, l):
-    """Query one lane at the given positions."""
+@inlined
+def look_around(x, v, w, sheet, block, l, h):
+    """Query one lane at the given positions; where it is fast it looks farther."""
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
     particles = x.shape[0]
     p, held = np.empty((particles, 3)), np.empty(particles, np.bool_)
-    room, free = np.empty(particles), np.empty(particles)
+    room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
+    _foresee(v, sheet, l, h, extra)
     farthest = 0.0
     for k in range(particles):
         held[k] = w[k, l] <= 0
@@ -273,13 +276,13 @@ def look_around(x, w, sheet, block, l):
     before = memory.contacts[block, l]
     known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
     count, tight = query(
-        p, sheet.pairs, sheet.reach, held, room, free, memory.particles[block, l], memory.figures[block, l], memory.ties[block, l],
-        memory.planes[block, l], report,
+        p, sheet.pairs, sheet.reach, extra, held, room, free, memory.particles[block, l], memory.figures[block, l],
+        memory.ties[block, l], memory.planes[block, l], report,
     )  # fmt: skip
     memory.tight[block, l] = tight
     if not setting.strict:
         room[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
-        free[:] = room
+        free[:] = room + 2.0 * SHARE * extra
     for k in range(particles):
         bounds[k, l] = (INSIDE * room[k]) ** 2
         memory.limits[block, k, l] = (INSIDE * free[k]) ** 2
@@ -291,6 +294,25 @@ def look_around(x, w, sheet, block, l):
     if count == 0:
         memory.pressed[block, :, :, l] = 0
     report[ROWS] = count
+
+
+@kernel
+def _foresee(v, sheet, l, h, extra):
+    """How much farther than its reach a query of one lane looks for each vertex [m].
+
+    It is what the vertex needs, at the speed that it has beside the whole sheet's, not to ask for the next one too soon: few are
+    that fast.
+    """
+    samples, far = sheet.pairs.samples, sheet.reach.far
+    mx, my, mz = 0.0, 0.0, 0.0
+    for s in range(samples.shape[0]):
+        p = samples[s]
+        mx, my, mz = mx + v[p, 0, l], my + v[p, 1, l], mz + v[p, 2, l]
+    share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, FORESEEN * far
+    for p in range(v.shape[0]):
+        dx, dy, dz = v[p, 0, l] - share * mx, v[p, 1, l] - share * my, v[p, 2, l] - share * mz
+        way = ahead * np.sqrt(dx * dx + dy * dy + dz * dz) - 0.5 * far
+        extra[p] = min(max(way, 0.0), most)
 
 
 @kernel

@@ -22,14 +22,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
 from clothgym.collisions.closest import closest_on_segments, closest_on_triangle
 
-LAYERED = 0.6  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
+LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
 LOOSE = 0.8  # of the reach below which pairs are tied
-AT_ONCE = 1.0 / 0.99
 SHARE = 0.45  # of a pair's distance that each side may use; below a half
+SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
 # what is told of each environment, see ``self_collision.SelfContact``
 ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 5, 6, 7
 REPORT = 8
@@ -90,14 +90,28 @@ def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ti
 
 
 @kernel
+def set_free(i, j, k, l, certified, left, loose, extra, free):
+    """Lower the room that a pair which is not tied leaves its four vertices.
+
+    left: of its certified distance, after what its vertices have beyond their shares.  Where there was no room to tie a pair that
+    is too close for that, they have nothing.
+    """
+    for v in (i, j, k, l):
+        free[v] = min(free[v], left if left >= loose else certified - 2.0 * extra[v])
+
+
+@kernel
 def vertex_contacts(
-    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, thickness, kept, margin, loose, stop, standoff, held, room,
-    free, closest, count, particles, figures, tight, ties, planes, report,
+    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, kept, margin, loose, stop,
+    standoff, held, room, free, closest, count, particles, figures, tight, ties, planes, report,
 ):  # fmt: skip
     """Certify vertices and triangles, lower the room of their vertices, and write the contacts down.  Returns the
     numbers of contacts and of tight pairs.
 
-    Pairs closer than ``loose`` are tied, as far as there is room; ``free`` is the room that the others leave.
+    extra: how much farther than ``reach`` is looked for each vertex, and how much more than its share it may go [m], (particles,).
+    Pairs closer than ``loose``, and what their vertices have of that, are tied, as far as there is room; ``free`` is the room that
+    the others leave.  kept: the least thickness of a contact: one that is closer than ``thickness`` is pushed apart only so far,
+    and beyond it only kept from coming closer.
 
     One contact for each closest feature: a face's inside, or a border that this triangle stands for; of two vertices, which meet
     twice, the one of the lower number has it.  closest: becomes the smallest distance
@@ -107,8 +121,8 @@ def vertex_contacts(
         v, t = candidates[m, 0], candidates[m, 1]
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         a, b, c, nx, ny, nz = gap_of_vertex(p, v, i, j, k)
-        square = nx * nx + ny * ny + nz * nz
-        if not square < reach * reach:
+        square, more = nx * nx + ny * ny + nz * nz, extra[v] + max(extra[i], max(extra[j], extra[k]))
+        if not square < (reach + more) * (reach + more):
             continue
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
         nx, ny, nz = nx * scale, ny * scale, nz * scale
@@ -118,13 +132,12 @@ def vertex_contacts(
             min(room[v], certified), min(room[i], certified), min(room[j], certified), min(room[k], certified)
         )  # fmt: skip
         group = candidates[m, 2]
-        if certified < loose and tight < ties.shape[0]:
+        left = certified - more
+        if left < loose and tight < ties.shape[0]:
             tie(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
             tight += 1
         else:
-            free[v], free[i], free[j], free[k] = (
-                min(free[v], certified), min(free[i], certified), min(free[j], certified), min(free[k], certified)
-            )  # fmt: skip
+            set_free(v, i, j, k, certified, left, loose, extra, free)
         if certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
         if certified <= 0.0 or certified > thickness + margin:
@@ -146,7 +159,7 @@ def vertex_contacts(
         if not mine:
             continue
         if count < particles.shape[0]:
-            own = min(thickness, max(kept, certified * AT_ONCE))
+            own = min(thickness, max(kept, certified / (1.0 - SLOP)))
             write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, own, count, particles, figures)
             count += 1
         else:
@@ -156,16 +169,20 @@ def vertex_contacts(
 
 @kernel
 def edge_contacts(
-    p, candidates, edges, ridges, reach, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles, figures,
-    tight, ties, planes, report,
+    p, candidates, edges, ridges, reach, extra, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles,
+    figures, tight, ties, planes, report,
 ):  # fmt: skip
-    """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same."""
+    """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same.
+
+    Only vertices and triangles that do not hang together push each other apart.  Where cloth is pinched, near pairs have no room
+    for their thickness, and edges that are close become ridges and cease to be: what pushed them would never rest.
+    """
     for m in range(candidates.shape[0]):
         e, f = candidates[m, 0], candidates[m, 1]
         i, j, k, l = edges[e, 0], edges[e, 1], edges[f, 0], edges[f, 1]
         s, t, nx, ny, nz = gap_of_edges(p, i, j, k, l)
-        square = nx * nx + ny * ny + nz * nz
-        if not square < reach * reach:
+        square, more = nx * nx + ny * ny + nz * nz, max(extra[i], extra[j]) + max(extra[k], extra[l])
+        if not square < (reach + more) * (reach + more):
             continue
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
         nx, ny, nz = nx * scale, ny * scale, nz * scale
@@ -174,17 +191,16 @@ def edge_contacts(
         room[i], room[j], room[k], room[l] = (
             min(room[i], certified), min(room[j], certified), min(room[k], certified), min(room[l], certified)
         )  # fmt: skip
-        if certified < loose and tight < ties.shape[0]:
+        left = certified - more
+        if left < loose and tight < ties.shape[0]:
             tie(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
             tight += 1
         else:
-            free[i], free[j], free[k], free[l] = (
-                min(free[i], certified), min(free[j], certified), min(free[k], certified), min(free[l], certified)
-            )  # fmt: skip
+            set_free(i, j, k, l, certified, left, loose, extra, free)
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
             if count < particles.shape[0]:
-                own = min(thickness, max(kept, certified * AT_ONCE))
+                own = min(thickness, max(kept, certified / (1.0 - SLOP)))
                 write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, own, count, particles, figures)
                 count += 1
             else:
@@ -193,7 +209,7 @@ def edge_contacts(
 
 
 @kernel
-def tie_layers(p, corners, leaves, gaps, closest, loose, stop, standoff, held, room, free, layered, tight, ties, planes):
+def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, tight, ties, planes):
     """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
     triangles.  Returns the number of tied pairs.
 
@@ -227,14 +243,18 @@ def tie_layers(p, corners, leaves, gaps, closest, loose, stop, standoff, held, r
         if not layered[pair]:
             continue
         leaf, other, gap = leaves[pair, 0], leaves[pair, 1], gaps[pair, 0]
-        tied = gap < loose and kept < ties.shape[0]
+        own, others = 0.0, 0.0
+        for m in range(4):
+            own, others = max(own, extra[corners[leaf, m]]), max(others, extra[corners[other, m]])
+        left = gap - own - others
+        tied = left < loose and kept < ties.shape[0]
         some = False
         for m in range(4):
             for v in (corners[leaf, m], corners[other, m]):
                 room[v] = min(room[v], gap)
                 some |= held[v]
                 if not tied:
-                    free[v] = min(free[v], gap)
+                    free[v] = min(free[v], left if left >= loose else gap - 2.0 * extra[v])
         if tied:
             nx, ny, nz = gaps[pair, 1], gaps[pair, 2], gaps[pair, 3]
             # the direction is from the second leaf to the first
@@ -249,13 +269,14 @@ def tie_layers(p, corners, leaves, gaps, closest, loose, stop, standoff, held, r
     return kept
 
 
-@kernel
-def query(p, pairs, reach, held, bounds, limits, particles, figures, ties, planes, report):
+@inlined
+def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties, planes, report):
     """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``figures``, and of
     tied pairs, which are in ``ties`` and ``planes``.
 
-    p: positions in float64 [m], (particles, 3).  held: particles that hands hold, (particles,).  bounds: becomes how far each
-    vertex may go before a tied pair must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT,).
+    p: positions in float64 [m], (particles, 3).  extra: how much farther than the reach is looked for each vertex [m],
+    (particles,).  held: particles that hands hold, (particles,).  bounds: becomes how far each vertex may go before a tied pair
+    must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT,).
     """
     triangles, edges, triangle_edges = pairs.triangles, pairs.edges, pairs.triangle_edges
     vertex_owner, edge_owner = pairs.vertex_owner, pairs.edge_owner
@@ -266,40 +287,41 @@ def query(p, pairs, reach, held, bounds, limits, particles, figures, ties, plane
     faces, ridges = np.empty((3, triangles.shape[0])), np.empty(edges.shape[0], np.bool_)
     faces_of(p, triangles, faces)
     ridges_of(faces, pairs.edge_triangles, ridges)
-    corners, sides, stretch = near_candidates(p, pairs, reach.near)
+    near, far, thin, thick = reach.near, reach.far, reach.near_thickness, reach.far_thickness
+    corners, sides, stretch = near_candidates(p, pairs, near, extra)
     closest = np.zeros((1, 4))
-    closest[0, 0] = reach.near
+    closest[0, 0] = near
     count, tight = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.near, reach.near_thickness, 0.0, margin, loose, stop,
-        standoff, held, bounds, limits, closest, 0, particles, figures, 0, ties, planes, report,
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, loose, stop, standoff,
+        held, bounds, limits, closest, 0, particles, figures, 0, ties, planes, report,
     )  # fmt: skip
     # these belong to no pair of leaves
     ties[:tight, 2] = -1
     count, tight = edge_contacts(
-        p, sides, edges, ridges, reach.near, reach.near_thickness, 0.0, margin, loose, stop, standoff, held, bounds, limits, count,
-        particles, figures, tight, ties, planes, report,
+        p, sides, edges, ridges, near, extra, thin, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
+        figures, tight, ties, planes, report,
     )  # fmt: skip
-    leaves, gaps, corners = far_pairs(p, pairs, reach.far, faces)
+    leaves, gaps, corners = far_pairs(p, pairs, far, extra, faces)
     closest = np.zeros((leaves.shape[0], 4))
-    closest[:, 0] = reach.far
+    closest[:, 0] = far
     count, tight = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, reach.far, reach.far_thickness, reach.far_thickness, margin, loose, stop,
-        standoff, held, bounds, limits, closest, count, particles, figures, tight, ties, planes, report,
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, far, extra, thick, thick, margin, loose, stop, standoff,
+        held, bounds, limits, closest, count, particles, figures, tight, ties, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
     tight = tie_layers(
-        p, pairs.corners, leaves, gaps, closest, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes
+        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes
     )
-    sides = far_sides(p, pairs, leaves, layered, ridges, stretch, reach.far)
+    sides = far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra)
     count, tight = edge_contacts(
-        p, sides, edges, ridges, reach.far, reach.far_thickness, 0.0, margin, loose, stop, standoff, held, bounds, limits, count,
-        particles, figures, tight, ties, planes, report,
+        p, sides, edges, ridges, far, extra, thick, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
+        figures, tight, ties, planes, report,
     )  # fmt: skip
     least = unlisted
     for v in range(p.shape[0]):
         least = min(least, bounds[v])
         bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
-        limits[v] = SHARE * max(limits[v] - MARGIN, 0.0)
+        limits[v] = SHARE * max(limits[v] - MARGIN + 2.0 * extra[v], 0.0)
     if least < unlisted:
         report[GAP] = min(report[GAP], least)
     return count, tight

@@ -1,10 +1,14 @@
 """Contacts of a sheet with itself: impulses between what is closer than the thickness of the cloth.
 
-Projected Gauss-Seidel on the velocities, one sweep a substep, with a warm start: an impulse is kept from substep to substep,
-pressed on again before anything else, and corrected.  The normal part leaves as much velocity of approach as closes the gap to the
-thickness, not more, and never pulls; it does not switch on and off where the gap is the thickness.  The
-tangential part is what stops the sliding, as far as Coulomb's law allows.  So stacks come to rest, and friction between layers
-holds.  What is too close is pushed apart at a bounded speed, by its position alone, so that no kinetic energy comes of it.
+Projected Gauss-Seidel on the velocities with a warm start: an impulse is kept from substep to substep, pressed on again before
+anything else, and corrected by a sweep over the contacts, each substep, or every few where nothing had to be corrected by much.
+Between sweeps, what all contacts press is one change of velocity for each particle.
+
+The normal part leaves as much velocity of approach as closes the gap to the thickness, not more, and never pulls; it does not
+switch on and off where the gap is the thickness.  The tangential part is what stops the sliding, as far as Coulomb's law allows.
+So stacks come to rest, and friction between layers holds.  What is too close is pushed apart at a bounded speed, by its position
+alone, so that no kinetic energy comes of it; springs that stand against it would make some again, so only what can give way is
+pushed (see ``proximity.edge_contacts``).
 """
 
 from __future__ import annotations
@@ -12,12 +16,11 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import kernel
-from clothgym.collisions.proximity import NORMAL, THICKNESS, TOUCHING
+from clothgym.collisions.proximity import NORMAL, SLOP, THICKNESS, TOUCHING
 
-SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
 SPAN = 4  # substeps between two sweeps over contacts that are calm; over others a sweep goes in each
-CALM = 0.005  # thicknesses that the correction of a calm contact would move it by in the longest span
+CALM = 0.005  # thicknesses by which a calm contact's correction moves it in the longest span, at most
 CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act soon
 SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
 
@@ -163,8 +166,10 @@ def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
 
 @kernel
 def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, friction, push, h, waited):
-    """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.  Returns how many contacts acted,
-    and the most that the velocity along one's normal had to be corrected by [m/s]."""
+    """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.
+
+    Returns how many contacts acted, and the most that the velocity along one's normal had to be corrected by [m/s].
+    """
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.candidates import Reach
 from clothgym.collisions.confinement import confine
 from clothgym.collisions.pairs import Pairs
@@ -42,7 +42,9 @@ class Memory(NamedTuple):
     looked at, and before a query is due [m^2], or -1; old: the last certified positions [m]; lag: how far what is held is
     behind its hand [m]; behind: the largest, (blocks, lanes).
     contacts: how many, (blocks, lanes); particles, figures: see ``proximity``, (blocks, lanes, room, 4) and (..., FIGURES);
-    impulses [N s], (..., 3).  tight: how many tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4).
+    impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
+    contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  tight: how many
+    tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4); looks: at these since the last query.
     chosen: contacts that may act soon, ``choices`` of them.  used: lanes that are no padding, (blocks,).
     report: see ``proximity``, (blocks, lanes, REPORT).
     """
@@ -72,7 +74,7 @@ class Memory(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Options as kernels see them: friction and push speed [m/s] in the kernel's dtype."""
+    """Options as kernels see them: friction, push speed [m/s], and by how much contacts may move and be calm [m] in their dtype."""
 
     strict: bool
     single: bool
@@ -90,7 +92,7 @@ class Sheet(NamedTuple):
     memory: Memory
 
 
-@kernel
+@inlined
 def press(x, v, w, sheet, block, step, h, carried):
     """What happens to one block's sheets before the solids have their say; see the module."""
     memory = sheet.memory
@@ -105,7 +107,7 @@ def press(x, v, w, sheet, block, step, h, carried):
     press_again(x, v, w, sheet, block, carried)
 
 
-@kernel
+@inlined
 def keep_apart(x, v, w, sheet, block, h, carried):
     """And what happens after; see the module."""
     repel(x, v, w, sheet, block, h, carried)

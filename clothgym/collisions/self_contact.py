@@ -33,7 +33,7 @@ from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
 
 MODES = ("fast", "strict")
-REACH = 2.0  # how far a query sees, in thicknesses
+REACH = 1.4  # how far a query sees, in thicknesses
 CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a contact
 ROOM = 12  # contacts for each vertex; more are counted as dropped
 TIGHT = 24  # tied pairs for each vertex; more bound their vertices instead
@@ -121,7 +121,8 @@ class SelfCollision:
         reach = reach_of(mesh, pairs, self.options.thickness)
         self.thickness = reach.far_thickness
         real = dtype.type
-        setting = Setting(self.options.mode == "strict", dtype == np.float32, real(self.options.friction), real(PUSH), real(CALM * reach.far_thickness))
+        friction, push, calm = real(self.options.friction), real(PUSH), real(CALM * self.thickness)
+        setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, calm)
         self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
         self.check(mesh.rest_positions)
 
@@ -317,9 +318,10 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None) -> Reach:
     near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.vertex_triangles))
     # what does not hang together: nothing is looked for beyond two such distances
     reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
-    leaves, _, corners = far_pairs(p, pairs, reach, faces)
-    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach)
-    figures = reach, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    extra = np.zeros(mesh.num_particles)
+    leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
+    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach, extra)
+    figures = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
     none = np.empty((0, 4), np.int32), np.empty((0, FIGURES)), 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
     owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
     vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
