@@ -135,46 +135,54 @@ def enclose(p, corners, blocks, extra, wide, box, ball, hulls):
 
 
 @kernel
-def excess(box, ball, leaf, first, far, out):
-    """By how much the leaves of a block, ``LEAVES`` from ``first`` on, are out of reach of a leaf: surely so if it is above 0."""
+def within(box, ball, beside, bit, leaf, first, number, far):
+    """Which of ``number`` leaves, from ``first`` on, come after a leaf, are not beside it and may be within its reach, as bits.
+
+    All fit in a vector, for which their number must not be known to the compiler, nor their places be signed.
+    """
     lx, ly, lz = box[0, leaf] - far, box[1, leaf] - far, box[2, leaf] - far
     hx, hy, hz = box[3, leaf] + far, box[4, leaf] + far, box[5, leaf] + far
     bx, by, bz, br = ball[0, leaf], ball[1, leaf], ball[2, leaf], ball[3, leaf] + far
-    for m in range(LEAVES):
-        other = first + m
+    bits = 0
+    for m in range(number):
+        other = np.uint64(first + m)
         dx, dy, dz, r = ball[0, other] - bx, ball[1, other] - by, ball[2, other] - bz, ball[3, other] + br
-        low = max(box[0, other] - hx, max(box[1, other] - hy, box[2, other] - hz))
-        high = max(lx - box[3, other], max(ly - box[4, other], lz - box[5, other]))
-        out[m] = max(dx * dx + dy * dy + dz * dz - r * r, max(low, high))
+        beyond = (box[0, other] > hx) | (box[1, other] > hy) | (box[2, other] > hz)
+        beyond |= (lx > box[3, other]) | (ly > box[4, other]) | (lz > box[5, other])
+        kept = (not beyond) & (dx * dx + dy * dy + dz * dz <= r * r) & (first + m > leaf) & ((beside[other] & bit) == 0)
+        bits |= kept << m
+    return bits
 
 
 @kernel
 def far_leaves(pairs, far, ball, box, hulls, out):
-    """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more than fit are written."""
+    """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more are written than fit
+    with one to spare."""
     blocks, neighbours, next_leaves = pairs.blocks, pairs.neighbours, pairs.next_leaves
-    beyond = np.empty(LEAVES)
-    count = 0
+    # a bit for each leaf of a block beside which a leaf is
+    beside = np.zeros(box.shape[1], np.int64)
+    count, last = 0, out.shape[0] - 1
     for one in range(blocks.shape[0] - 1):
+        for leaf in range(blocks[one], blocks[one + 1]):
+            for n in range(neighbours[leaf], neighbours[leaf + 1]):
+                beside[next_leaves[n]] |= 1 << (leaf - blocks[one])
         for two in range(one, blocks.shape[0] - 1):
             if out_of_reach(hulls, one, hulls, two, far):
                 continue
+            first = blocks[two]
+            number = blocks[two + 1] - first
             for leaf in range(blocks[one], blocks[one + 1]):
                 if out_of_reach(box, leaf, hulls, two, far):
                     continue
-                first = blocks[two]
-                excess(box, ball, leaf, first, far, beyond)
+                bits = within(box, ball, beside, 1 << (leaf - blocks[one]), leaf, first, number, far)
+                # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
                 for m in range(LEAVES):
-                    other = first + m
-                    if not beyond[m] <= 0.0 or other <= leaf:
-                        continue
-                    beside = False
-                    for n in range(neighbours[leaf], neighbours[leaf + 1]):
-                        beside |= next_leaves[n] == other
-                    if not beside:
-                        if count < out.shape[0]:
-                            out[count, 0] = leaf
-                            out[count, 1] = other
-                        count += 1
+                    place = min(count, last)
+                    out[place, 0], out[place, 1] = leaf, first + m
+                    count += (bits >> m) & 1
+        for leaf in range(blocks[one], blocks[one + 1]):
+            for n in range(neighbours[leaf], neighbours[leaf + 1]):
+                beside[next_leaves[n]] = 0
     return count
 
 
@@ -262,29 +270,30 @@ def far_vertices(p, leaves, ball, far, wide, leaf_vertices, own_vertices, leaf_t
 
 @kernel
 def far_edges(p, leaves, layered, ridges, stretch, far, extra, leaf_edges, own_edges, edges, half_edges, out):
-    """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more than fit are
-    written."""
-    count = 0
+    """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more are written than fit
+    with one to spare."""
+    count, last, size = 0, out.shape[0] - 1, own_edges.shape[0]
+    # balls around edges, in their leaves' order: twice the centre, and the radius
+    ball, ridge = np.empty((4, size)), np.empty(size, np.bool_)
+    for m in range(size):
+        e = own_edges[m]
+        i, j = edges[e, 0], edges[e, 1]
+        for c in range(3):
+            ball[c, m] = p[i, c] + p[j, c]
+        ball[3, m] = half_edges[e] * stretch + max(extra[i], extra[j])
+        ridge[m] = ridges[e]
     for pair in range(leaves.shape[0]):
-        leaf, other, some = leaves[pair, 0], leaves[pair, 1], layered[pair]
+        leaf, other, any_edge = leaves[pair, 0], leaves[pair, 1], not layered[pair]
+        begin, end = leaf_edges[other], leaf_edges[other + 1]
         for m in range(leaf_edges[leaf], leaf_edges[leaf + 1]):
-            e = own_edges[m]
-            if some and not ridges[e]:
+            if not (any_edge or ridge[m]):
                 continue
-            i, j = edges[e, 0], edges[e, 1]
-            mx, my, mz = p[i, 0] + p[j, 0], p[i, 1] + p[j, 1], p[i, 2] + p[j, 2]
-            half = half_edges[e] * stretch + far + max(extra[i], extra[j])
-            for n in range(leaf_edges[other], leaf_edges[other + 1]):
-                f = own_edges[n]
-                if some and not ridges[f]:
-                    continue
-                k, l = edges[f, 0], edges[f, 1]
-                dx, dy, dz = p[k, 0] + p[l, 0] - mx, p[k, 1] + p[l, 1] - my, p[k, 2] + p[l, 2] - mz
-                r = half + half_edges[f] * stretch + max(extra[k], extra[l])
-                if dx * dx + dy * dy + dz * dz <= 4.0 * r * r:
-                    if count < out.shape[0]:
-                        out[count, 0], out[count, 1] = e, f
-                    count += 1
+            mx, my, mz, reach = ball[0, m], ball[1, m], ball[2, m], ball[3, m] + far
+            for n in range(begin, end):
+                dx, dy, dz, r = ball[0, n] - mx, ball[1, n] - my, ball[2, n] - mz, ball[3, n] + reach
+                place = min(count, last)
+                out[place, 0], out[place, 1] = own_edges[m], own_edges[n]
+                count += (dx * dx + dy * dy + dz * dz <= 4.0 * r * r) & (any_edge or ridge[n])
     return count
 
 
@@ -293,14 +302,13 @@ def far_pairs(p, pairs, far, extra, faces):
     """Pairs of leaves without a common vertex to look into, (pairs, 2), the distance that a plane shows them to have [m] and
     its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3)."""
     corners, size = pairs.corners, pairs.corners.shape[0]
-    # the last block is looked at as if it were full
-    box, ball = np.full((6, size + LEAVES), np.inf), np.zeros((4, size + LEAVES))
+    box, ball = np.empty((6, size)), np.empty((4, size))
     hulls, wide = np.empty((6, pairs.blocks.shape[0] - 1)), np.empty(size)
     enclose(p, corners, pairs.blocks, extra, wide, box, ball, hulls)
     found = np.empty((16 * size, 2), np.int32)
     number = far_leaves(pairs, far, ball, box, hulls, found)
-    if number > found.shape[0]:
-        found = np.empty((number, 2), np.int32)
+    if number >= found.shape[0]:
+        found = np.empty((number + 1, 2), np.int32)
         far_leaves(pairs, far, ball, box, hulls, found)
     gaps = np.empty((number, 4))
     number = gaps_of_leaves(p, corners, faces, pairs.leaf_triangles, pairs.own_triangles, far, wide, found, number, gaps)
@@ -320,10 +328,10 @@ def far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra):
 
     stretch: the largest of an edge.
     """
-    sides = np.empty((4 * leaves.shape[0], 2), np.int32)
+    sides = np.empty((4 * leaves.shape[0] + 1, 2), np.int32)
     owned = pairs.leaf_edges, pairs.own_edges, pairs.edges, pairs.half_edges
     count = far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
-    if count > sides.shape[0]:
-        sides = np.empty((count, 2), np.int32)
+    if count >= sides.shape[0]:
+        sides = np.empty((count + 1, 2), np.int32)
         far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
     return sides[:count]
