@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.pairs import LEAVES
 
 TINY = 1e-300
@@ -34,7 +34,7 @@ class Reach(NamedTuple):
     standoff: float
 
 
-@kernel
+@inlined
 def along(p, v, nx, ny, nz):
     """Place of a vertex along a direction [m]."""
     return nx * p[v, 0] + ny * p[v, 1] + nz * p[v, 2]
@@ -134,7 +134,7 @@ def enclose(p, corners, blocks, extra, wide, box, ball, hulls):
             hulls[3 + c, k] = high
 
 
-@kernel
+@inlined
 def within(box, ball, beside, bit, leaf, first, number, far):
     """Which of ``number`` leaves, from ``first`` on, come after a leaf, are not beside it and may be within its reach, as bits.
 
@@ -175,6 +175,8 @@ def far_leaves(pairs, far, ball, box, hulls, out):
                 if out_of_reach(box, leaf, hulls, two, far):
                     continue
                 bits = within(box, ball, beside, 1 << (leaf - blocks[one]), leaf, first, number, far)
+                if bits == 0:
+                    continue
                 # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
                 for m in range(LEAVES):
                     place = min(count, last)
@@ -186,7 +188,7 @@ def far_leaves(pairs, far, ball, box, hulls, out):
     return count
 
 
-@kernel
+@inlined
 def out_of_reach(a, i, b, j, far):
     """Whether box i of ``a`` and box j of ``b`` are farther apart than ``far`` along an axis."""
     apart = (a[0, i] > b[3, j] + far) | (a[1, i] > b[4, j] + far) | (a[2, i] > b[5, j] + far)
@@ -215,7 +217,7 @@ def ridges_of(faces, edge_triangles, ridges):
         ridges[e] = (s == t) | (not turn >= least)
 
 
-@kernel
+@inlined
 def between(p, corners, leaf, other, nx, ny, nz):
     """Distance along a unit direction of two leaves that it separates [m], on whichever side; else negative."""
     i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]

@@ -45,7 +45,7 @@ TIE, JAMMED = 11, -2
 MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
 
 
-@kernel
+@inlined
 def gap_of_vertex(p, v, i, j, k):
     """Barycentric weights of the point of triangle ijk that is closest to vertex v, and the way from it to v [m]."""
     px, py, pz = p[v, 0], p[v, 1], p[v, 2]
@@ -56,7 +56,7 @@ def gap_of_vertex(p, v, i, j, k):
     return a, b, c, px - (a * ax + b * bx + c * cx), py - (a * ay + b * by + c * cy), pz - (a * az + b * bz + c * cz)
 
 
-@kernel
+@inlined
 def gap_of_edges(p, i, j, k, l):
     """Where on edges ij and kl they are closest, from 0 to 1, and the way from the second to the first [m]."""
     ax, ay, az = p[i, 0], p[i, 1], p[i, 2]
@@ -70,7 +70,7 @@ def gap_of_edges(p, i, j, k, l):
     return s, t, nx, ny, nz
 
 
-@kernel
+@inlined
 def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, figures):
     """Write a contact down."""
     particles[count, 0], particles[count, 1], particles[count, 2], particles[count, 3] = i, j, k, l
@@ -79,7 +79,7 @@ def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, f
     figures[count, THICKNESS] = thickness
 
 
-@kernel
+@inlined
 def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ties, planes):
     """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
     direction, or than ``standoff`` if a hand holds any."""
@@ -89,7 +89,7 @@ def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ti
     planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) - ROUNDING
 
 
-@kernel
+@inlined
 def set_free(i, j, k, l, certified, left, loose, extra, free):
     """Lower the room that a pair which is not tied leaves its four vertices.
 
