@@ -29,19 +29,17 @@ def confine(x, v, w, sheet, block, h):
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    out, overdue = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
+    out, overdue, outside = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_), np.empty((x.shape[0], lanes), np.bool_)
     if lanes == 1:
-        out[0], overdue[0] = _leaves(x, start, bounds, limits, samples)
+        out[0], overdue[0] = _leaves(x, start, bounds, limits, samples, outside)
     else:
-        _leave(x, start, bounds, limits, samples, out, overdue)
-    beyond = np.empty(x.shape[0], np.bool_)
+        _leave(x, start, bounds, limits, samples, outside, out, overdue)
     for l in range(memory.used[block]):
         if not out[l]:
             continue
         # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
-        due, close = overdue[l], False
+        due, close, beyond = overdue[l], False, outside[:, l]
         if not due and setting.strict:
-            _mark(x, start, bounds, samples, l, beyond)
             due, close = _comes_close(x, memory, block, l, beyond)
         if due:
             _renew(x, v, w, sheet, block, l, h)
@@ -56,8 +54,9 @@ def confine(x, v, w, sheet, block, h):
 
 
 @kernel
-def _leave(x, start, bounds, limits, samples, beyond, due):
-    """Mark lanes of which a vertex has left its bound, and its limit, but for a motion that all share: it changes no distance."""
+def _leave(x, start, bounds, limits, samples, outside, beyond, due):
+    """Mark the vertices that have left their bounds, and the lanes in which one has left its bound, or its limit, but for a motion
+    that all share: it changes no distance."""
     lanes = x.shape[2]
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
@@ -67,11 +66,12 @@ def _leave(x, start, bounds, limits, samples, beyond, due):
             for l in range(lanes):
                 mean[c, l] += (xs[c, l] - ss[c, l]) * share
     for p in range(x.shape[0]):
-        xp, sp, bp, lp = x[p], start[p], bounds[p], limits[p]
+        xp, sp, bp, lp, op = x[p], start[p], bounds[p], limits[p], outside[p]
         for l in range(lanes):
             dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
             square = dx * dx + dy * dy + dz * dz
             inside, allowed = square <= bp[l], square <= lp[l]
+            op[l] = not inside
             beyond[l] |= not inside
             due[l] |= not allowed
 
@@ -90,27 +90,18 @@ def _shift(x, start, samples, l):
 
 
 @kernel
-def _leaves(x, start, bounds, limits, samples):
-    """Whether a vertex of the one lane there is has left its bound, and whether one its limit; without loops of one round."""
+def _leaves(x, start, bounds, limits, samples, outside):
+    """The same for the one lane there is, without loops of one round."""
     mx, my, mz = _shift(x, start, samples, 0)
     beyond, due = False, False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, 0] - start[p, 0, 0] - mx, x[p, 1, 0] - start[p, 1, 0] - my, x[p, 2, 0] - start[p, 2, 0] - mz
         square = dx * dx + dy * dy + dz * dz
         inside, allowed = square <= bounds[p, 0], square <= limits[p, 0]
+        outside[p, 0] = not inside
         beyond |= not inside
         due |= not allowed
     return beyond, due
-
-
-@kernel
-def _mark(x, start, bounds, samples, l, beyond):
-    """Mark the vertices of one lane that have left their bounds."""
-    mx, my, mz = _shift(x, start, samples, l)
-    for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
-        inside = dx * dx + dy * dy + dz * dz <= bounds[p, l]
-        beyond[p] = not inside
 
 
 @kernel
@@ -163,7 +154,7 @@ def _renew(x, v, w, sheet, block, l, h):
     _note_lag(w, memory, block, l)
 
 
-@kernel
+@inlined
 def _gap(x, ties, planes, t, l):
     """Distance of tied pair t of one lane along its direction [m]."""
     nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
@@ -179,7 +170,7 @@ def _gap(x, ties, planes, t, l):
     return low - high
 
 
-@kernel
+@inlined
 def _some(ties, t, beyond):
     """Whether a vertex of tied pair t is beyond its bound: only then can the pair be closer than it may."""
     some = beyond[ties[t, 3]] | beyond[ties[t, 4]] | beyond[ties[t, 5]] | beyond[ties[t, 6]]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.proximity import NORMAL, SLOP, THICKNESS, TOUCHING
 
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
@@ -103,7 +103,7 @@ def _put_back(x, v, l, place, motion):
             v[p, c, l] = motion[p, c]
 
 
-@kernel
+@inlined
 def _along(a, particles, figures, k, nx, ny, nz):
     """n.(sum of weights times positions or velocities) of contact k."""
     i, j, m, n = particles[k, 0], particles[k, 1], particles[k, 2], particles[k, 3]
@@ -114,7 +114,7 @@ def _along(a, particles, figures, k, nx, ny, nz):
     return nx * ax + ny * ay + nz * az, ax, ay, az
 
 
-@kernel
+@inlined
 def _push(x, v, w, particles, figures, k, jx, jy, jz, carried, qx, qy, qz):
     """Add an impulse j [N s] to contact k's velocities, what of it has been carried on to its positions, and a push q to these."""
     for c in range(4):
