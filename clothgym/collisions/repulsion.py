@@ -64,30 +64,50 @@ def repel(x, v, w, sheet, block, h, carried):
         if waited < memory.span[block, l]:
             continue
         particles, figures = memory.particles[block, l], memory.figures[block, l]
-        impulses, chosen = memory.impulses[block, l], memory.chosen[block, l]
-        _take(x, v, w, l, place, motion, mobility)
+        impulses, chosen, pressing = memory.impulses[block, l], memory.chosen[block, l], memory.pressing[block, l]
+        pressed = memory.pressed[block, :, :, l]
         if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-            memory.choices[block, l] = _choose(place, motion, particles, figures, impulses, chosen, count, h)
+            memory.choices[block, l] = _choose(x[:, :, l], v[:, :, l], particles, figures, impulses, chosen, count, h)
+            memory.pressers[block, l] = _list_particles(particles, chosen, memory.choices[block, l], pressing, x.shape[0])
             memory.aged[block, l] = 0
-        choices = memory.choices[block, l]
+            pressed[:] = 0
+        choices, pressing = memory.choices[block, l], pressing[: memory.pressers[block, l]]
+        _take(x, v, w, l, pressing, place, motion, mobility)
         touching, most = _correct(
             place, motion, mobility, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h,
             waited,
         )  # fmt: skip
-        _put_back(x, v, l, place, motion)
-        _add_up(mobility, particles, figures, impulses, chosen, choices, motion)
-        for p in range(x.shape[0]):
+        _put_back(x, v, l, pressing, place, motion)
+        _add_up(mobility, particles, figures, impulses, chosen, choices, pressing, motion)
+        for m in range(pressing.shape[0]):
+            p = pressing[m]
             for c in range(3):
-                memory.pressed[block, p, c, l] = motion[p, c]
+                pressed[p, c] = motion[p, c]
         memory.report[block, l, TOUCHING] = touching
         memory.waited[block, l] = 0
         memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
 
 
 @kernel
-def _take(x, v, w, l, place, motion, mobility):
-    """Copy one lane to where its particles lie side by side: contacts read each of them many times."""
-    for p in range(x.shape[0]):
+def _list_particles(particles, chosen, choices, pressing, number):
+    """List the particles of the chosen contacts, in their order; returns how many."""
+    some = np.zeros(number, np.bool_)
+    for c in range(choices):
+        for m in range(4):
+            some[particles[chosen[c], m]] = True
+    count = 0
+    for p in range(number):
+        if some[p]:
+            pressing[count] = p
+            count += 1
+    return count
+
+
+@kernel
+def _take(x, v, w, l, pressing, place, motion, mobility):
+    """Copy the particles of one lane that contacts press to where they lie side by side: contacts read each of them many times."""
+    for m in range(pressing.shape[0]):
+        p = pressing[m]
         mobility[p] = w[p, l]
         for c in range(3):
             place[p, c] = x[p, c, l]
@@ -95,9 +115,10 @@ def _take(x, v, w, l, place, motion, mobility):
 
 
 @kernel
-def _put_back(x, v, l, place, motion):
+def _put_back(x, v, l, pressing, place, motion):
     """And back."""
-    for p in range(x.shape[0]):
+    for m in range(pressing.shape[0]):
+        p = pressing[m]
         for c in range(3):
             x[p, c, l] = place[p, c]
             v[p, c, l] = motion[p, c]
@@ -148,10 +169,11 @@ def _choose(x, v, particles, figures, impulses, chosen, count, h):
 
 
 @kernel
-def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
+def _add_up(w, particles, figures, impulses, chosen, choices, pressing, pressed):
     """What the impulses of a substep change each particle's velocity by [m/s], (particles, 3)."""
     zero = pressed.dtype.type(0)
-    pressed[:] = zero
+    for m in range(pressing.shape[0]):
+        pressed[pressing[m]] = zero
     for c in range(choices):
         k = chosen[c]
         jx, jy, jz = impulses[k, 0], impulses[k, 1], impulses[k, 2]
