@@ -154,29 +154,32 @@ def _renew(x, v, w, sheet, block, l, h):
     _note_lag(w, memory, block, l)
 
 
-@inlined
-def _gap(x, ties, planes, t, l):
-    """Distance of tied pair t of one lane along its direction [m]."""
-    nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
-    own, number = ties[t, 0], ties[t, 1]
-    low, high = np.inf, -np.inf
-    for m in range(number):
-        p = ties[t, 3 + m]
-        place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
-        if m < own:
-            low = min(low, place)
-        else:
-            high = max(high, place)
-    return low - high
-
-
-@inlined
-def _some(ties, t, beyond):
-    """Whether a vertex of tied pair t is beyond its bound: only then can the pair be closer than it may."""
-    some = beyond[ties[t, 3]] | beyond[ties[t, 4]] | beyond[ties[t, 5]] | beyond[ties[t, 6]]
-    if ties[t, 1] == 8:
-        some |= beyond[ties[t, 7]] | beyond[ties[t, 8]] | beyond[ties[t, 9]] | beyond[ties[t, 10]]
-    return some
+@kernel
+def _look_at_ties(x, ties, planes, begin, end, beyond, l, close):
+    """List which tied pairs of one lane, of those from ``begin`` to ``end``, are closer than they may be; only those with a vertex
+    beyond its bound are looked at.  Returns how many are close, and how many were looked at."""
+    count, looks = 0, 0
+    for t in range(begin, end):
+        own, number, some = ties[t, 0], ties[t, 1], False
+        for m in range(number):
+            some |= beyond[ties[t, 3 + m]]
+        if not some:
+            continue
+        looks += 1
+        nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
+        low, high = np.inf, -np.inf
+        for m in range(number):
+            p = ties[t, 3 + m]
+            place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
+            if m < own:
+                low = min(low, place)
+            else:
+                high = max(high, place)
+        # not what is not a number: that has diverged, and is not held
+        if low - high < planes[t, KEPT]:
+            close[count] = t
+            count += 1
+    return count, looks
 
 
 @kernel
@@ -186,18 +189,13 @@ def _comes_close(x, memory, block, l, beyond):
     Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
     looked at than it is worth.
     """
-    ties, planes = memory.ties[block, l], memory.planes[block, l]
-    tight = memory.tight[block, l]
-    due, close, looks = False, False, tight // PASSING
-    for t in range(tight):
-        if _some(ties, t, beyond):
-            looks += 1
-            # not what is not a number: that has diverged, and is not held
-            if _gap(x, ties, planes, t, l) < planes[t, KEPT]:
-                close = True
-                due |= ties[t, 2] != JAMMED
-    memory.looks[block, l] += looks
-    return due or memory.looks[block, l] > PATIENCE * tight, close
+    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
+    close, due = np.empty(tight, np.int32), False
+    count, looks = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
+    for c in range(count):
+        due |= ties[close[c], 2] != JAMMED
+    memory.looks[block, l] += tight // PASSING + looks
+    return due or memory.looks[block, l] > PATIENCE * tight, count > 0
 
 
 @kernel
@@ -205,18 +203,18 @@ def _hold_apart(x, v, w, sheet, block, l, beyond):
     """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; others may follow."""
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
-    ties, planes = memory.ties[block, l], memory.planes[block, l]
+    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
     zero = x.dtype.type(0)
-    stay = np.zeros(x.shape[0], np.bool_)
-    tight = memory.tight[block, l]
-    for t in range(tight):
-        if _some(ties, t, beyond) and _gap(x, ties, planes, t, l) < planes[t, KEPT]:
-            ties[t, 2] = JAMMED
-    going = True
+    close = np.empty(tight, np.int32)
+    count, _ = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
+    for c in range(count):
+        ties[close[c], 2] = JAMMED
+    stay, going = np.zeros(x.shape[0], np.bool_), count > 0
     while going:
         going = False
         for t in range(tight):
-            if _some(ties, t, beyond) and _gap(x, ties, planes, t, l) < planes[t, KEPT]:
+            count, _ = _look_at_ties(x, ties, planes, t, t + 1, beyond, l, close)
+            if count > 0:
                 for m in range(ties[t, 1]):
                     p = ties[t, 3 + m]
                     if stay[p]:

@@ -24,7 +24,7 @@ import numpy as np
 
 from clothgym._jit import inlined, kernel
 from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
-from clothgym.collisions.closest import closest_on_segments, closest_on_triangle
+from clothgym.collisions.closest import closest_on_segments, closest_on_triangle, segments_apart
 
 LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
 LOOSE = 0.8  # of the reach below which pairs are tied
@@ -180,8 +180,13 @@ def edge_contacts(
     for m in range(candidates.shape[0]):
         e, f = candidates[m, 0], candidates[m, 1]
         i, j, k, l = edges[e, 0], edges[e, 1], edges[f, 0], edges[f, 1]
+        more = max(extra[i], extra[j]) + max(extra[k], extra[l])
+        if segments_apart(
+            p[i, 0], p[i, 1], p[i, 2], p[j, 0], p[j, 1], p[j, 2], p[k, 0], p[k, 1], p[k, 2], p[l, 0], p[l, 1], p[l, 2], reach + more
+        ):  # fmt: skip
+            continue
         s, t, nx, ny, nz = gap_of_edges(p, i, j, k, l)
-        square, more = nx * nx + ny * ny + nz * nz, max(extra[i], extra[j]) + max(extra[k], extra[l])
+        square = nx * nx + ny * ny + nz * nz
         if not square < (reach + more) * (reach + more):
             continue
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
