@@ -45,8 +45,8 @@ class Memory(NamedTuple):
     impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
     contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  tight: how many
     tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4); looks: at these since the last query.
-    chosen: contacts that may act soon, ``choices`` of them; pressing: the particles of these, ``pressers`` of them.  used: lanes that are no padding, (blocks,).
-    report: see ``proximity``, (blocks, lanes, REPORT).
+    chosen: contacts that may act soon, ``choices`` of them; pressing: the particles of these, ``pressers`` of them.
+    used: lanes that are no padding, (blocks,).  report: see ``proximity``, (blocks, lanes, REPORT).
     """
 
     start: NDArray
