@@ -6,6 +6,7 @@ import pytest
 from exact_intersections import intersecting_pairs
 
 import clothgym
+from clothgym.collisions import self_contact
 from clothgym.collisions.candidates import Reach
 from clothgym.collisions.pairs import pairs_of
 from clothgym.collisions.proximity import FIGURES, REPORT, TIE, query
@@ -159,6 +160,22 @@ def test_a_thin_sheet_that_is_wrung_does_not_intersect_with_it():
     assert bad == 0
 
 
+def test_a_jam_without_room_for_ties_does_not_creep(monkeypatch):
+    """What may not move at all stays to the bit: if it crept by rounding, it would come through in time."""
+    monkeypatch.setattr(self_contact, "TIGHT", 0)
+    mesh = sheet(9)
+    option = {"mode": "strict", "thickness": 0.012}
+    wring = MANOEUVRES["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)
+    gap = np.inf
+    for _ in range(240):
+        wring.step()
+        gap = min(gap, wring.simulation.self_contacts.gap.min())
+    assert wring.simulation.self_contacts.clamped.min() > 100
+    # pairs move while their distance is above 1e-5 m, and what rounding takes from that is less than a hundredth
+    assert 0.99e-5 < gap < 1.01e-5
+    assert not wring.simulation.intersections().any()
+
+
 # --- what it leaves alone ---------------------------------------------------------------------------------------------------
 
 
@@ -207,6 +224,16 @@ def test_three_layers_on_a_table_rest_at_their_thickness():
     flat = np.abs(x[:, 0] - x[:, 0].mean()) < 0.05  # away from the folds
     layers = [x[flat & (np.round((x[:, 2] - 0.001) / thickness) == k), 2].mean() for k in range(3)]
     np.testing.assert_allclose(np.diff(layers), thickness, rtol=0.2)
+
+
+def test_a_large_heap_comes_to_rest():
+    """It trembles at 60 to 110 mm/s where contacts push apart what cannot give way."""
+    heap = MANOEUVRES["heap"](clothgym.grid(25, 25, 1, 1), seeds=range(4), self_collision={"mode": "strict", "thickness": 0.008})
+    while not heap.over:
+        heap.step()
+    heap.simulation.step(240)
+    speed = np.sqrt((heap.simulation.velocities**2).sum(axis=2).mean(axis=1))
+    assert np.median(speed) < 0.03
 
 
 @pytest.mark.parametrize(("friction", "slides"), [(0.2, True), (0.6, False)])

@@ -41,11 +41,15 @@ def confine(x, v, w, sheet, block, h):
         due, close, beyond = overdue[l], False, outside[:, l]
         if not due and setting.strict:
             due, close = _comes_close(x, memory, block, l, beyond)
+        if close and not due:
+            _hold_apart(x, v, w, sheet, block, l, beyond)
+            # what has stayed has not shared the motion of the others
+            due = _strays(x, start, limits, samples, l)
         if due:
             _renew(x, v, w, sheet, block, l, h)
             beyond[:] = True
-        if setting.strict and (due or close):
-            _hold_apart(x, v, w, sheet, block, l, beyond)
+            if setting.strict:
+                _hold_apart(x, v, w, sheet, block, l, beyond)
     for p in range(x.shape[0]):
         for c in range(3):
             xc, oc = x[p, c], old[p, c]
@@ -105,6 +109,18 @@ def _leaves(x, start, bounds, limits, samples, outside):
 
 
 @kernel
+def _strays(x, start, limits, samples, l):
+    """Whether a vertex of one lane has left its limit."""
+    mx, my, mz = _shift(x, start, samples, l)
+    due = False
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+        allowed = dx * dx + dy * dy + dz * dz <= limits[p, l]
+        due |= not allowed
+    return due
+
+
+@kernel
 def _catch_up(x, w, lag, l, h):
     """Move what lags behind its hand on, as far as the speed for it allows; who has been let go lags no more.  Returns the largest
     lag that is left."""
@@ -135,7 +151,7 @@ def _renew(x, v, w, sheet, block, l, h):
     look_around(old, v, w, sheet, block, l, h)
     if not setting.strict:
         return
-    zero, one = x.dtype.type(0), x.dtype.type(1)
+    zero = x.dtype.type(0)
     report = memory.report[block, l]
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, l] - start[p, 0, l], x[p, 1, l] - start[p, 1, l], x[p, 2, l] - start[p, 2, l]
@@ -145,12 +161,13 @@ def _renew(x, v, w, sheet, block, l, h):
             report[CLAMPED] += 1
             held = w[p, l] <= zero
             for c in range(3):
-                back = (one - keep) * (x[p, c, l] - start[p, c, l])
-                x[p, c, l] -= back
+                # from the start, so that what may not move at all does not creep by rounding
+                place = start[p, c, l] + keep * (x[p, c, l] - start[p, c, l])
                 if held:
-                    lag[p, c, l] += back
+                    lag[p, c, l] += x[p, c, l] - place
                 else:
                     v[p, c, l] *= keep
+                x[p, c, l] = place
     _note_lag(w, memory, block, l)
 
 

@@ -37,7 +37,6 @@ REPORT = 8
 # vector from the second primitive to the first; the thickness is the gap at which it acts [m]
 NORMAL, THICKNESS = 4, 7  # after the weights
 FIGURES = 8
-ROUNDING = 1e-9  # of a distance in float64 [m]
 # of a tight pair: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
 KEPT = 3
 # and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or JAMMED, and the vertices, (room, TIE)
@@ -86,7 +85,7 @@ def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ti
     ties[tight, 0], ties[tight, 1], ties[tight, 2] = own, 4, group
     ties[tight, 3], ties[tight, 4], ties[tight, 5], ties[tight, 6] = i, j, k, l
     least = standoff if held[i] or held[j] or held[k] or held[l] else stop
-    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) - ROUNDING
+    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least)
 
 
 @inlined
@@ -269,7 +268,7 @@ def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, 
             for m in range(4):
                 ties[kept, 3 + m], ties[kept, 7 + m] = corners[leaf, m], corners[other, m]
             planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
-            planes[kept, KEPT] = min(gap, standoff if some else stop) - ROUNDING
+            planes[kept, KEPT] = min(gap, standoff if some else stop)
             kept += 1
     return kept
 
