@@ -29,22 +29,23 @@ def confine(x, v, w, sheet, block, h):
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    out, overdue, outside = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_), np.empty((x.shape[0], lanes), np.bool_)
+    out = np.zeros(lanes, np.bool_)
     if lanes == 1:
-        out[0], overdue[0] = _leaves(x, start, bounds, limits, samples, outside)
+        out[0] = _leaves(x, start, bounds, samples)
     else:
-        _leave(x, start, bounds, limits, samples, outside, out, overdue)
+        _leave(x, start, bounds, samples, out)
+    beyond = np.empty(x.shape[0], np.bool_)
     for l in range(memory.used[block]):
         if not out[l]:
             continue
         # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
-        due, close, beyond = overdue[l], False, outside[:, l]
+        due, close = _mark(x, start, bounds, limits, samples, l, beyond), False
         if not due and setting.strict:
             due, close = _comes_close(x, memory, block, l, beyond)
         if close and not due:
             _hold_apart(x, v, w, sheet, block, l, beyond)
             # what has stayed has not shared the motion of the others
-            due = _strays(x, start, limits, samples, l)
+            due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
             _renew(x, v, w, sheet, block, l, h)
             beyond[:] = True
@@ -58,9 +59,8 @@ def confine(x, v, w, sheet, block, h):
 
 
 @kernel
-def _leave(x, start, bounds, limits, samples, outside, beyond, due):
-    """Mark the vertices that have left their bounds, and the lanes in which one has left its bound, or its limit, but for a motion
-    that all share: it changes no distance."""
+def _leave(x, start, bounds, samples, beyond):
+    """Mark lanes of which a vertex has left its bound, but for a motion that all share: it changes no distance."""
     lanes = x.shape[2]
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
@@ -70,14 +70,11 @@ def _leave(x, start, bounds, limits, samples, outside, beyond, due):
             for l in range(lanes):
                 mean[c, l] += (xs[c, l] - ss[c, l]) * share
     for p in range(x.shape[0]):
-        xp, sp, bp, lp, op = x[p], start[p], bounds[p], limits[p], outside[p]
+        xp, sp, bp = x[p], start[p], bounds[p]
         for l in range(lanes):
             dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
-            square = dx * dx + dy * dy + dz * dz
-            inside, allowed = square <= bp[l], square <= lp[l]
-            op[l] = not inside
+            inside = dx * dx + dy * dy + dz * dz <= bp[l]
             beyond[l] |= not inside
-            due[l] |= not allowed
 
 
 @kernel
@@ -94,28 +91,27 @@ def _shift(x, start, samples, l):
 
 
 @kernel
-def _leaves(x, start, bounds, limits, samples, outside):
-    """The same for the one lane there is, without loops of one round."""
+def _leaves(x, start, bounds, samples):
+    """Whether a vertex of the one lane there is has left its bound; without loops of one round."""
     mx, my, mz = _shift(x, start, samples, 0)
-    beyond, due = False, False
+    beyond = False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, 0] - start[p, 0, 0] - mx, x[p, 1, 0] - start[p, 1, 0] - my, x[p, 2, 0] - start[p, 2, 0] - mz
-        square = dx * dx + dy * dy + dz * dz
-        inside, allowed = square <= bounds[p, 0], square <= limits[p, 0]
-        outside[p, 0] = not inside
+        inside = dx * dx + dy * dy + dz * dz <= bounds[p, 0]
         beyond |= not inside
-        due |= not allowed
-    return beyond, due
+    return beyond
 
 
 @kernel
-def _strays(x, start, limits, samples, l):
-    """Whether a vertex of one lane has left its limit."""
+def _mark(x, start, bounds, limits, samples, l, beyond):
+    """Mark the vertices of one lane that have left their bounds; returns whether one has left its limit."""
     mx, my, mz = _shift(x, start, samples, l)
     due = False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
-        allowed = dx * dx + dy * dy + dz * dz <= limits[p, l]
+        square = dx * dx + dy * dy + dz * dz
+        inside, allowed = square <= bounds[p, l], square <= limits[p, l]
+        beyond[p] = not inside
         due |= not allowed
     return due
 
