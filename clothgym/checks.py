@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def count(name: str, value: Any, what: str = "") -> int:
 
 def members(name: str, value: Any, kind: type, what: str) -> None:
     """A sequence of instances of a class."""
-    if isinstance(value, kind) or not all(isinstance(one, kind) for one in value):
+    if not isinstance(value, Sequence) or not all(isinstance(one, kind) for one in value):
         raise ValueError(f"{name}={value!r}: must be a sequence of {what}")
 
 
@@ -69,6 +70,14 @@ def vector(name: str, value: ArrayLike) -> NDArray:
     if array.shape != (3,):
         raise ValueError(f"{name}={value!r}: must be three numbers")
     return array
+
+
+def vectors(name: str, value: ArrayLike, number: int) -> NDArray:
+    """Finite vectors, one for all or ``number`` of them, as (number, 3)."""
+    array = finite(name, value)
+    if array.shape not in ((3,), (1, 3), (number, 3)):
+        raise ValueError(f"{name} has shape {array.shape}: must be (3,), for all, or {(number, 3)}")
+    return np.broadcast_to(array, (number, 3))
 
 
 def spread(name: str, value: NDArray, shape: tuple[int, ...]) -> NDArray:

@@ -18,7 +18,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import count, one_of, positive
+from clothgym import checks
+from clothgym.checks import one_of, positive
 from clothgym.collisions import Plane
 from clothgym.collisions.intersections import find_intersections
 from clothgym.hands import Gripper
@@ -61,6 +62,9 @@ class Manoeuvre:
         thickness: float = 0.008,
         **options: Any,
     ) -> None:
+        for name in ("num_envs", "colliders", "anchors", "grippers"):
+            if name in options:
+                raise ValueError(f"{name}={options[name]!r}: a manoeuvre has its own")
         self.mesh = mesh
         self.random = [np.random.default_rng(seed) for seed in seeds]
         self.thickness = positive("thickness", thickness)
@@ -139,7 +143,7 @@ class ZFold(Manoeuvre):
     seconds = 5.0
 
     def __init__(self, *args: Any, leaves: int = 8, **options: Any) -> None:
-        self.leaves = count("leaves", leaves)
+        self.leaves = checks.count("leaves", leaves)
         super().__init__(*args, **options)
 
     def _start(self) -> tuple[NDArray, float]:
@@ -192,7 +196,7 @@ class Fold(Manoeuvre):
     )
 
     def __init__(self, *args: Any, times: int = 1, **options: Any) -> None:
-        self.times = count("times", times)
+        self.times = checks.count("times", times)
         if times > len(self.FOLDS):
             raise ValueError(f"times={times!r}: a sheet is folded {len(self.FOLDS)} times at most")
         self.seconds = (self.carrying + self.holding + self.resting) * times + 1.5
@@ -259,7 +263,8 @@ class Wring(Manoeuvre):
     def __init__(
         self, *args: Any, turns: float = 3.0, turning: float = 9.0, share: float = 0.25, approach: float = 0.15, **options: Any
     ) -> None:
-        self.turns, self.turning, self.share, self.approach = turns, turning, share, approach
+        self.turns, self.turning = checks.number("turns", turns), positive("turning", turning)
+        self.share, self.approach = positive("share", share), checks.number("approach", approach)
         self.seconds = turning + self.holding
         super().__init__(*args, **options)
 
@@ -337,7 +342,7 @@ class PickAndDrop(Manoeuvre):
         super().__init__(*args, **options)
         self.lifting = 1.5 * self.side * np.hypot(lift[1], np.sqrt(2) * carry) / self.grippers[0].speed
         self.turn = self.closing + self.lifting + self.dropping
-        self.seconds = count("picks", picks) * self.turn
+        self.seconds = checks.count("picks", picks) * self.turn
 
     def _start(self) -> tuple[NDArray, float]:
         return self.rest, 0.5 * self.thickness
@@ -402,6 +407,9 @@ def starts(
         RuntimeError: a sheet that is not at rest after ``MOST_SETTLING`` seconds, or that intersects itself.
     """
     one_of("kind", kind, *STARTS)
+    checks.count("count", count)
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"seed={seed!r}: must be an integer of at least 0")
     options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options
     manoeuvre = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
     while not manoeuvre.over:

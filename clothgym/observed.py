@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.bending import Bending
@@ -112,8 +113,10 @@ class Observed:
 
     def penetration(self) -> NDArray:
         """How deep the deepest point of the sheet, on its triangles too, is in the colliders' surface [m], (num_envs,); 0 if it
-        is in none.  The thickness that contact keeps does not count as part of a collider."""
-        return self._solids.penetration(self._x, self._surface)
+        is in none, and NaN where positions are not finite.  The thickness that contact keeps does not count as part of a
+        collider."""
+        depth = self._solids.penetration(self._x, self._surface)
+        return np.where(np.isfinite(self.positions).all(axis=(1, 2)), depth, np.nan)
 
     @property
     def self_contacts(self) -> SelfContacts | None:
@@ -121,5 +124,9 @@ class Observed:
         return self._contact.told()
 
     def intersections(self) -> NDArray:
-        """Number of pairs of triangles that intersect, (num_envs,): an exact count, that self-collision has no part in."""
-        return count_intersections(self.mesh.triangles, self.positions)
+        """Number of pairs of triangles that intersect, (num_envs,): an exact count, that self-collision has no part in; -1 where
+        positions are not finite."""
+        x = self.positions
+        counts, finite = np.full(len(x), -1), np.isfinite(x).all(axis=(1, 2))
+        counts[finite] = count_intersections(self.mesh.triangles, x[finite])
+        return counts

@@ -172,6 +172,9 @@ def test_lanes_may_have_different_solids():
     assert found[1] == pytest.approx(1.75, abs=1e-9)
     with pytest.raises(ValueError, match="Plane"):
         simulation.set_collider(0, [Plane()], envs=[0])
+    for wrong in (None, ["Sphere", "Box"]):
+        with pytest.raises(ValueError, match="must be a sequence of 2 colliders"):
+            simulation.set_collider(0, wrong)
 
 
 @pytest.mark.parametrize("name", NAMES)

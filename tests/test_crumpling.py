@@ -113,3 +113,9 @@ def test_what_cannot_be_started():
         starts(GRID, kind="ironed")
     with pytest.raises(ValueError, match="3 times at most"):
         MANOEUVRES["fold"](GRID, times=4)
+    with pytest.raises(ValueError, match="count=0: must be an integer of at least 1"):
+        starts(GRID, count=0)
+    with pytest.raises(ValueError, match="seed=-1"):
+        starts(GRID, seed=-1)
+    with pytest.raises(ValueError, match="a manoeuvre has its own"):
+        starts(GRID, colliders=[])

@@ -179,14 +179,42 @@ def test_a_jam_without_room_for_ties_does_not_creep(monkeypatch):
 # --- what it leaves alone ---------------------------------------------------------------------------------------------------
 
 
-def test_a_free_swing_is_the_same_to_the_bit():
+@pytest.mark.parametrize("option", ["strict", {"mode": "strict", "thickness": 0.002}])
+def test_a_free_swing_is_the_same_to_the_bit(option):
+    """It is much faster than a thin sheet's bounds are wide; they are about the motion that all share."""
     runs = []
-    for mode in (False, "strict"):
+    for mode in (False, option):
         simulation = clothgym.Simulation(sheet(), num_envs=3, anchors=[0, 12], self_collision=mode)
         simulation.step(60)
         runs.append(simulation.positions)
     assert np.abs(runs[0][..., 2]).max() > 0.3  # it did swing
     np.testing.assert_array_equal(*runs)
+
+
+def test_a_thrown_sheet_keeps_its_speed():
+    mesh = sheet(9)
+    option = {"mode": "strict", "thickness": 0.002}
+    simulation = clothgym.Simulation(mesh, gravity=(0, 0, 0), air_density=0.0, self_collision=option)
+    simulation.set_parameters(air_drag=0.0)
+    ripple = 0.005 * np.sin(20 * mesh.rest_positions[:, :1]) * (0, 0, 1)
+    simulation.reset(positions=mesh.rest_positions + ripple, velocities=np.full((1, 81, 3), (8.0, 0.0, 3.0)))
+    simulation.step(30)
+    np.testing.assert_allclose(simulation.velocities[0].mean(axis=0), (8, 0, 3), atol=0.01)
+    np.testing.assert_allclose(simulation.positions[0].mean(axis=0) - ripple.mean(axis=0), (4, 0, 1.5), atol=0.01)
+
+
+def test_what_nothing_certifies_stays_apart():
+    """Halves as near as numbers are, one hinge apart, thrown through each other."""
+    mesh = sheet(9)
+    r = mesh.rest_positions
+    side = np.sign(np.round(r[:, 0], 6))
+    x = np.stack([np.abs(r[:, 0]), r[:, 1], np.where(side > 0, 3e-14 * r[:, 0], 0)], axis=1)
+    simulation = clothgym.Simulation(mesh, self_collision="strict")
+    simulation.reset(positions=x, velocities=-side[:, None] * (0, 0, 1))
+    for _ in range(20):
+        simulation.step()
+        assert not simulation.intersections().any()
+    assert simulation.self_contacts.gap[0] >= 0
 
 
 def test_momentum_is_conserved_in_contact():
@@ -360,6 +388,9 @@ def test_an_environment_takes_it_and_tells_of_it():
         ({"mode": "strict", "friction": -0.1}, "friction"),
         ({"mode": "strict", "thicknes": 0.01}, "no option 'thicknes'"),
         ({"mode": "strict", "thickness": 0.05}, "at most"),
+        ({"mode": "strict", "thickness": 1e-5}, "strict mode takes 0.0002 m and more"),
+        (True, "must be False, 'fast' or 'strict'"),
+        (np.array(["strict", "fast"]), "must be False, 'fast' or 'strict'"),
     ],
 )
 def test_bad_options_are_named(value, message):
@@ -375,6 +406,14 @@ def test_a_start_in_intersection_is_refused_and_changes_nothing():
     with pytest.raises(ValueError, match="triangles .* intersect"):
         simulation.reset(positions=x)
     np.testing.assert_array_equal(simulation.positions, before)
+
+
+def test_a_sheet_that_flies_too_far_is_reported():
+    simulation = clothgym.Simulation(sheet(5), gravity=(0, 0, 0), self_collision="strict")
+    simulation.reset(velocities=np.full((1, 25, 3), (60.0, 0.0, 0.0)))
+    with pytest.warns(RuntimeWarning, match="16 m from the origin"):
+        simulation.step(40)
+    assert simulation.self_contacts.uncertified[0]
 
 
 def test_a_sheet_too_far_from_the_origin_is_reported():

@@ -47,10 +47,8 @@ def confine(x, v, w, sheet, block, h):
             # what has stayed has not shared the motion of the others
             due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
-            _renew(x, v, w, sheet, block, l, h)
             beyond[:] = True
-            if setting.strict:
-                _hold_apart(x, v, w, sheet, block, l, beyond)
+            _renew(x, v, w, sheet, block, l, h, beyond)
     for p in range(x.shape[0]):
         for c in range(3):
             xc, oc = x[p, c], old[p, c]
@@ -140,31 +138,52 @@ def _catch_up(x, w, lag, l, h):
 
 
 @inlined
-def _renew(x, v, w, sheet, block, l, h):
-    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it."""
-    memory, setting = sheet.memory, sheet.setting
-    start, bounds, old, lag = memory.start[block], memory.limits[block], memory.old[block], memory.lag[block]
-    look_around(old, v, w, sheet, block, l, h)
-    if not setting.strict:
-        return
+def _renew(x, v, w, sheet, block, l, h, beyond):
+    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it; all are beyond.
+
+    Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a tie or since it
+    may not move at all, they are about the place itself: there rounding must not add up.
+    """
+    memory = sheet.memory
+    look_around(memory.old[block], v, w, sheet, block, l, h)
+    if sheet.setting.strict:
+        start, limits, tight = memory.start[block], memory.limits[block], memory.tight[block, l]
+        zero = x.dtype.type(0)
+        mx, my, mz = _shift(x, start, sheet.pairs.samples, l)
+        least = limits[0, l]
+        for p in range(x.shape[0]):
+            least = min(least, limits[p, l])
+        if not least > zero:
+            mx, my, mz = zero, zero, zero
+        _draw_back(x, v, w, memory, block, l, h, mx, my, mz)
+        close = np.empty(tight, np.int32)
+        count, _ = _look_at_ties(x, memory.ties[block, l], memory.planes[block, l], 0, tight, beyond, l, close)
+        if count > 0:
+            _draw_back(x, v, w, memory, block, l, h, zero, zero, zero)
+            _hold_apart(x, v, w, sheet, block, l, beyond)
+        _note_lag(w, memory, block, l)
+
+
+@kernel
+def _draw_back(x, v, w, memory, block, l, h, mx, my, mz):
+    """Draw one lane's vertices back to their limits about a common motion m since the query [m]."""
+    start, limits, lag, report = memory.start[block], memory.limits[block], memory.lag[block], memory.report[block, l]
     zero = x.dtype.type(0)
-    report = memory.report[block, l]
     for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, l] - start[p, 0, l], x[p, 1, l] - start[p, 1, l], x[p, 2, l] - start[p, 2, l]
+        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
         square = dx * dx + dy * dy + dz * dz
-        if square > bounds[p, l]:
-            keep = np.sqrt(bounds[p, l] / square)
+        if square > limits[p, l]:
+            keep = np.sqrt(limits[p, l] / square)
             report[CLAMPED] += 1
             held = w[p, l] <= zero
-            for c in range(3):
+            for c, m, d in ((0, mx, dx), (1, my, dy), (2, mz, dz)):
                 # from the start, so that what may not move at all does not creep by rounding
-                place = start[p, c, l] + keep * (x[p, c, l] - start[p, c, l])
+                place = start[p, c, l] + (m + keep * d)
                 if held:
                     lag[p, c, l] += x[p, c, l] - place
                 else:
-                    v[p, c, l] *= keep
+                    v[p, c, l] = m / h + keep * (v[p, c, l] - m / h)
                 x[p, c, l] = place
-    _note_lag(w, memory, block, l)
 
 
 @kernel
@@ -264,18 +283,13 @@ def look_around(x, v, w, sheet, block, l, h):
     p, held = np.empty((particles, 3)), np.empty(particles, np.bool_)
     room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
     _foresee(v, sheet, l, h, extra)
-    farthest = 0.0
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
             start[k, c, l] = x[k, c, l]
             p[k, c] = x[k, c, l]
-            farthest = max(farthest, abs(p[k, c]))
     report = memory.report[block, l]
     report[QUERIES] += 1
-    # what is not finite, or beyond all cloth, has diverged, and is told of as that
-    if setting.single and farthest > FARTHEST and farthest < 1e3:
-        report[UNCERTAIN] = 1
     before = memory.contacts[block, l]
     known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
     count, tight = query(
@@ -297,6 +311,20 @@ def look_around(x, v, w, sheet, block, l, h):
     if count == 0:
         memory.pressed[block, :, :, l] = 0
     report[ROWS] = count
+
+
+@kernel
+def note_uncertain(x, report, used):
+    """Note which of one block's sheets are too far from the origin to be certified; what is not finite has diverged."""
+    farthest = np.zeros(x.shape[2], x.dtype)
+    for p in range(x.shape[0]):
+        for c in range(3):
+            xc = x[p, c]
+            for l in range(x.shape[2]):
+                farthest[l] = max(farthest[l], abs(xc[l]))
+    for l in range(used):
+        if farthest[l] > FARTHEST and farthest[l] < np.inf:
+            report[l, UNCERTAIN] = 1
 
 
 @kernel

@@ -81,11 +81,14 @@ def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, f
 @inlined
 def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ties, planes):
     """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
-    direction, or than ``standoff`` if a hand holds any."""
+    direction, or than ``standoff`` if a hand holds any.
+
+    A direction along which they are not apart certifies nothing: the vertices stay where they are, apart as they are.
+    """
     ties[tight, 0], ties[tight, 1], ties[tight, 2] = own, 4, group
     ties[tight, 3], ties[tight, 4], ties[tight, 5], ties[tight, 6] = i, j, k, l
     least = standoff if held[i] or held[j] or held[k] or held[l] else stop
-    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least)
+    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) if gap > 0.0 else np.inf
 
 
 @inlined
@@ -327,5 +330,5 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
         bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
         limits[v] = SHARE * max(limits[v] - MARGIN + 2.0 * extra[v], 0.0)
     if least < unlisted:
-        report[GAP] = min(report[GAP], least)
+        report[GAP] = min(report[GAP], max(least, 0.0))
     return count, tight

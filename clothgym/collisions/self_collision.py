@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined, kernel
 from clothgym.collisions.candidates import Reach
-from clothgym.collisions.confinement import confine
+from clothgym.collisions.confinement import confine, note_uncertain
 from clothgym.collisions.pairs import Pairs
 from clothgym.collisions.proximity import GAP, LAG, ROWS
 from clothgym.collisions.repulsion import press_again, repel
@@ -106,6 +106,8 @@ def press(x, v, w, sheet, block, step, h, carried):
             report[GAP] = np.inf
             report[ROWS] = memory.contacts[block, l]
             report[LAG] = memory.behind[block, l]
+        if sheet.setting.single:
+            note_uncertain(x, memory.report[block], memory.used[block])
     press_again(x, v, w, sheet, block, carried)
 
 

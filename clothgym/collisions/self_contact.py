@@ -19,6 +19,7 @@ from clothgym.collisions.proximity import (
     FIGURES,
     GAP,
     LAG,
+    MARGIN,
     REPORT,
     TIE,
     UNCERTAIN,
@@ -45,6 +46,8 @@ NEAR_MOST, FAR_MOST = (
     0.45,
 )  # largest thickness over such a distance: of near pairs, which are thinner if need be, and of others
 FRICTION = 0.3
+THINNEST = 20 * MARGIN  # thickness that strict mode takes [m]: rounding takes a share of it
+WANTED = "must be False, 'fast' or 'strict', or a dict with mode, thickness and friction"
 BEYOND = (
     f"within {FARTHEST:g} m float32 can certify that a sheet does not intersect itself; move the scene to the origin, or take "
     "dtype='float64'"
@@ -58,8 +61,8 @@ class SelfContacts(NamedTuple):
 
     rows: contacts within reach; touching: those at which something acted in the last substep.
     clamped: moves of a vertex in a substep that were cut short.  queries: made.  dropped: contacts for which there was no room
-    (they still bound their vertices).  gap: smallest certified distance at a query [m], inf if nothing was within reach or no
-    query made.
+    (they still bound their vertices).  gap: smallest certified distance at a query [m], 0 where the directions that were tried
+    certify none, inf if nothing was within reach or no query made.
     lag: how far the slowest held particle is behind its hand [m].  uncertified: whether the sheet went farther from the origin than
     rounding allows.
     """
@@ -90,14 +93,18 @@ def options_of(value: Any) -> Options | None:
     """
     if value is None or value is False:
         return None
+    if not isinstance(value, (str, Mapping)):
+        raise ValueError(f"self_collision={value!r}: {WANTED}")
     given = dict(value) if isinstance(value, Mapping) else {"mode": value}
     for name in given:
         if name not in Options._fields:
             raise ValueError(f"self_collision: no option {name!r} (there are: {', '.join(Options._fields)})")
     mode, thickness, friction = given.get("mode", "strict"), given.get("thickness"), given.get("friction", FRICTION)
-    if mode not in MODES:
-        raise ValueError(f"self_collision={mode!r}: must be False, 'fast' or 'strict', or a dict with mode, thickness and friction")
+    if not isinstance(mode, str) or mode not in MODES:
+        raise ValueError(f"self_collision={mode!r}: {WANTED}")
     thickness = None if thickness is None else positive("self_collision: thickness", thickness)
+    if thickness is not None and thickness < THINNEST and mode == "strict":
+        raise ValueError(f"self_collision: thickness={thickness!r}: strict mode takes {THINNEST:g} m and more")
     return Options(mode, thickness, not_negative("self_collision: friction", friction))
 
 

@@ -14,7 +14,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import finite, number, vector
+from clothgym.checks import finite, members, number, vector
 
 # rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r with the thickness in it, friction,
 # velocity, the square of the distance from the point beyond which nothing can touch it, thickness, and the velocity that it will
@@ -208,7 +208,8 @@ def check_replacement(colliders: Sequence[Collider], index: int, others: Sequenc
         ValueError: there is no such collider, the number is wrong, or they are of another family.
     """
     check_index(colliders, index)
-    if isinstance(others, Collider) or len(others) != envs:
+    members("colliders", others, Collider, f"{envs} colliders, one for each environment")
+    if len(others) != envs:
         raise ValueError(f"colliders={others!r}: give a sequence of {envs}, one for each environment")
     for other in others:
         if not colliders[index].fits(other):

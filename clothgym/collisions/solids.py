@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import finite, spread
+from clothgym.checks import vectors
 from clothgym.collisions.distance import Shapes
 from clothgym.collisions.mesh_collider import MeshCollider
 from clothgym.collisions.penetration import deepest
@@ -58,12 +58,11 @@ class Solids:
         check_index(self.colliders, index)
         if targets is None and velocities is None:
             raise ValueError("move_colliders: give targets, velocities, or both")
-        shape = (len(env), 3)
-        after = np.zeros(shape) if velocities is None else spread("velocities", finite("velocities", velocities), shape)
+        after = np.zeros((len(env), 3)) if velocities is None else vectors("velocities", velocities, len(env))
         block, lane = self.layout.place(env)
         now = after
         if targets is not None:
-            x = spread("targets", finite("targets", targets), shape)
+            x = vectors("targets", targets, len(env))
             now = (x - self.rows[block, index, POINT : POINT + 3, lane]) / self.time_step
         self.rows[block, index, VELOCITY : VELOCITY + 3, lane] = now
         self.rows[block, index, AFTER : AFTER + 3, lane] = after
