@@ -21,7 +21,7 @@ class Reach(NamedTuple):
     """Distances of a query [m].
 
     near, far: within which near pairs, and all others, are found.  near_thickness, far_thickness: of the cloth there.
-    margin: beyond the thickness within which a pair becomes a contact.  stop: below it a pair may come no closer.
+    margin: beyond the thickness within which a pair becomes a contact.  stop: at which tied pairs are held.
     standoff: distance at which what is held stops.
     """
 

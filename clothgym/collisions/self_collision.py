@@ -10,10 +10,11 @@ After each substep of any integrator, whose name it does not know:
    certified to be free of intersections, and in strict mode vertices that are beyond even their new bounds are drawn back to
    them, and tied pairs are held (see ``confinement``).
 
-So in strict mode: if a sheet starts without intersections, then at the end of every substep every vertex and triangle, and every
-two edges, without a common vertex are at a positive distance.  That holds for what hands hold, too: a hand that would pull cloth
-through cloth is slowed, and its particles lag.  Not promised are a least thickness, the untangling of a sheet that starts tangled,
-and that solids which squeeze cloth stay outside it.  Mode "fast" is the same without the drawing back, and promises nothing.
+So in strict mode: if a sheet starts without intersections, then in every substep every vertex and triangle, and every two edges,
+without a common vertex are at a positive distance all the way, so none has passed through another.  That holds for what hands
+hold, too: a hand that would pull cloth through cloth is slowed, and its particles lag.  Not promised are a least thickness, the
+untangling of a sheet that starts tangled, and that solids which squeeze cloth stay outside it.  Mode "fast" is the same without the
+drawing back, and promises nothing.
 
 Contacts go lane by lane: they share nothing but the mesh.  A lane without contacts costs the test of its bounds alone.
 """
