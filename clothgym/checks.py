@@ -34,10 +34,10 @@ def not_negative(name: str, value: Any) -> float:
     return float(value)
 
 
-def count(name: str, value: Any, what: str = "") -> int:
-    """An integer of at least 1."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise ValueError(f"{name}={value!r}: must be {what}an integer of at least 1")
+def count(name: str, value: Any, what: str = "", least: int = 1) -> int:
+    """An integer of at least ``least``."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
+        raise ValueError(f"{name}={value!r}: must be {what}an integer of at least {least}")
     return int(value)
 
 

@@ -62,24 +62,16 @@ class Manoeuvre:
         thickness: float = 0.008,
         **options: Any,
     ) -> None:
-        for name in ("num_envs", "colliders", "anchors", "grippers"):
-            if name in options:
-                raise ValueError(f"{name}={options[name]!r}: a manoeuvre has its own")
+        if own := {"num_envs", "colliders", "anchors", "grippers"} & set(options):
+            raise ValueError(f"{', '.join(sorted(own))}: a manoeuvre has its own")
         self.mesh = mesh
         self.random = [np.random.default_rng(seed) for seed in seeds]
         self.thickness = positive("thickness", thickness)
         self.rest = mesh.rest_positions - (mesh.rest_positions.max(axis=0) + mesh.rest_positions.min(axis=0)) / 2
         self.side = float(np.ptp(self.rest, axis=0).max())
         self.frames = 0
-        self.simulation = Simulation(
-            mesh,
-            material,
-            num_envs=len(self.random),
-            colliders=[Plane(friction=FRICTION)],
-            anchors=self._anchors().tolist(),
-            grippers=self.grippers,
-            **options,
-        )
+        world = {"colliders": [Plane(friction=FRICTION)], "anchors": self._anchors().tolist(), "grippers": self.grippers}
+        self.simulation = Simulation(mesh, material, num_envs=len(self.random), **world, **options)
         self.start = self._varied(*self._start())
         self.simulation.reset(positions=self.start)
         self.held = self.simulation.positions[:, self.simulation.anchors].astype(np.float64)
@@ -263,8 +255,7 @@ class Wring(Manoeuvre):
     def __init__(
         self, *args: Any, turns: float = 3.0, turning: float = 9.0, share: float = 0.25, approach: float = 0.15, **options: Any
     ) -> None:
-        self.turns, self.turning = checks.number("turns", turns), positive("turning", turning)
-        self.share, self.approach = positive("share", share), checks.number("approach", approach)
+        self.turns, self.turning, self.share, self.approach = turns, positive("turning", turning), share, approach
         self.seconds = turning + self.holding
         super().__init__(*args, **options)
 
@@ -408,8 +399,7 @@ def starts(
     """
     one_of("kind", kind, *STARTS)
     checks.count("count", count)
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"seed={seed!r}: must be an integer of at least 0")
+    checks.count("seed", seed, least=0)
     options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options
     manoeuvre = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
     while not manoeuvre.over:

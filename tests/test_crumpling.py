@@ -94,11 +94,12 @@ def test_a_corner_is_dragged_at_its_speed():
 
 @pytest.mark.parametrize("kind", STARTS)
 def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
-    x = starts(GRID, kind=kind, count=2, seed=5)
-    assert x.shape == (2, GRID.num_particles, 3)
+    mesh = grid(10, 10, 0.8, 0.8)
+    x = starts(mesh, kind=kind, count=2, seed=5)
+    assert x.shape == (2, mesh.num_particles, 3)
     assert not np.array_equal(x[0], x[1])
     for sheet in x:
-        assert intersecting_pairs(GRID.triangles, sheet) == set()
+        assert intersecting_pairs(mesh.triangles, sheet) == set()
     assert 0 <= x[:, :, 2].min() < 0.01
     assert x[:, :, 2].max() > 0.008  # not flat
 

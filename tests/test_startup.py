@@ -12,7 +12,7 @@ SIMULATE = """
 import numpy as np
 from clothgym import Simulation, grid
 import clothgym.simulation as simulation
-s = Simulation(grid(3, 3, 0.1, 0.1), anchors=[0])
+s = Simulation(grid(3, 3, 0.1, 0.1), anchors=[0], contact="particles")
 s.step(3)
 compiled = s._advance.stats.cache_misses
 print(sum(compiled.values()), s.positions.sum())
@@ -81,7 +81,7 @@ TWO_THREADS = """
 import threading
 from clothgym import Simulation, grid, _jit
 def run(name):
-    Simulation(grid(3, 3, 0.1, 0.1), integrator=name, anchors=[0]).step(2)
+    Simulation(grid(3, 3, 0.1, 0.1), integrator=name, anchors=[0], contact="particles").step(2)
 threads = [threading.Thread(target=run, args=(name,)) for name in ("semi_implicit_euler", "xpbd")]
 [t.start() for t in threads]
 [t.join() for t in threads]
