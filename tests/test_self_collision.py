@@ -184,8 +184,8 @@ def test_a_free_swing_is_the_same_to_the_bit(option):
     """It is much faster than a thin sheet's bounds are wide; they are about the motion that all share."""
     runs = []
     for mode in (False, option):
-        simulation = clothgym.Simulation(sheet(), num_envs=3, anchors=[0, 12], self_collision=mode)
-        simulation.step(60)
+        simulation = clothgym.Simulation(clothgym.grid(13, 13, 1, 1), num_envs=3, anchors=[0, 12], self_collision=mode)
+        simulation.step(40)
         runs.append(simulation.positions)
     assert np.abs(runs[0][..., 2]).max() > 0.3  # it did swing
     np.testing.assert_array_equal(*runs)
@@ -201,20 +201,6 @@ def test_a_thrown_sheet_keeps_its_speed():
     simulation.step(30)
     np.testing.assert_allclose(simulation.velocities[0].mean(axis=0), (8, 0, 3), atol=0.01)
     np.testing.assert_allclose(simulation.positions[0].mean(axis=0) - ripple.mean(axis=0), (4, 0, 1.5), atol=0.01)
-
-
-def test_what_nothing_certifies_stays_apart():
-    """Halves as near as numbers are, one hinge apart, thrown through each other."""
-    mesh = sheet(9)
-    r = mesh.rest_positions
-    side = np.sign(np.round(r[:, 0], 6))
-    x = np.stack([np.abs(r[:, 0]), r[:, 1], np.where(side > 0, 3e-14 * r[:, 0], 0)], axis=1)
-    simulation = clothgym.Simulation(mesh, self_collision="strict")
-    simulation.reset(positions=x, velocities=-side[:, None] * (0, 0, 1))
-    for _ in range(20):
-        simulation.step()
-        assert not simulation.intersections().any()
-    assert simulation.self_contacts.gap[0] >= 0
 
 
 def test_momentum_is_conserved_in_contact():
