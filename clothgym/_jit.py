@@ -27,6 +27,7 @@ from types import FunctionType
 from typing import Any, cast
 
 import numba
+from llvmlite import binding as llvm
 from numba.core import caching
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import rtsys
@@ -154,8 +155,47 @@ class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  #
         pass
 
 
+class _Outdated(Exception):
+    """Compiled code calls code that is no longer there."""
+
+
 class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    """What is kept of compiled code: also which kernels that stay apart it calls, ``(name, argument types, symbol)`` each."""
+
     _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
+
+    def reduce(self, result: Any) -> Any:
+        return _calls_of(result.library), super().reduce(result)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        calls, payload = payload
+        # they must be there before the code is, in which their symbols are looked up
+        libraries = []
+        for name, types, symbol in calls:
+            _dispatchers[name].compile(types)
+            called = _dispatchers[name].overloads[types]
+            if called.fndesc.mangled_name != symbol:
+                raise _Outdated
+            libraries.append(called.library)
+        result = super().rebuild(target_context, payload)
+        result.library.calls, result.library.called = calls, libraries
+        return result
+
+
+def _calls_of(library: Any) -> list[tuple[str, Any, str]]:
+    """Kernels that stay apart which a library calls, itself or in what is linked into it."""
+    if not hasattr(library, "calls"):
+        library.calls = list(dict.fromkeys(call for part in library._linking_libraries for call in _asks(part)))
+    return library.calls
+
+
+def _asks(library: Any) -> list[tuple[str, Any, str]]:
+    """What must be there for a call of a library."""
+    return [library.stays_apart] if hasattr(library, "stays_apart") else _calls_of(library)
+
+
+# all kernels by name, for compiled code that calls them
+_dispatchers: dict[str, Any] = {}
 
 
 class _Cache(caching.FunctionCache):  # type: ignore[misc]
@@ -163,9 +203,10 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
 
     _impl_class = _Impl
 
-    def __init__(self, py_func: FunctionType) -> None:
+    def __init__(self, py_func: FunctionType, apart: bool) -> None:
         super().__init__(py_func)
         self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}"
+        self.apart = apart
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         folder = cache_folder()
@@ -186,9 +227,12 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         else:
             target_context.refresh()
         try:
-            return self._load_overload(sig, target_context)
-        except (OSError, EOFError, pickle.UnpicklingError):  # a file cut short, by a full disk for instance: compile anew
+            found = self._load_overload(sig, target_context)
+        except (OSError, EOFError, pickle.UnpicklingError, _Outdated):  # a file cut short, by a full disk for instance
             return None
+        if found is not None:
+            self._set_apart(found)
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         folder = cache_folder()
@@ -197,17 +241,29 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
                 super().save_overload(sig, data)
             except OSError as error:
                 folder.give_up(error)
+        self._set_apart(data)
+
+    def _set_apart(self, result: Any) -> None:
+        """Give callers nothing to link but the symbol, if the kernel is to stay apart."""
+        if self.apart:
+            library = result.library
+            library.stays_apart = self.lock_name, result.signature.args, result.fndesc.mangled_name
+            library._shared_module = llvm.parse_assembly(str(library._codegen._create_empty_module("apart")))
 
 
-def kernel(function: Callable[..., Any]) -> Any:
+def kernel(function: Callable[..., Any], apart: bool = False) -> Any:
     """Compile ``function`` by the project's policy, at its first call, through the locked cache.
 
     Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
+
+    apart: compile it once for all its callers, who jump to it.  Of others numba links the code into each kernel above them, and
+    optimises it anew there: right for what is short, and minutes in all for what is long and has many callers.
     """
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return function
     dispatcher = numba.njit(**OPTIONS)(function)
-    dispatcher._cache = _Cache(cast(FunctionType, function))
+    dispatcher._cache = _Cache(cast(FunctionType, function), apart)
+    _dispatchers[dispatcher._cache.lock_name] = dispatcher
     compile_or_load = dispatcher.compile
 
     def compile_locked(signature: Any) -> Any:
@@ -225,7 +281,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """A part of the one kernel that calls it, by the same policy.
+    """A part of the kernels that call it, by the same policy: for a long one with one caller, and for the shortest.
 
     It is compiled there alone.  A kernel's code is optimised anew in each kernel above it, so a chain of long ones with one caller
     each would be optimised as often as it is long.
@@ -235,8 +291,13 @@ def inlined(function: Callable[..., Any]) -> Any:
     return numba.njit(inline="always", **OPTIONS)(function)
 
 
-def specialize(function: Any, name: str, **callees: Any) -> Any:
-    """A kernel with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
+def apart(function: Callable[..., Any]) -> Any:
+    """A ``kernel`` that is compiled once for all its callers."""
+    return kernel(function, apart=True)
+
+
+def specialize(function: Any, name: str, apart: bool = False, **callees: Any) -> Any:
+    """A ``kernel`` with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
 
     This is how one substep loop serves every integrator: numba's disk cache misses in each new process when a dispatcher
     is an argument or a closure variable, and hits when it is a global.  ``name`` keeps the cache entries apart, with a digest
@@ -250,7 +311,7 @@ def specialize(function: Any, name: str, **callees: Any) -> Any:
     bound = FunctionType(code, {**function.__globals__, **callees}, name)
     bound.__qualname__ = name
     bound.__module__ = function.__module__
-    return kernel(bound)
+    return kernel(bound, apart)
 
 
 _pool: ThreadPoolExecutor | None = None

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.mesh import ClothMesh
 from clothgym.state import BendArrays
 
@@ -217,7 +217,7 @@ def _hinge_rows(scratch):
     return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
 
 
-@kernel
+@apart
 def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
     """Of the energy ``B/2 weight (angle - rest angle)^2``."""
     members, weight, rest_angle, _ = bends
@@ -235,7 +235,7 @@ def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
                     fm[e, l] -= slopes[3 * m + e, l] * angle[l]
 
 
-@kernel
+@apart
 def add_hinge_products(x, p, y, bends, scale, scratch):
     """The part of the energy's matrix that is never negative: the derivatives' outer product (Gauss and Newton)."""
     members, weight, _, _ = bends

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.bending import Bending
 from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.state import Elements, State
@@ -21,7 +21,7 @@ POWER_STEPS = 16
 TINY = 1e-30  # [m^2]: a spring of no length, as in a sheet that is folded on itself, has no direction to pull in
 
 
-@kernel
+@apart
 def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
     """Add Hooke's force and the damper's along each spring to ``f`` [N], (particles, 3, lanes).
 
@@ -85,7 +85,7 @@ def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
         f[j, 2] -= fz
 
 
-@kernel
+@apart
 def add_spring_products(x, p, y, springs, along, across, row):
     """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (particles, 3, lanes).
 
@@ -151,7 +151,7 @@ def _add_spring_products_of_one(x, p, y, springs, along, across):
         y[j, 2] += tz
 
 
-@kernel
+@apart
 def add_air_forces(x, v, f, surface, resistance, wind, row):
     """Add the air's force on each triangle to ``f`` [N], (particles, 3, lanes).
 

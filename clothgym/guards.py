@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart
 from clothgym.bending import Bending
 from clothgym.forces import Oscillators
 from clothgym.integrators import Integrator
@@ -19,7 +19,7 @@ from clothgym.state import Elements, Fabric
 FASTEST = 1e3  # no cloth moves at a kilometre a second [m/s]
 
 
-@kernel
+@apart
 def mark_diverged(x, v, diverged):
     """Set the flags, (lanes,), of lanes where something is not finite, or faster than ``FASTEST``."""
     limit = x.dtype.type(FASTEST)

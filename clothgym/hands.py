@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import kernel, run_spans, specialize
+from clothgym._jit import apart, kernel, run_spans, specialize
 from clothgym.bending import BEND_SCRATCH, Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.collisions import DESK, ROWS, Solids, keep_out, stop_at_solids
@@ -287,7 +287,7 @@ def count_held(holder, anchors, out):
                     out[b, k, l] += 1
 
 
-@kernel
+@apart
 def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
     """Begin a control step of one block: move fingers, take hold or let go, and set the velocity of what is held.
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
@@ -48,7 +48,7 @@ class Limiting(NamedTuple):
     sweeps: NDArray
 
 
-@kernel
+@apart
 def limit_strain(x, v, w, springs, limit, report):
     """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
 
@@ -74,7 +74,7 @@ def limit_strain(x, v, w, springs, limit, report):
         _sweep(x, v, w, springs, x.dtype.type(limit), enough, largest)
 
 
-@kernel
+@apart
 def measure_strain(x, springs, report):
     """What is left at the end of a control step, after contact, which knows nothing of the limit."""
     _largest_strain(x, springs, report[AFTER])

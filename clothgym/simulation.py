@@ -67,7 +67,7 @@ def advance(
 @cache
 def _compiled(substep: Any, name: str, model: Bending, limits: bool, collides: bool, contact: str) -> Any:
     """The main loop around an integrator's substep, in which the model's kernels bend."""
-    bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", **model.kernels)
+    bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", apart=True, **model.kernels)
     parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | CONTACT[contact]
     return specialize(advance, f"advance_{name}_{model.name}_{limits}_{collides}_{contact}", substep=bound, **parts)
 

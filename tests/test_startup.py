@@ -106,3 +106,18 @@ def test_a_folder_that_vanishes_costs_a_sentence(tmp_path):
     code = "import shutil, os\nfrom clothgym import _jit\n_jit.cache_folder()\nshutil.rmtree(os.environ['CLOTHGYM_CACHE_DIR'])\n"
     out, err = start(code + SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path / "cache")).communicate(timeout=300)
     assert out.startswith("1 "), err
+
+
+def test_a_callee_that_stays_apart_is_compiled_once_and_its_callers_anew_when_it_has_changed(tmp_path):
+    """Two main loops call one substep's code; its symbol is another when a process compiles it that did other things before."""
+    more = SIMULATE + "from clothgym import Plane\nSimulation(grid(3, 3, 0.1, 0.1), colliders=[Plane()]).step()\n"
+    first, err = start(more, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    loops, substeps = list(tmp_path.rglob("simulation.advance_*.nbc")), list(tmp_path.rglob("*.semi_implicit_euler_springs*.nbc"))
+    assert (len(loops), len(substeps)) == (2, 1), err
+    again, err = start(SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    assert again.split() == ["0", first.split()[1]] and err == ""
+    for path in tmp_path.rglob("*.semi_implicit_euler_springs*"):
+        path.unlink()
+    other = "from clothgym import Simulation, grid\nSimulation(grid(3, 3, 0.1, 0.1), integrator='verlet').step()\n"
+    again, err = start(other + SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
+    assert again.split() == ["1", first.split()[1]], err

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.collisions.distance import CONTACT, SPOT, lay_out, measure, normal_to_world, to_axes
 from clothgym.collisions.shapes import ROWS, THICKNESS, VELOCITY
 
@@ -34,7 +34,7 @@ def _room(x, collider, shapes, k, lane, spent, point, rows, desk):
     return desk[CONTACT, 0] + desk[THICKNESS, 0]
 
 
-@kernel
+@apart
 def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, desk):
     """Take one point along its way, in which solids may be; return whether they changed it.
 
@@ -83,7 +83,7 @@ def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, desk
     return changed
 
 
-@kernel
+@apart
 def keep_out(start, way, colliders, shapes, lane, time_step, point, rows, desk):
     """Change a way so that a point which goes it from ``start``, (3,), ends no deeper in any solid than it began.
 

@@ -1,7 +1,7 @@
 """Which primitives of one sheet may be close: the broad phase of self-collision's query.
 
-Near pairs (see ``pairs``) by the distances of their vertices; all others by boxes of blocks, boxes, balls and planes of leaves, and
-balls of primitives.  What is left out is surely farther apart than the query's reach.
+Near pairs (see ``pairs``) by the distances of their vertices; all others by the boxes of a tree, boxes, balls and planes of leaves,
+and balls of primitives.  What is left out is surely farther apart than the query's reach.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from clothgym._jit import inlined, kernel
-from clothgym.collisions.pairs import LEAVES
+from clothgym._jit import apart, inlined, kernel
+from clothgym.collisions.pairs import BEGIN, END, LEAVES, NEXT
 
 TINY = 1e-300
 FLAT = 0.2  # angle [rad] up to which neighbouring faces are taken for flat: there vertices alone keep layers apart
@@ -71,7 +71,7 @@ def come_close(p, ends, slack, stretch, near, wide, out):
     return count
 
 
-@kernel
+@apart
 def near_candidates(p, pairs, near, extra):
     """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), edges
     and edges, (candidates, 2), and the sheet's largest stretch."""
@@ -108,9 +108,9 @@ def near_candidates(p, pairs, near, extra):
 
 
 @kernel
-def enclose(p, corners, blocks, extra, wide, box, ball, hulls):
+def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
     """Boxes, (6, leaves), and balls (centre and radius), (4, leaves), around leaves, wider by their extra, ``wide``, (leaves,), and
-    boxes around blocks, (6, blocks)."""
+    boxes around nodes, (6, nodes)."""
     for leaf in range(corners.shape[0]):
         i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
         wide[leaf] = max(max(extra[i], extra[j]), max(extra[k], extra[l]))
@@ -125,11 +125,16 @@ def enclose(p, corners, blocks, extra, wide, box, ball, hulls):
             dx, dy, dz = p[v, 0] - ball[0, leaf], p[v, 1] - ball[1, leaf], p[v, 2] - ball[2, leaf]
             square = max(square, dx * dx + dy * dy + dz * dz)
         ball[3, leaf] = np.sqrt(square) + wide[leaf]
-    for k in range(blocks.shape[0] - 1):
+    for k in range(nodes.shape[0] - 1, -1, -1):
+        one, begin, end = k + 1, nodes[k, BEGIN], nodes[k, END]
         for c in range(3):
-            low, high = box[c, blocks[k]], box[3 + c, blocks[k]]
-            for leaf in range(blocks[k], blocks[k + 1]):
-                low, high = min(low, box[c, leaf]), max(high, box[3 + c, leaf])
+            if one < nodes[k, NEXT]:
+                two = nodes[one, NEXT]
+                low, high = min(hulls[c, one], hulls[c, two]), max(hulls[3 + c, one], hulls[3 + c, two])
+            else:
+                low, high = box[c, begin], box[3 + c, begin]
+                for leaf in range(begin, end):
+                    low, high = min(low, box[c, leaf]), max(high, box[3 + c, leaf])
             hulls[c, k] = low
             hulls[3 + c, k] = high
 
@@ -158,23 +163,32 @@ def within(box, ball, beside, bit, leaf, first, number, far):
 def far_leaves(pairs, far, ball, box, hulls, out):
     """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more are written than fit
     with one to spare."""
-    blocks, neighbours, next_leaves = pairs.blocks, pairs.neighbours, pairs.next_leaves
-    # a bit for each leaf of a block beside which a leaf is
+    nodes, neighbours, next_leaves = pairs.nodes, pairs.neighbours, pairs.next_leaves
+    # a bit for each leaf of a node beside which a leaf is
     beside = np.zeros(box.shape[1], np.int64)
     count, last = 0, out.shape[0] - 1
-    for one in range(blocks.shape[0] - 1):
-        for leaf in range(blocks[one], blocks[one + 1]):
+    for one in range(nodes.shape[0]):
+        if nodes[one, NEXT] > one + 1:
+            continue
+        begin, end = nodes[one, BEGIN], nodes[one, END]
+        for leaf in range(begin, end):
             for n in range(neighbours[leaf], neighbours[leaf + 1]):
-                beside[next_leaves[n]] |= 1 << (leaf - blocks[one])
-        for two in range(one, blocks.shape[0] - 1):
-            if out_of_reach(hulls, one, hulls, two, far):
+                beside[next_leaves[n]] |= 1 << (leaf - begin)
+        # what comes after it in the tree; a node that is out of reach is passed over with all that is in it
+        two = one
+        while two < nodes.shape[0]:
+            inside, two = two, nodes[two, NEXT]
+            if out_of_reach(hulls, one, hulls, inside, far):
                 continue
-            first = blocks[two]
-            number = blocks[two + 1] - first
-            for leaf in range(blocks[one], blocks[one + 1]):
-                if out_of_reach(box, leaf, hulls, two, far):
+            if two > inside + 1:
+                two = inside + 1
+                continue
+            first = nodes[inside, BEGIN]
+            number = nodes[inside, END] - first
+            for leaf in range(begin, end):
+                if out_of_reach(box, leaf, hulls, inside, far):
                     continue
-                bits = within(box, ball, beside, 1 << (leaf - blocks[one]), leaf, first, number, far)
+                bits = within(box, ball, beside, 1 << (leaf - begin), leaf, first, number, far)
                 if bits == 0:
                     continue
                 # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
@@ -182,7 +196,7 @@ def far_leaves(pairs, far, ball, box, hulls, out):
                     place = min(count, last)
                     out[place, 0], out[place, 1] = leaf, first + m
                     count += (bits >> m) & 1
-        for leaf in range(blocks[one], blocks[one + 1]):
+        for leaf in range(begin, end):
             for n in range(neighbours[leaf], neighbours[leaf + 1]):
                 beside[next_leaves[n]] = 0
     return count
@@ -299,14 +313,14 @@ def far_edges(p, leaves, layered, ridges, stretch, far, extra, leaf_edges, own_e
     return count
 
 
-@kernel
+@apart
 def far_pairs(p, pairs, far, extra, faces):
     """Pairs of leaves without a common vertex to look into, (pairs, 2), the distance that a plane shows them to have [m] and
     its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3)."""
     corners, size = pairs.corners, pairs.corners.shape[0]
     box, ball = np.empty((6, size)), np.empty((4, size))
-    hulls, wide = np.empty((6, pairs.blocks.shape[0] - 1)), np.empty(size)
-    enclose(p, corners, pairs.blocks, extra, wide, box, ball, hulls)
+    hulls, wide = np.empty((6, pairs.nodes.shape[0])), np.empty(size)
+    enclose(p, corners, pairs.nodes, extra, wide, box, ball, hulls)
     found = np.empty((16 * size, 2), np.int32)
     number = far_leaves(pairs, far, ball, box, hulls, found)
     if number >= found.shape[0]:
@@ -324,7 +338,7 @@ def far_pairs(p, pairs, far, extra, faces):
     return leaves, gaps[:number], vertices[:count]
 
 
-@kernel
+@apart
 def far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra):
     """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.proximity import CLAMPED, JAMMED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
 
 INSIDE = 0.999  # of a bound that is used, for rounding
@@ -230,7 +230,7 @@ def _comes_close(x, memory, block, l, beyond):
     return due or memory.looks[block, l] > PATIENCE * tight, count > 0
 
 
-@kernel
+@apart
 def _hold_apart(x, v, w, sheet, block, l, beyond):
     """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; others may follow."""
     memory = sheet.memory

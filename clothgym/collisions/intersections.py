@@ -20,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.checks import finite
 from clothgym.collisions import exact
 from clothgym.collisions.exact import UNSURE
@@ -154,7 +154,7 @@ def _sort_into_cells(low, size, origin, cells, cell, order):
     return starts
 
 
-@kernel
+@apart
 def _verdict(x, first, second, work):
     """Whether two triangles intersect: 1, 0 or UNSURE."""
     # shared vertices come first in both
@@ -285,7 +285,7 @@ def _wedges_apart(a, b):
     return True
 
 
-@kernel
+@apart
 def _triangles(a, b, work):
     """Whether two triangles without a common vertex intersect: whether a side of one meets the other."""
     a0, a1, a2 = _orientation(b[0], b[1], b[2], a[0]), _orientation(b[0], b[1], b[2], a[1]), _orientation(b[0], b[1], b[2], a[2])

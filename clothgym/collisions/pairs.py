@@ -1,8 +1,8 @@
 """Which pairs of a sheet's vertices, edges and triangles can touch: all that follows from the mesh alone, made once.
 
 Triangles are joined to leaves, two across an edge where possible (a grid's quads), and leaves lie in memory along a k-d tree of
-the flat sheet, so that a run of them, a block, is a compact patch.  A leaf owns its triangles, and each vertex and edge belongs to
-one leaf: a pair of primitives is met in one pair of leaves only (after Curtis, Tamstorf and Manocha 2008).
+the flat sheet, so that a run of them, a node of the tree, is a compact patch.  A leaf owns its triangles, and each vertex and edge
+belongs to one leaf: a pair of primitives is met in one pair of leaves only (after Curtis, Tamstorf and Manocha 2008).
 
 Leaves that share a vertex always overlap.  Their primitive pairs that share no vertex, the near pairs, are listed, and are cleared
 in a query by distances between vertices: for points P = sum a_i p_i and Q = sum b_j q_j with weights that sum to one,
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from clothgym.mesh import ClothMesh
 
-LEAVES = 8  # in a block, but for the last one: a vector of float64
+LEAVES = 8  # in a node that is not halved any more, but for the last one: a vector of float64
+BEGIN, END, NEXT = 0, 1, 2  # of a node: its leaves, and where the tree goes on after all that is in it
 SAMPLES = 16  # vertices whose mean displacement stands for that of the sheet
 
 Int = NDArray[np.int32]
@@ -40,7 +41,7 @@ class Pairs(NamedTuple):
     vertex_owner, edge_owner: the triangle that stands for each in contacts with a triangle's border, (particles,), (edges,).
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
-    blocks: where each block's leaves begin, (blocks + 1,).
+    nodes: of the tree, each before its halves, the first of which follows it: see ``BEGIN``, (nodes, 3).
     neighbours: where the leaves that share a vertex with each leaf and come after it begin, (leaves + 1,); ``next_leaves``.
     ends, slack: near pairs of vertices, (near, 2), and the slack of the primitive pairs they are in, at rest [m^2], (near,).
     near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
@@ -64,7 +65,7 @@ class Pairs(NamedTuple):
     own_edges: Int
     leaf_triangles: Int
     own_triangles: Int
-    blocks: Int
+    nodes: Int
     neighbours: Int
     next_leaves: Int
     ends: Int
@@ -84,7 +85,7 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     triangle_edges = inverse.reshape(-1, 3)
     length2 = ((x[edges[:, 0]] - x[edges[:, 1]]) ** 2).sum(axis=1)
     members = _leaves(triangles, triangle_edges, length2)
-    order, blocks = _compact(np.array([x[np.unique(triangles[m])].mean(axis=0) for m in members]))
+    order, nodes = _compact(np.array([x[np.unique(triangles[m])].mean(axis=0) for m in members]))
     members = [members[k] for k in order]
     leaf_of_triangle = np.zeros(len(triangles), np.int64)
     for leaf, own in enumerate(members):
@@ -121,7 +122,7 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         own_edges=_int(by_leaf[1]),
         leaf_triangles=counted[2],
         own_triangles=_int(by_leaf[2]),
-        blocks=_int(np.array(blocks)),
+        nodes=_int(np.array(nodes)),
         neighbours=_ranges(np.array([len(each) for each in after])),
         next_leaves=_int(np.concatenate([np.array(each, np.int64) for each in after])),
         ends=_int(ends),
@@ -168,22 +169,25 @@ def _leaves(triangles: NDArray, triangle_edges: NDArray, length2: NDArray) -> li
     return leaves + [[t] for t in np.flatnonzero(free).tolist()]
 
 
-def _compact(centres: NDArray) -> tuple[list[int], list[int]]:
-    """An order in which runs are compact, by halving along the longest side, and where the runs begin."""
+def _compact(centres: NDArray) -> tuple[list[int], list[list[int]]]:
+    """An order in which runs are compact, by halving along the longest side, and the tree of halves."""
     order: list[int] = []
-    begins = [0]
-    waiting = [np.arange(len(centres))]
-    while waiting:
-        part = waiting.pop()
+    nodes: list[list[int]] = []
+
+    def halve(part: NDArray) -> None:
+        begin, node = len(order), len(nodes)
+        nodes.append([])
         if len(part) <= LEAVES:
-            order += part.tolist()
-            begins.append(len(order))
-            continue
-        axis = np.ptp(centres[part], axis=0).argmax()
-        part = part[np.argsort(centres[part, axis], kind="stable")]
-        half = -(-len(part) // (2 * LEAVES)) * LEAVES
-        waiting += [part[half:], part[:half]]
-    return order, begins
+            order.extend(part.tolist())
+        else:
+            along = part[np.argsort(centres[part, np.ptp(centres[part], axis=0).argmax()], kind="stable")]
+            half = -(-len(part) // (2 * LEAVES)) * LEAVES
+            halve(along[:half])
+            halve(along[half:])
+        nodes[node] = [begin, len(order), len(nodes)]
+
+    halve(np.arange(len(centres)))
+    return order, nodes
 
 
 def _near_pairs(

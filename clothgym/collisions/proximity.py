@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import apart, inlined
 from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
 from clothgym.collisions.closest import closest_on_segments, closest_on_triangle, segments_apart
 
@@ -102,7 +102,7 @@ def set_free(i, j, k, l, certified, left, loose, extra, free):
         free[v] = min(free[v], left if left >= loose else certified - 2.0 * extra[v])
 
 
-@kernel
+@apart
 def vertex_contacts(
     p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, kept, margin, loose, stop,
     standoff, held, room, free, closest, count, particles, figures, tight, ties, planes, report,
@@ -169,7 +169,7 @@ def vertex_contacts(
     return count, tight
 
 
-@kernel
+@apart
 def edge_contacts(
     p, candidates, edges, ridges, reach, extra, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles,
     figures, tight, ties, planes, report,
@@ -215,7 +215,7 @@ def edge_contacts(
     return count, tight
 
 
-@kernel
+@apart
 def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, tight, ties, planes):
     """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
     triangles.  Returns the number of tied pairs.
@@ -298,9 +298,11 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
     corners, sides, stretch = near_candidates(p, pairs, near, extra)
     closest = np.zeros((1, 4))
     closest[0, 0] = near
+    # a literal would have a type, and so a version of the kernel, of its own
+    none = np.int64(0)
     count, tight = vertex_contacts(
         p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, loose, stop, standoff,
-        held, bounds, limits, closest, 0, particles, figures, 0, ties, planes, report,
+        held, bounds, limits, closest, none, particles, figures, none, ties, planes, report,
     )  # fmt: skip
     # these belong to no pair of leaves
     ties[:tight, 2] = -1

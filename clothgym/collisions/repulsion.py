@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.proximity import NORMAL, SLOP, THICKNESS, TOUCHING
 
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
@@ -25,7 +25,7 @@ CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act s
 SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
 
 
-@kernel
+@apart
 def press_again(x, v, w, sheet, block, carried):
     """What the contacts pressed at the last sweep, on one block's sheets; before the solids, so that these bear what lies on them.
 
@@ -49,7 +49,7 @@ def press_again(x, v, w, sheet, block, carried):
                 vc[l] = faster if pressed != zero else vc[l]
 
 
-@kernel
+@apart
 def repel(x, v, w, sheet, block, h, carried):
     """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
     memory, setting = sheet.memory, sheet.setting

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.collisions.distance import CONTACT, DESK, MOTION, SPOT, YIELDING, Shapes, lay_out, may_touch, measure_in_world
 from clothgym.collisions.shapes import FRICTION, PLANE, POINT, VELOCITY
 from clothgym.collisions.surface import any_near, find_touches, press
@@ -60,7 +60,7 @@ def _push_out(x, v, w, carried, desk):
             v[c, l] += desk[MOTION + c, l]
 
 
-@kernel
+@apart
 def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
     """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
@@ -81,7 +81,7 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, t
                 _push_out(x[p], v[p], w[p], carried, desk)
 
 
-@kernel
+@apart
 def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
     """The same for the whole sheet.
 

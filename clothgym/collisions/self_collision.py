@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import apart, kernel
 from clothgym.collisions.candidates import Reach
 from clothgym.collisions.confinement import confine, note_uncertain
 from clothgym.collisions.pairs import Pairs
@@ -95,7 +95,7 @@ class Sheet(NamedTuple):
     memory: Memory
 
 
-@inlined
+@apart
 def press(x, v, w, sheet, block, step, h, carried):
     """What happens to one block's sheets before the solids have their say; see the module."""
     memory = sheet.memory
@@ -112,7 +112,7 @@ def press(x, v, w, sheet, block, step, h, carried):
     press_again(x, v, w, sheet, block, carried)
 
 
-@inlined
+@apart
 def keep_apart(x, v, w, sheet, block, h, carried):
     """And what happens after; see the module."""
     repel(x, v, w, sheet, block, h, carried)

@@ -125,7 +125,7 @@ class SelfCollision:
         if self.options is None:
             return
         pairs = pairs_of(mesh)
-        reach = reach_of(mesh, pairs, self.options.thickness)
+        reach = reach_of(mesh, pairs, self.options.thickness, dtype)
         self.thickness = reach.far_thickness
         real = dtype.type
         friction, push, calm = real(self.options.friction), real(PUSH), real(CALM * self.thickness)
@@ -317,8 +317,8 @@ def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
     return np.sqrt(shortest)
 
 
-def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None) -> Reach:
-    """Distances of the query for a cloth thickness [m], or for the usual one.
+def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.dtype) -> Reach:
+    """Distances of the query for a cloth thickness [m], or for the usual one; dtype: of the simulation, whose kernels do for it.
 
     Raises:
         ValueError: the sheet is that close to itself at rest.
@@ -331,7 +331,8 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None) -> Reach:
     leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
     sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach, extra)
     figures = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
-    none = np.empty((0, 4), np.int32), np.empty((0, FIGURES)), 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
+    no_contacts = np.empty((0, 4), np.int32), np.empty((0, FIGURES), dtype)
+    none = *no_contacts, 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
     owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
     vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
     edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *figures, 0, *none)

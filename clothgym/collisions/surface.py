@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.collisions.distance import (
     BEFORE,
     BETWEEN,
@@ -221,7 +221,7 @@ def _leap(desk):
         desk[CORE + 2, l] = desk[SPOT + 2, l] + leap * fz
 
 
-@kernel
+@apart
 def find_deepest(desk, shapes, k):
     """Find the deepest point of the triangle in CORNERS, from SPOT on, all in the solid's axes; return whether any lane may touch.
 
@@ -365,7 +365,7 @@ def room_for_touches(x, triangles, shapes):
     return rows, np.empty((most, 2), np.int64), np.zeros(1, np.int64), scratch
 
 
-@kernel
+@apart
 def find_touches(x, triangles, shapes, k, touches, desk):
     """Find where one block's triangles touch the solid on the desk, which is no plane, or soon may.
 
@@ -402,7 +402,7 @@ def find_touches(x, triangles, shapes, k, touches, desk):
             count[0] += 1
 
 
-@kernel
+@apart
 def press(x, v, w, triangles, colliders, touches, h, carried, desk):
     """Resolve the touches of one block.
 

@@ -15,7 +15,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, kernel
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
 from clothgym.integrators.base import SCRATCH, Integrator
@@ -37,7 +37,7 @@ def surely_allowed(o: Oscillators) -> float:
     return largest_substep(o)[0]
 
 
-@kernel
+@apart
 def project_springs(x, start, w, springs, compliance, damping, row):
     """Move both ends of each spring towards its rest length, in place.
 
