@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+LARGEST = 1e30  # of an array: its differences over a control step are still numbers in float32
+
 
 def number(name: str, value: Any) -> float:
     """A finite number."""
@@ -54,13 +56,15 @@ def one_of(name: str, value: Any, *known: str) -> None:
 
 
 def finite(name: str, value: ArrayLike) -> NDArray:
-    """An array of finite numbers, as float64."""
+    """An array of finite numbers that float32 can reckon with, as float64."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name}={value!r}: must be numbers") from None
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds a value that is not finite: {array[~np.isfinite(array)][0]}")
+    if np.any(np.abs(array) > LARGEST):
+        raise ValueError(f"{name} holds {array[np.abs(array) > LARGEST][0]:g}: must lie within {LARGEST:g}")
     return array
 
 

@@ -369,6 +369,7 @@ class Simulation(Observed):
         counts = len(self.anchors), len(self.grippers), len(self.colliders)
         check_fits(state, self.num_envs, self.mesh.num_particles, self._hands.members, *counts, self._sheet)
         guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
+        self._contact.check_memory(state)
         self._contact.check(state.positions)
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)

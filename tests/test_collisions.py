@@ -154,6 +154,7 @@ def test_held_particles_are_not_pushed():
         (lambda: Box(half_sides=(1, 0, 1)), "half_sides"),
         (lambda: Capsule(radius=0.2, height=0.3), "height"),
         (lambda: Sphere(center=(0, np.nan, 0)), "center"),
+        (lambda: Sphere(velocity=(0, 0, 1e39)), r"Sphere velocity holds 1e\+39: must lie within"),
         (lambda: Sphere(thickness=np.inf), "thickness"),
     ],
 )

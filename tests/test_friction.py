@@ -116,6 +116,7 @@ def test_moves_are_checked():
         ({"index": 0, "targets": (0, np.nan, 0)}, "not finite"),
         ({"index": 0, "targets": np.zeros((2, 3))}, r"shape \(2, 3\)"),
         ({"index": 0, "velocities": (0, 0)}, "velocities has shape"),
+        ({"index": 0, "velocities": (0, 0, -1e39)}, r"velocities holds -1e\+39: must lie within 1e\+30"),
         ({"index": 0, "targets": 0.5}, r"targets has shape \(\): must be \(3,\)"),
         ({"index": 1, "velocities": (0, 0, 1), "envs": [3]}, "envs"),
     ):

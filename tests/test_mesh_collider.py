@@ -81,6 +81,7 @@ def cavity_inside_out():
         (lambda v, t: (v, t[1:]), r"open: edge \d-\d belongs to one triangle only \(3 such edges\): close its holes"),
         (lambda v, t: (v, t[:, ::-1]), r"inside out .*volume is -0.008 m\^3\): turn all triangles round"),
         (lambda v, t: (v, np.concatenate([t[:1, ::-1], t[1:]])), "disagree on which side is out"),
+        (lambda v, t: cavity_inside_out(), "a part of the mesh near .* is inside out"),
         (lambda v, t: crossing(), r"passes through itself: triangles \d+, .* and \d+, .* cross; join"),
         (lambda v, t: (np.where(v > 0, np.nan, v), t), "not finite"),
         (lambda v, t: (v, np.concatenate([t, [[0, 0, 1]]])), "degenerate"),
@@ -92,12 +93,6 @@ def test_meshes_that_are_no_solids_are_refused(make, message):
     vertices, triangles = make(*box_mesh())
     with pytest.raises(ValueError, match=message):
         MeshCollider(vertices=vertices, triangles=triangles)
-
-
-def test_part_inside_out_is_found():
-    vertices, triangles = cavity_inside_out()
-    with pytest.raises(ValueError, match="a part of the mesh near .* is inside out"):
-        Simulation(grid(2, 2, 0.1, 0.1), colliders=[MeshCollider(vertices=vertices, triangles=triangles)])
 
 
 @pytest.mark.parametrize(

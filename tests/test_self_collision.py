@@ -140,8 +140,7 @@ def bad_frames(name, mode, mesh, thickness=None, frames=None, every=1, seeds=(0,
 def test_strict_never_intersects(name):
     bad, simulation = bad_frames(name, "strict", sheet())
     assert bad == 0
-    assert simulation.self_contacts.dropped[0] == 0
-    assert not simulation.diverged[0]
+    assert simulation.self_contacts.dropped[0] == 0 and not simulation.diverged[0]
 
 
 def test_strict_never_intersects_on_a_disc():
@@ -320,12 +319,35 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     first = made.simulation
     assert first.self_contacts.rows.min() > 10
     state = first.get_state()
+    assert not state.contact_ties[state.contact_ties[:, :, 1] == 4][:, 7:].any()
     state.save(tmp_path / "state.npz")
     first.step(20)
     other = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
     other.set_state(clothgym.State.load(tmp_path / "state.npz"))
     other.step(20)
     np.testing.assert_array_equal(first.positions, other.positions)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        ("contact_particles", lambda a: a + 169, "name particles beyond the 169"),
+        ("contact_ties", lambda a: np.where(np.arange(11) == 1, 9, a), "more vertices than a pair has"),
+        ("contact_figures", lambda a: a[:, :1], r"contact_figures has shape \(1, 1, 8\)"),
+        ("contact_impulses", lambda a: np.tile(a, (1, 999, 1)), "contact_impulses has shape"),
+        ("contact_count", lambda a: a + 1000, "contact_particles has shape"),
+    ],
+)
+def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(name, spoil, message):
+    made = MANOEUVRES["z-fold"](sheet(13), self_collision="strict")
+    for _ in range(25):
+        made.step()
+    state, before = made.simulation.get_state(), made.simulation.positions
+    setattr(state, name, spoil(getattr(state, name)))
+    state.positions += 1
+    with pytest.raises(ValueError, match=message):
+        made.simulation.set_state(state)
+    np.testing.assert_array_equal(made.simulation.positions, before)
 
 
 def test_an_environment_does_not_feel_its_batch():

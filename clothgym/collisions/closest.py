@@ -7,7 +7,10 @@ from clothgym._jit import kernel
 
 @kernel
 def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
-    """Barycentric weights of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5)."""
+    """Barycentric weights of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
+
+    An edge without length is passed over: the others say the same.
+    """
     abx, aby, abz = bx - ax, by - ay, bz - az
     acx, acy, acz = cx - ax, cy - ay, cz - az
     apx, apy, apz = px - ax, py - ay, pz - az
@@ -26,11 +29,11 @@ def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
     if d6 >= 0.0 and d5 <= d6:
         return 0.0, 0.0, 1.0
     vc = d1 * d4 - d3 * d2
-    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 > d3:
         t = d1 / (d1 - d3)
         return 1.0 - t, t, 0.0
     vb = d5 * d2 - d1 * d6
-    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0 and d2 > d6:
         t = d2 / (d2 - d6)
         return 1.0 - t, 0.0, t
     va = d3 * d6 - d5 * d4
@@ -55,7 +58,8 @@ def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
     b = ux * vx + uy * vy + uz * vz
     denominator = a * e - b * b
     s = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 0.0 else 0.0
-    t = (b * s + f) / e if e > 0.0 else 0.0
+    # of an edge without length the end does
+    t = (b * s + f) / e if e > 0.0 else -1.0
     if t < 0.0:
         t = 0.0
         s = min(max(-c / a, 0.0), 1.0) if a > 0.0 else 0.0

@@ -9,7 +9,21 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.proximity import CLAMPED, JAMMED, KEPT, LAG, QUERIES, ROWS, SHARE, UNCERTAIN, query
+from clothgym.collisions.proximity import (
+    CLAMPED,
+    GROUP,
+    JAMMED,
+    KEPT,
+    LAG,
+    NUMBER,
+    OWN,
+    QUERIES,
+    ROWS,
+    SHARE,
+    UNCERTAIN,
+    VERTICES,
+    query,
+)
 
 INSIDE = 0.999  # of a bound that is used, for rounding
 REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
@@ -192,16 +206,16 @@ def _look_at_ties(x, ties, planes, begin, end, beyond, l, close):
     beyond its bound are looked at.  Returns how many are close, and how many were looked at."""
     count, looks = 0, 0
     for t in range(begin, end):
-        own, number, some = ties[t, 0], ties[t, 1], False
+        own, number, some = ties[t, OWN], ties[t, NUMBER], False
         for m in range(number):
-            some |= beyond[ties[t, 3 + m]]
+            some |= beyond[ties[t, VERTICES + m]]
         if not some:
             continue
         looks += 1
         nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
         low, high = np.inf, -np.inf
         for m in range(number):
-            p = ties[t, 3 + m]
+            p = ties[t, VERTICES + m]
             place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
             if m < own:
                 low = min(low, place)
@@ -225,7 +239,7 @@ def _comes_close(x, memory, block, l, beyond):
     close, due = np.empty(tight, np.int32), False
     count, looks = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
     for c in range(count):
-        due |= ties[close[c], 2] != JAMMED
+        due |= ties[close[c], GROUP] != JAMMED
     memory.looks[block, l] += tight // PASSING + looks
     return due or memory.looks[block, l] > PATIENCE * tight, count > 0
 
@@ -240,15 +254,15 @@ def _hold_apart(x, v, w, sheet, block, l, beyond):
     close = np.empty(tight, np.int32)
     count, _ = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
     for c in range(count):
-        ties[close[c], 2] = JAMMED
+        ties[close[c], GROUP] = JAMMED
     stay, going = np.zeros(x.shape[0], np.bool_), count > 0
     while going:
         going = False
         for t in range(tight):
             count, _ = _look_at_ties(x, ties, planes, t, t + 1, beyond, l, close)
             if count > 0:
-                for m in range(ties[t, 1]):
-                    p = ties[t, 3 + m]
+                for m in range(ties[t, NUMBER]):
+                    p = ties[t, VERTICES + m]
                     if stay[p]:
                         continue
                     stay[p] = beyond[p] = going = True

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -58,7 +60,7 @@ class MeshCollider(Collider):
             self.path is not None and (self.vertices is not None or self.triangles is not None)
         ):
             raise ValueError("MeshCollider: give the path of a file, or vertices and triangles")
-        self.surface  # noqa: B018 - a mesh that is no solid is refused here
+        self.grid  # noqa: B018 - a mesh that is no solid is refused here
 
     def __repr__(self) -> str:
         shown = (f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if f.name not in ("vertices", "triangles"))
@@ -69,17 +71,26 @@ class MeshCollider(Collider):
         """Vertices in the solid's own axes, scaled [m], and triangles."""
         if self.path is not None:
             x, triangles = read_triangles(self.path, "MeshCollider", "solid")
-            try:
+            with self._named():
                 return _solid(*_frozen(x * self.scale, triangles))
-            except ValueError as error:
-                raise ValueError(f"{str(self.path)!r} is no solid: {error}") from error
         assert self.vertices is not None and self.triangles is not None
         return _solid(*_frozen(finite("vertices", self.vertices) * self.scale, np.asarray(self.triangles)))
 
     @cached_property
     def grid(self) -> DistanceGrid:
         x, triangles = self.surface
-        return _grid(*_frozen(x, triangles), self.resolution)
+        with self._named():
+            return _grid(*_frozen(x, triangles), self.resolution)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """Name the file in what is wrong with its mesh."""
+        try:
+            yield
+        except ValueError as error:
+            if self.path is None:
+                raise
+            raise ValueError(f"{str(self.path)!r} is no solid: {error}") from error
 
     def world_vertices(self) -> NDArray[np.float64]:
         """Where the vertices are as long as the solid has not moved [m], (vertices, 3)."""

@@ -40,7 +40,8 @@ FIGURES = 8
 # of a tight pair: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
 KEPT = 3
 # and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or JAMMED, and the vertices, (room, TIE)
-TIE, JAMMED = 11, -2
+OWN, NUMBER, GROUP, VERTICES, TIE = 0, 1, 2, 3, 11
+JAMMED = -2
 MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
 
 
@@ -85,8 +86,8 @@ def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ti
 
     A direction along which they are not apart certifies nothing: the vertices stay where they are, apart as they are.
     """
-    ties[tight, 0], ties[tight, 1], ties[tight, 2] = own, 4, group
-    ties[tight, 3], ties[tight, 4], ties[tight, 5], ties[tight, 6] = i, j, k, l
+    ties[tight, OWN], ties[tight, NUMBER], ties[tight, GROUP] = own, 4, group
+    ties[tight, VERTICES], ties[tight, VERTICES + 1], ties[tight, VERTICES + 2], ties[tight, VERTICES + 3] = i, j, k, l
     least = standoff if held[i] or held[j] or held[k] or held[l] else stop
     planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) if gap > 0.0 else np.inf
 
@@ -238,7 +239,7 @@ def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, 
                 )
     kept = 0
     for t in range(tight):
-        if ties[t, 2] >= 0 and layered[ties[t, 2]]:
+        if ties[t, GROUP] >= 0 and layered[ties[t, GROUP]]:
             continue
         if kept < t:
             for c in range(TIE):
@@ -267,9 +268,9 @@ def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, 
             # the direction is from the second leaf to the first
             way = along(p, corners[leaf, 0], nx, ny, nz) - along(p, corners[other, 0], nx, ny, nz)
             sign = 1.0 if way > 0.0 else -1.0
-            ties[kept, 0], ties[kept, 1], ties[kept, 2] = 4, 8, -1
+            ties[kept, OWN], ties[kept, NUMBER], ties[kept, GROUP] = 4, 8, -1
             for m in range(4):
-                ties[kept, 3 + m], ties[kept, 7 + m] = corners[leaf, m], corners[other, m]
+                ties[kept, VERTICES + m], ties[kept, VERTICES + 4 + m] = corners[leaf, m], corners[other, m]
             planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
             planes[kept, KEPT] = min(gap, standoff if some else stop)
             kept += 1
@@ -305,7 +306,7 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
         held, bounds, limits, closest, none, particles, figures, none, ties, planes, report,
     )  # fmt: skip
     # these belong to no pair of leaves
-    ties[:tight, 2] = -1
+    ties[:tight, GROUP] = -1
     count, tight = edge_contacts(
         p, sides, edges, ridges, near, extra, thin, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
         figures, tight, ties, planes, report,

@@ -20,9 +20,12 @@ from clothgym.collisions.proximity import (
     GAP,
     LAG,
     MARGIN,
+    NUMBER,
+    OWN,
     REPORT,
     TIE,
     UNCERTAIN,
+    VERTICES,
     edge_contacts,
     gap_of_edges,
     gap_of_vertex,
@@ -219,7 +222,38 @@ class SelfCollision:
             used = array.reshape(-1, *array.shape[2:])[: self.layout.num_envs, : count.max()]
             there = np.arange(used.shape[1]) < count[:, None]
             state[f"contact_{name}"] = np.where(there[:, :, None], used, 0)
+        # nothing has written what lies behind a pair's vertices
+        ties = state["contact_ties"]
+        ties[np.arange(TIE) >= VERTICES + ties[:, :, NUMBER, None]] = 0
         return state
+
+    def check_memory(self, state: State) -> None:
+        """Refuse contacts that this simulation cannot have had: kernels would look for them beyond their arrays.
+
+        Raises:
+            ValueError: what is wrong.
+        """
+        if self.options is None:
+            return
+        memory, particles = self.sheet.memory, self.sheet.memory.bounds.shape[1]
+        advice = "give what get_state() of such a simulation gave"
+        for name, blank in self.blank().items():
+            given, array = getattr(state, name), name.removeprefix("contact_")
+            rows = given.shape[1] if given.ndim > 1 else 0
+            if array in ROW_ARRAYS:
+                count = getattr(state, f"contact_{ROW_ARRAYS[array]}")
+                fits = given.shape[::2] == blank.shape[::2] and count.min() >= 0 and count.max() <= rows
+                fits = fits and rows <= getattr(memory, array).shape[2]
+            else:
+                fits = given.shape == blank.shape
+            if not fits:
+                raise ValueError(f"the state's {name} has shape {given.shape}, which is none of this simulation's: {advice}")
+        for name, vertices in (("particles", state.contact_particles), ("ties", state.contact_ties[:, :, VERTICES:])):
+            if np.any((vertices < 0) | (vertices >= particles)):
+                raise ValueError(f"the state's contact_{name} name particles beyond the {particles} of the sheet: {advice}")
+        own, number = state.contact_ties[:, :, OWN], state.contact_ties[:, :, NUMBER]
+        if np.any((own < 0) | (number < own) | (number > TIE - VERTICES)):
+            raise ValueError(f"the state's contact_ties count more vertices than a pair has: {advice}")
 
     def restore(self, state: State, x: NDArray) -> None:
         """Take over from a state, with positions x in blocks [m]."""
