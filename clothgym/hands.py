@@ -344,7 +344,7 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
     Where nothing is in its way that is its target.  (In ``steer`` it would be compiled once more with each caller.)
     """
     one = x.dtype.type(1)
-    point, rows, desk = np.empty((3, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
+    point, rows, desk = np.empty((1, 3, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
     tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
     for b in range(first, last):
         for k in range(hand.shape[1]):

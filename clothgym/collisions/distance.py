@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import inlined, kernel
 from clothgym.collisions.shapes import AXES, HALF, PLANE, POINT, RADIUS, REACH2, ROUNDED_BOX, ROWS
 
 # the desk's rows after the solid's: a triangle's corners, a point, and one of the solid's core, all in its axes; barycentric
@@ -45,23 +45,27 @@ class Shapes(NamedTuple):
     cells: NDArray
 
 
-@kernel
-def may_touch(x, collider, kind):
-    """Whether any lane's particle is inside the solid's bound.  It only decides whether work can be skipped."""
-    zero = x.dtype.type(0)
+@inlined
+def may_touch_plane(x, p, collider):
+    """Whether particle ``p`` of any lane is below a plane.  It only decides whether work can be skipped."""
     near = False
-    if kind == PLANE:
-        for l in range(x.shape[1]):
-            height = zero
-            for c in range(3):
-                height += (x[c, l] - collider[POINT + c, l]) * collider[AXES + 6 + c, l]
-            near |= height < collider[RADIUS, l]
-    else:
-        for l in range(x.shape[1]):
-            dx = x[0, l] - collider[POINT, l]
-            dy = x[1, l] - collider[POINT + 1, l]
-            dz = x[2, l] - collider[POINT + 2, l]
-            near |= dx * dx + dy * dy + dz * dz < collider[REACH2, l]
+    for l in range(x.shape[2]):
+        height = x.dtype.type(0)
+        for c in range(3):
+            height += (x[p, c, l] - collider[POINT + c, l]) * collider[AXES + 6 + c, l]
+        near |= height < collider[RADIUS, l]
+    return near
+
+
+@inlined
+def may_touch_solid(x, p, collider):
+    """Whether particle ``p`` of any lane is inside another solid's bound."""
+    near = False
+    for l in range(x.shape[2]):
+        dx = x[p, 0, l] - collider[POINT, l]
+        dy = x[p, 1, l] - collider[POINT + 1, l]
+        dz = x[p, 2, l] - collider[POINT + 2, l]
+        near |= dx * dx + dy * dy + dz * dz < collider[REACH2, l]
     return near
 
 
@@ -75,12 +79,12 @@ def lay_out(collider, desk):
         desk[CLEAR, l] = 0
 
 
-@kernel
-def to_axes(x, desk, at):
-    """Write a point in the world, (3, lanes), to three rows of the desk, in the solid's axes."""
+@inlined
+def to_axes(x, p, desk, at):
+    """Write particle ``p`` of x, in the world, (particles, 3, lanes), to three rows of the desk, in the solid's axes."""
     for c in range(3):
         for l in range(desk.shape[1]):
-            desk[at + c, l] = x[c, l] - desk[POINT + c, l]
+            desk[at + c, l] = x[p, c, l] - desk[POINT + c, l]
     for l in range(desk.shape[1]):
         dx, dy, dz = desk[at, l], desk[at + 1, l], desk[at + 2, l]
         desk[at, l] = dx * desk[AXES, l] + dy * desk[AXES + 1, l] + dz * desk[AXES + 2, l]
@@ -88,7 +92,7 @@ def to_axes(x, desk, at):
         desk[at + 2, l] = dx * desk[AXES + 6, l] + dy * desk[AXES + 7, l] + dz * desk[AXES + 8, l]
 
 
-@kernel
+@inlined
 def normal_to_world(desk):
     """Turn the normal of contact from the solid's axes to the world's."""
     for l in range(desk.shape[1]):
@@ -104,21 +108,34 @@ def measure(desk, at, shapes, k, within):
 
     A mesh leaves out the normal where the distance is not less than ``within``, and lanes that are clear.
     """
-    kinds, nodes, first, sizes, corners, cells = shapes
-    if kinds[k] == PLANE:
-        for l in range(desk.shape[1]):
-            desk[CONTACT, l] = desk[at + 2, l] - desk[RADIUS, l]
-            desk[CONTACT + 1, l] = 0
-            desk[CONTACT + 2, l] = 0
-            desk[CONTACT + 3, l] = 1
-    elif kinds[k] == ROUNDED_BOX:
-        _measure_rounded_box(desk, at)
+    kind = shapes.kinds[k]
+    if kind == PLANE:
+        measure_plane(desk, at, shapes, k, within)
+    elif kind == ROUNDED_BOX:
+        measure_rounded_box(desk, at, shapes, k, within)
     else:
-        _measure_in_grid(desk, at, nodes[first[k] :], sizes[k], corners[k], cells[k], within)
+        measure_mesh(desk, at, shapes, k, within)
 
 
-@kernel
-def _measure_rounded_box(desk, at):
+@inlined
+def measure_plane(desk, at, shapes, k, within):
+    """The height above it."""
+    for l in range(desk.shape[1]):
+        desk[CONTACT, l] = desk[at + 2, l] - desk[RADIUS, l]
+        desk[CONTACT + 1, l] = 0
+        desk[CONTACT + 2, l] = 0
+        desk[CONTACT + 3, l] = 1
+
+
+@inlined
+def measure_mesh(desk, at, shapes, k, within):
+    """What its grid says."""
+    _, nodes, first, sizes, corners, cells = shapes
+    _measure_in_grid(desk, at, nodes[first[k] :], sizes[k], corners[k], cells[k], within)
+
+
+@inlined
+def measure_rounded_box(desk, at, shapes, k, within):
     """With a = |q| - b: outside the inner box the distance is ``|max(a, 0)| - r``, inside it ``max(a) - r``."""
     zero = desk.dtype.type(0)
     one = desk.dtype.type(1)
@@ -197,8 +214,8 @@ def _measure_in_grid(desk, at, grid, size, corner, cell, within):
 
 
 @kernel
-def measure_in_world(x, desk, shapes, k):
-    """Write signed distance [m], and outward unit normal where it is negative, of points in the world, (3, lanes), to CONTACT."""
-    to_axes(x, desk, SPOT)
+def measure_in_world(x, p, desk, shapes, k):
+    """Write signed distance [m], and outward unit normal where it is negative, of particle ``p`` to CONTACT."""
+    to_axes(x, p, desk, SPOT)
     measure(desk, SPOT, shapes, k, x.dtype.type(0))
     normal_to_world(desk)

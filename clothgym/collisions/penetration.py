@@ -26,7 +26,7 @@ def deepest(first, last, x, triangles, shapes, colliders, out):
             lay_out(colliders[b, k], desk)
             for t in range(triangles.shape[0]):
                 for c in range(3):
-                    to_axes(x[b, triangles[t, c]], desk, CORNERS + 3 * c)
+                    to_axes(x[b], triangles[t, c], desk, CORNERS + 3 * c)
                 desk[CLEAR] = 0
                 start[:] = x.dtype.type(np.inf)
                 for i in range(FINENESS + 1):

@@ -22,6 +22,9 @@ RELAXED = 0.03  # share of what is too close by which a contact pushes apart in 
 SPAN = 4  # substeps between two sweeps over contacts that are calm; over others a sweep goes in each
 CALM = 0.005  # thicknesses by which a calm contact's correction moves it in the longest span, at most
 CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act soon
+# velocity of approach that a contact takes in a substep, at most [m/s]: in a jam, which takes all motion away, what is kept from
+# substep to substep would grow for ever
+MOST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
 
 
@@ -195,7 +198,7 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)
-    since = x.dtype.type(waited)
+    since, most_speed = x.dtype.type(waited), x.dtype.type(MOST)
     reach = x.dtype.type(SPAN) * h + carried
     touching, largest = 0, zero
     for c in range(choices):
@@ -216,7 +219,7 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
         if mobile <= zero:
             continue
         mass = one / mobile
-        now = max(before + (wanted - un) * mass, zero)
+        now = min(max(before + (wanted - un) * mass, zero), since * most_speed * mass)
         # what would stop the sliding, and as much of it as Coulomb allows
         tx = jx - before * nx - (ux - un * nx) * mass
         ty = jy - before * ny - (uy - un * ny) * mass

@@ -14,25 +14,41 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
-from clothgym.collisions.distance import CONTACT, DESK, MOTION, SPOT, YIELDING, Shapes, lay_out, may_touch, measure_in_world
-from clothgym.collisions.shapes import FRICTION, PLANE, POINT, VELOCITY
+from clothgym._jit import apart, inlined, kernel, specialize
+from clothgym.collisions.distance import (
+    CONTACT,
+    DESK,
+    MOTION,
+    SPOT,
+    YIELDING,
+    Shapes,
+    lay_out,
+    may_touch_plane,
+    may_touch_solid,
+    measure_in_world,
+    measure_mesh,
+    measure_plane,
+    measure_rounded_box,
+    normal_to_world,
+    to_axes,
+)
+from clothgym.collisions.shapes import FRICTION, PLANE, POINT, ROUNDED_BOX, VELOCITY
 from clothgym.collisions.surface import any_near, find_touches, press
 from clothgym.state import Layout
 
 
-@kernel
-def _push_out(x, v, w, carried, desk):
-    """Correct one particle's position and velocity, (3, lanes), for the contact on the desk."""
+@inlined
+def _push_out(x, v, w, p, carried, desk):
+    """Correct the position and velocity of particle ``p``, for the contact on the desk."""
     zero = x.dtype.type(0)
     one = x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     for c in range(3):
-        for l in range(x.shape[1]):
-            desk[MOTION + c, l] = v[c, l]
-    for l in range(x.shape[1]):
-        desk[YIELDING, l] = w[l]
-    for l in range(x.shape[1]):
+        for l in range(x.shape[2]):
+            desk[MOTION + c, l] = v[p, c, l]
+    for l in range(x.shape[2]):
+        desk[YIELDING, l] = w[p, l]
+    for l in range(x.shape[2]):
         distance, nx, ny, nz = desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         touching = distance < zero and desk[YIELDING, l] > zero
         # velocity relative to the solid, split along the normal
@@ -54,10 +70,28 @@ def _push_out(x, v, w, carried, desk):
         desk[MOTION + 1, l] = stopped * ny - lost * ty
         desk[MOTION + 2, l] = stopped * nz - lost * tz
     for c in range(3):
-        for l in range(x.shape[1]):
-            x[c, l] += desk[SPOT + c, l]
-        for l in range(x.shape[1]):
-            v[c, l] += desk[MOTION + c, l]
+        for l in range(x.shape[2]):
+            x[p, c, l] += desk[SPOT + c, l]
+        for l in range(x.shape[2]):
+            v[p, c, l] += desk[MOTION + c, l]
+
+
+def _resolve_solid(x, v, w, collider, shapes, k, carried, desk):
+    """Resolve the contacts of one block's particles with the solid on the desk."""
+    for p in range(x.shape[0]):
+        if may_touch(x, p, collider):  # noqa: F821
+            to_axes(x, p, desk, SPOT)
+            measure_solid(desk, SPOT, shapes, k, x.dtype.type(0))  # noqa: F821
+            normal_to_world(desk)
+            _push_out(x, v, w, p, carried, desk)
+
+
+# one for each family: a branch inside the loop costs a single environment as much as the contact itself
+_resolve_plane = specialize(_resolve_solid, "resolve_plane", may_touch=may_touch_plane, measure_solid=measure_plane)
+_resolve_rounded_box = specialize(
+    _resolve_solid, "resolve_rounded_box", may_touch=may_touch_solid, measure_solid=measure_rounded_box
+)
+_resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_solid, measure_solid=measure_mesh)
 
 
 @apart
@@ -75,10 +109,12 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, t
             for l in range(x.shape[2]):
                 collider[POINT + c, l] += h * collider[VELOCITY + c, l]
         lay_out(collider, desk)
-        for p in range(x.shape[0]):
-            if may_touch(x[p], collider, kinds[k]):
-                measure_in_world(x[p], desk, shapes, k)
-                _push_out(x[p], v[p], w[p], carried, desk)
+        if kinds[k] == PLANE:
+            _resolve_plane(x, v, w, collider, shapes, k, carried, desk)
+        elif kinds[k] == ROUNDED_BOX:
+            _resolve_rounded_box(x, v, w, collider, shapes, k, carried, desk)
+        else:
+            _resolve_mesh(x, v, w, collider, shapes, k, carried, desk)
 
 
 @apart
@@ -122,7 +158,7 @@ def signed_distances(first, last, x, shapes, colliders, out):
         for k in range(colliders.shape[1]):
             lay_out(colliders[b, k], desk)
             for p in range(x.shape[1]):
-                measure_in_world(x[b, p], desk, shapes, k)
+                measure_in_world(x[b], p, desk, shapes, k)
                 out[b, k, p] = desk[CONTACT]
 
 

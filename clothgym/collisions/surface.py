@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.distance import (
     BEFORE,
     BETWEEN,
@@ -81,7 +81,7 @@ def any_near(x, collider, desk):
     return near
 
 
-@kernel
+@inlined
 def _may_touch_triangle(desk):
     """Whether any lane's triangle comes near the solid; its centre goes to SPOT, its radius to RHO, and to CLEAR whether it surely
     does not touch: its corners lie beyond one face of the box of half sides b + r, as those of cloth that lies on a box do.
@@ -289,7 +289,7 @@ def _turn_normal(desk):
     return some
 
 
-@kernel
+@inlined
 def _push_out(h, carried, desk):
     """What the contact changes, per inverse mass and weight of a corner: of positions to SPOT, of velocities to MOTION."""
     zero, one, tiny, relaxed = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12), desk.dtype.type(RELAXED)
@@ -315,7 +315,7 @@ def _push_out(h, carried, desk):
         desk[MOTION + 2, l] = share * (stopped * nz - lost * tz)
 
 
-@kernel
+@inlined
 def _move_corner(x, v, w, weight, desk):
     for c in range(3):
         for l in range(desk.shape[1]):
@@ -324,16 +324,16 @@ def _move_corner(x, v, w, weight, desk):
             v[c, l] += w[l] * weight[l] * desk[MOTION + c, l]
 
 
-@kernel
-def _place(x, desk, local):
+@inlined
+def _place(x, p, desk, local):
     """A particle's place in the solid's axes."""
-    to_axes(x, desk, CORE)
+    to_axes(x, p, desk, CORE)
     for c in range(3):
         for l in range(desk.shape[1]):
             local[c, l] = desk[CORE + c, l]
 
 
-@kernel
+@inlined
 def _fetch(rows, desk, at):
     """Copy rows to the desk; they lie side by side, so that one loop will do."""
     size = rows.shape[0] * rows.shape[1]
@@ -376,7 +376,7 @@ def find_touches(x, triangles, shapes, k, touches, desk):
         half = min(desk[HALF, l], min(desk[HALF + 1, l], desk[HALF + 2, l])) + desk[RADIUS, l]
         desk[RADIUS, l] -= desk[THICKNESS, l] + desk.dtype.type(2 * SINKS) * half
     for p in range(x.shape[0]):
-        _place(x[p], desk, local[p])
+        _place(x, p, desk, local[p])
     for t in range(triangles.shape[0]):
         for c in range(3):
             _fetch(local[triangles[t, c]], desk, CORNERS + 3 * c)
