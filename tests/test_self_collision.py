@@ -1,9 +1,9 @@
 """Self-collision: nothing passes through itself, judged by a count that knows nothing of it."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from exact_intersections import intersecting_pairs
+from folded import SIDE, sheet, three_layers
 
 import clothgym
 from clothgym.collisions import self_contact
@@ -12,34 +12,9 @@ from clothgym.collisions.pairs import pairs_of
 from clothgym.collisions.proximity import FIGURES, REPORT, TIE, query
 from clothgym.crumpling import MANOEUVRES
 
-SIDE = 0.6
-
 
 def count_intersections(triangles, x):
     return len(intersecting_pairs(triangles, x))
-
-
-def sheet(points=13):
-    return clothgym.grid(points, points, SIDE, SIDE)
-
-
-def three_layers(mesh, gap):
-    """The sheet folded in three, layers ``gap`` apart, the folds round."""
-    arc = np.pi * gap / 2
-    flat = (SIDE - 2 * arc) / 3
-    s = mesh.rest_positions[:, 0] - mesh.rest_positions[:, 0].min()
-    bend_one, bend_two = (s - flat) / (gap / 2), (s - 2 * flat - arc) / (gap / 2)
-    along = np.select(
-        [s < flat, s < flat + arc, s < 2 * flat + arc, s < 2 * flat + 2 * arc],
-        [s, flat + gap / 2 * np.sin(bend_one), 2 * flat + arc - s, -gap / 2 * np.sin(bend_two)],
-        s - 2 * flat - 2 * arc,
-    )
-    height = np.select(
-        [s < flat, s < flat + arc, s < 2 * flat + arc, s < 2 * flat + 2 * arc],
-        [0 * s, gap / 2 * (1 - np.cos(bend_one)), 0 * s + gap, gap + gap / 2 * (1 - np.cos(bend_two))],
-        2 * gap,
-    )
-    return np.stack([along, mesh.rest_positions[:, 1], height + 0.01], axis=1)
 
 
 # --- the query, against brute force -----------------------------------------------------------------------------------------
@@ -175,6 +150,17 @@ def test_a_jam_without_room_for_ties_does_not_creep(monkeypatch):
     assert not wring.simulation.intersections().any()
 
 
+def test_a_jam_does_not_carry_hands_away():
+    """Cloth that may not move stays between the hands that pull at it, which cannot go on: none of it gets out of their reach."""
+    option = {"mode": "strict", "thickness": 0.012}
+    wring = MANOEUVRES["impossible wring"](sheet(9), seeds=[1, 2], thickness=0.012, time_step=1 / 60, self_collision=option)
+    for _ in range(200):
+        wring.step()
+        assert np.abs(wring.simulation.positions).max() < 0.8  # the hands' way is within 0.75 m; 20 m where a jam carried them
+    assert wring.simulation.self_contacts.clamped.min() > 100
+    assert not wring.simulation.intersections().any()
+
+
 # --- what it leaves alone ---------------------------------------------------------------------------------------------------
 
 
@@ -306,145 +292,3 @@ def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
         simulation.move_anchors(targets)
         simulation.step()
     np.testing.assert_allclose(simulation.positions[0, 0], targets[0, 0], atol=1e-3)
-
-
-# --- the state --------------------------------------------------------------------------------------------------------------
-
-
-def test_a_restored_state_goes_on_to_the_bit(tmp_path):
-    mesh = sheet(13)
-    made = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict")
-    for _ in range(25):
-        made.step()
-    first = made.simulation
-    assert first.self_contacts.rows.min() > 10
-    state = first.get_state()
-    assert not state.contact_ties[state.contact_ties[:, :, 1] == 4][:, 7:].any()
-    state.save(tmp_path / "state.npz")
-    first.step(20)
-    other = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
-    other.set_state(clothgym.State.load(tmp_path / "state.npz"))
-    other.step(20)
-    np.testing.assert_array_equal(first.positions, other.positions)
-
-
-@pytest.mark.parametrize(
-    ("name", "spoil", "message"),
-    [
-        ("contact_particles", lambda a: a + 169, "name particles beyond the 169"),
-        ("contact_ties", lambda a: np.where(np.arange(11) == 1, 9, a), "more vertices than a pair has"),
-        ("contact_figures", lambda a: a[:, :1], r"contact_figures has shape \(1, 1, 8\)"),
-        ("contact_impulses", lambda a: np.tile(a, (1, 999, 1)), "contact_impulses has shape"),
-        ("contact_count", lambda a: a + 1000, "contact_particles has shape"),
-    ],
-)
-def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(name, spoil, message):
-    made = MANOEUVRES["z-fold"](sheet(13), self_collision="strict")
-    for _ in range(25):
-        made.step()
-    state, before = made.simulation.get_state(), made.simulation.positions
-    setattr(state, name, spoil(getattr(state, name)))
-    state.positions += 1
-    with pytest.raises(ValueError, match=message):
-        made.simulation.set_state(state)
-    np.testing.assert_array_equal(made.simulation.positions, before)
-
-
-def test_an_environment_does_not_feel_its_batch():
-    mesh = sheet(9)
-    together = MANOEUVRES["z-fold"](mesh, seeds=range(19), self_collision="strict")
-    alone = MANOEUVRES["z-fold"](mesh, seeds=[7], self_collision="strict")
-    for _ in range(30):
-        together.step()
-        alone.step()
-    assert alone.simulation.self_contacts.rows[0] > 0
-    np.testing.assert_array_equal(together.simulation.positions[7], alone.simulation.positions[0])
-
-
-@pytest.mark.parametrize("name", ["verlet", "xpbd", "projective_dynamics"])
-def test_other_integrators_take_part(name):
-    """One of each kind: explicit, by projections, implicit; the module knows none of them."""
-    mesh = sheet(9)
-    simulation = clothgym.Simulation(
-        mesh, integrator=name, substeps=16 if name == "projective_dynamics" else "auto",
-        colliders=[clothgym.Plane(friction=0.5)], self_collision="strict",
-    )  # fmt: skip
-    simulation.reset(positions=three_layers(mesh, 0.06))
-    simulation.step(45)
-    assert count_intersections(mesh.triangles, simulation.positions[0]) == 0
-    assert not simulation.diverged[0]
-    assert np.ptp(simulation.positions[0, :, 2]) > 1.8 * 0.28 * SIDE / 8 / np.sqrt(2)  # three layers
-
-
-def test_an_environment_takes_it_and_tells_of_it():
-    env = gym.make("clothgym:ClothDrape-v0", self_collision="strict")
-    env.reset(seed=0)
-    for _ in range(8):
-        *_, info = env.step(np.array([0.5, 0.2, -1, -0.5, -0.2, -1, 0.3, 0.3], np.float32)[: env.action_space.shape[0]])
-    assert {"self_contacts", "clamped_moves", "hand_lag"} <= set(info)
-    assert env.unwrapped.task.simulation.intersections()[0] == 0
-
-
-# --- bad input --------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("value", "message"),
-    [
-        ("strickt", "'fast' or 'strict'"),
-        ({"mode": "strict", "thickness": -1.0}, "thickness"),
-        ({"mode": "strict", "friction": -0.1}, "friction"),
-        ({"mode": "strict", "thicknes": 0.01}, "no option 'thicknes'"),
-        ({"mode": "strict", "thickness": 0.05}, "at most"),
-        ({"mode": "strict", "thickness": 1e-5}, "strict mode takes 0.0002 m and more"),
-        (True, "must be False, 'fast' or 'strict'"),
-        (np.array(["strict", "fast"]), "must be False, 'fast' or 'strict'"),
-    ],
-)
-def test_bad_options_are_named(value, message):
-    with pytest.raises(ValueError, match=message):
-        clothgym.Simulation(sheet(), self_collision=value)
-
-
-def test_a_start_in_intersection_is_refused_and_changes_nothing():
-    simulation = clothgym.Simulation(sheet(), self_collision="strict")
-    before = simulation.positions
-    x = three_layers(sheet(), 0.02)
-    x[:, 2] = np.abs(x[:, 2] - 0.02)
-    with pytest.raises(ValueError, match="triangles .* intersect"):
-        simulation.reset(positions=x)
-    np.testing.assert_array_equal(simulation.positions, before)
-
-
-def test_a_sheet_that_flies_too_far_is_reported():
-    simulation = clothgym.Simulation(sheet(5), gravity=(0, 0, 0), self_collision="strict")
-    simulation.reset(velocities=np.full((1, 25, 3), (60.0, 0.0, 0.0)))
-    with pytest.warns(RuntimeWarning, match="16 m from the origin"):
-        simulation.step(40)
-    assert simulation.self_contacts.uncertified[0]
-
-
-def test_a_sheet_too_far_from_the_origin_is_reported():
-    simulation = clothgym.Simulation(sheet(), self_collision="strict")
-    far = sheet().rest_positions + [20.0, 0, 0]
-    with pytest.raises(ValueError, match="16 m"):
-        simulation.reset(positions=far)
-    simulation.reset(positions=sheet().rest_positions + [15.5, 0, 0], velocities=np.array([10.0, 0, 0]))
-    with pytest.warns(RuntimeWarning, match="16 m"):
-        simulation.step(20)
-    clothgym.Simulation(sheet(), self_collision="strict", dtype="float64").reset(positions=far)
-
-
-def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbours():
-    mesh = sheet(9)
-    x = np.stack([three_layers(mesh, 0.03)] * 3)
-    v = np.zeros_like(x)
-    runs = []
-    for fast in (0.0, 1e20):
-        simulation = clothgym.Simulation(mesh, num_envs=3, self_collision="strict", on_divergence="ignore")
-        v[1, 40] = fast
-        simulation.reset(positions=x, velocities=v)
-        simulation.step(5)
-        runs.append(simulation)
-    np.testing.assert_array_equal(runs[1].diverged, [False, True, False])
-    np.testing.assert_array_equal(runs[0].positions[[0, 2]], runs[1].positions[[0, 2]])

@@ -156,7 +156,8 @@ def _renew(x, v, w, sheet, block, l, h, beyond):
     """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it; all are beyond.
 
     Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a tie or since it
-    may not move at all, they are about the place itself: there rounding must not add up.
+    may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand holds does
+    not go with the others: else a jam would carry the hands away.
     """
     memory = sheet.memory
     look_around(memory.old[block], v, w, sheet, block, l, h)
@@ -164,10 +165,13 @@ def _renew(x, v, w, sheet, block, l, h, beyond):
         start, limits, tight = memory.start[block], memory.limits[block], memory.tight[block, l]
         zero = x.dtype.type(0)
         mx, my, mz = _shift(x, start, sheet.pairs.samples, l)
-        least = limits[0, l]
+        together = True
         for p in range(x.shape[0]):
-            least = min(least, limits[p, l])
-        if not least > zero:
+            together &= limits[p, l] > zero
+            if w[p, l] <= zero:
+                dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+                together &= dx * dx + dy * dy + dz * dz <= limits[p, l]
+        if not together:
             mx, my, mz = zero, zero, zero
         _draw_back(x, v, w, memory, block, l, h, mx, my, mz)
         close = np.empty(tight, np.int32)
