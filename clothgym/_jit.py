@@ -172,6 +172,8 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
         # they must be there before the code is, in which their symbols are looked up
         libraries = []
         for name, types, symbol in calls:
+            if name not in _dispatchers:  # a module has another name in the process that runs it than in one that imports it
+                raise _Outdated
             _dispatchers[name].compile(types)
             called = _dispatchers[name].overloads[types]
             if called.fndesc.mangled_name != symbol:
@@ -238,7 +240,11 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         folder = cache_folder()
         if folder.writable:
             try:
-                super().save_overload(sig, data)
+                try:
+                    super().save_overload(sig, data)
+                except (EOFError, pickle.UnpicklingError):  # the index has been cut short: begin it anew
+                    self.flush()
+                    super().save_overload(sig, data)
             except OSError as error:
                 folder.give_up(error)
         self._set_apart(data)
@@ -262,7 +268,10 @@ def kernel(function: Callable[..., Any], apart: bool = False) -> Any:
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return function
     dispatcher = numba.njit(**OPTIONS)(function)
-    dispatcher._cache = _Cache(cast(FunctionType, function), apart)
+    try:
+        dispatcher._cache = _Cache(cast(FunctionType, function), apart)
+    except RuntimeError:  # it has been typed in, and lies in no file: it is compiled in memory, and linked into its callers
+        return dispatcher
     _dispatchers[dispatcher._cache.lock_name] = dispatcher
     compile_or_load = dispatcher.compile
 

@@ -161,6 +161,23 @@ def test_a_jam_does_not_carry_hands_away():
     assert not wring.simulation.intersections().any()
 
 
+def test_anchors_that_stand_still_again_are_caught_up_with():
+    """A sheet that is swung so hard that its corners are thrown together: no pair freezes that has room to come apart."""
+    mesh = clothgym.grid(13, 13, 0.5, 0.5)
+    hang = mesh.rest_positions[:, [0, 2, 1]] * (1, 1, -1) + (0, 0, 1.5)
+    top = [int(p) for p in np.lexsort((mesh.rest_positions[:, 0], mesh.rest_positions[:, 1]))[[0, 12]]]
+    simulation = clothgym.Simulation(mesh, anchors=top, self_collision="strict")
+    simulation.reset(positions=hang)
+    for frame in range(80):
+        phase = (frame + 1) / 60 % 0.8 / 0.8
+        if frame < 40:
+            targets = hang[top] + (0, 4 * min(phase, 1 - phase), 0)
+        simulation.move_anchors(targets)
+        simulation.step()
+    np.testing.assert_allclose(simulation.positions[0, top], targets, atol=1e-3)
+    assert simulation.self_contacts.clamped[0] == 0 and simulation.strain().max() < 0.1
+
+
 # --- what it leaves alone ---------------------------------------------------------------------------------------------------
 
 

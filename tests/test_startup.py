@@ -103,9 +103,10 @@ def test_two_threads_that_compile_at_once_leave_the_lock_free(tmp_path):
     assert out.strip() == "0", err
 
 
-def test_a_broken_cache_file_is_compiled_anew(filled, tmp_path):
+@pytest.mark.parametrize("files", ["*.nbc", "*.nbi"])
+def test_a_broken_cache_file_is_compiled_anew(files, filled, tmp_path):
     cache = shutil.copytree(filled[0], tmp_path / "cache")
-    for path in cache.rglob("*.nbc"):
+    for path in cache.rglob(files):
         path.write_bytes(path.read_bytes()[:100])
     out, err = start(SIMULATE, CLOTHGYM_CACHE_DIR=str(cache)).communicate(timeout=300)
     assert out.startswith("1 "), err
@@ -115,6 +116,30 @@ def test_a_folder_that_vanishes_costs_a_sentence(tmp_path):
     code = "import shutil, os\nfrom clothgym import _jit\n_jit.cache_folder()\nshutil.rmtree(os.environ['CLOTHGYM_CACHE_DIR'])\n"
     out, err = start(code + SIMULATE, CLOTHGYM_CACHE_DIR=str(tmp_path / "cache")).communicate(timeout=300)
     assert out.startswith("1 "), err
+
+
+MINE = """
+from dataclasses import replace
+from clothgym import INTEGRATORS, Simulation, grid
+from clothgym._jit import kernel
+@kernel
+def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    x += h * v
+def go():
+    s = Simulation(grid(3, 3, 0.1, 0.1), integrator=replace(INTEGRATORS["semi_implicit_euler"], name="mine", substep=substep))
+    s.step()
+    print(s.positions.sum())
+if __name__ == "__main__":
+    go()
+"""
+
+
+def test_an_integrator_of_one_s_own_runs_from_a_script_a_module_and_a_prompt(filled, tmp_path):
+    (tmp_path / "mine.py").write_text(MINE)
+    cache = {"CLOTHGYM_CACHE_DIR": str(shutil.copytree(filled[0], tmp_path / "cache")), "PYTHONPATH": str(tmp_path)}
+    codes = [f"import runpy; runpy.run_path({str(tmp_path / 'mine.py')!r}, run_name='__main__')", "import mine; mine.go()", MINE]
+    outputs = [start(code, **cache).communicate(timeout=300) for code in codes]
+    assert len({out for out, _ in outputs}) == 1 and outputs[0][0], outputs
 
 
 def test_a_callee_that_stays_apart_is_compiled_once_and_its_callers_anew_when_it_has_changed(filled, tmp_path):

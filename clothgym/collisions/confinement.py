@@ -31,6 +31,7 @@ FARTHEST = 16.0  # distance from the origin within which float32 is certified [m
 PATIENCE = 4  # looks at all tied pairs after which a query, which frees the vertices again, is the cheaper
 AHEAD = 8  # substeps for which a query shall last: for fast vertices it looks farther
 FORESEEN = 1.0  # of the reach, the most that it looks beyond it for one
+HALVES = 4  # times that the way of a tied pair is halved before it stays
 PASSING = 8  # tied pairs passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
 
 
@@ -116,16 +117,16 @@ def _leaves(x, start, bounds, samples):
 
 @kernel
 def _mark(x, start, bounds, limits, samples, l, beyond):
-    """Mark the vertices of one lane that have left their bounds; returns whether one has left its limit."""
+    """Mark the vertices of one lane that have left their bounds, until one has left its limit; returns whether one has."""
     mx, my, mz = _shift(x, start, samples, l)
-    due = False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
         square = dx * dx + dy * dy + dz * dz
         inside, allowed = square <= bounds[p, l], square <= limits[p, l]
+        if not allowed:
+            return True
         beyond[p] = not inside
-        due |= not allowed
-    return due
+    return False
 
 
 @kernel
@@ -250,16 +251,17 @@ def _comes_close(x, memory, block, l, beyond):
 
 @apart
 def _hold_apart(x, v, w, sheet, block, l, beyond):
-    """Where a tied pair of one lane would come closer than it may, leave its vertices where they were; others may follow."""
+    """Where a tied pair of one lane would come closer than it may, halve the way of its vertices, and in the end leave them where
+    they were; others may follow."""
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
     ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
-    zero = x.dtype.type(0)
+    zero, half = x.dtype.type(0), x.dtype.type(0.5)
     close = np.empty(tight, np.int32)
     count, _ = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
     for c in range(count):
         ties[close[c], GROUP] = JAMMED
-    stay, going = np.zeros(x.shape[0], np.bool_), count > 0
+    halved, going = np.zeros(x.shape[0], np.int64), count > 0
     while going:
         going = False
         for t in range(tight):
@@ -267,16 +269,21 @@ def _hold_apart(x, v, w, sheet, block, l, beyond):
             if count > 0:
                 for m in range(ties[t, NUMBER]):
                     p = ties[t, VERTICES + m]
-                    if stay[p]:
+                    if halved[p] > HALVES:
                         continue
-                    stay[p] = beyond[p] = going = True
-                    report[CLAMPED] += 1
+                    report[CLAMPED] += halved[p] == 0
+                    halved[p] += 1
+                    beyond[p] = going = True
+                    share = half if halved[p] <= HALVES else zero
                     for c in range(3):
+                        place = old[p, c, l]
+                        if share > zero:  # what is not finite stays, too
+                            place += share * (x[p, c, l] - place)
                         if w[p, l] <= zero:
-                            lag[p, c, l] += x[p, c, l] - old[p, c, l]
+                            lag[p, c, l] += x[p, c, l] - place
                         else:
-                            v[p, c, l] = zero
-                        x[p, c, l] = old[p, c, l]
+                            v[p, c, l] *= share
+                        x[p, c, l] = place
     _note_lag(w, memory, block, l)
 
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
 from clothgym.collisions.closest import closest_on_segments, closest_on_triangle, segments_apart
 
@@ -79,17 +79,20 @@ def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, f
     figures[count, THICKNESS] = thickness
 
 
+@kernel
+def distance_to_keep(gap, held, stop, standoff):
+    """What a tied pair may come no closer than; a direction along which it is not apart certifies nothing: it stays as it is."""
+    return min(gap, standoff if held else stop) if gap > 0.0 else np.inf
+
+
 @inlined
 def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ties, planes):
     """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
-    direction, or than ``standoff`` if a hand holds any.
-
-    A direction along which they are not apart certifies nothing: the vertices stay where they are, apart as they are.
-    """
+    direction, or than ``standoff`` if a hand holds any."""
     ties[tight, OWN], ties[tight, NUMBER], ties[tight, GROUP] = own, 4, group
     ties[tight, VERTICES], ties[tight, VERTICES + 1], ties[tight, VERTICES + 2], ties[tight, VERTICES + 3] = i, j, k, l
-    least = standoff if held[i] or held[j] or held[k] or held[l] else stop
-    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, min(gap, least) if gap > 0.0 else np.inf
+    keep = distance_to_keep(gap, held[i] | held[j] | held[k] | held[l], stop, standoff)
+    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, keep
 
 
 @inlined
