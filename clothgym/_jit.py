@@ -165,22 +165,24 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
 
     def reduce(self, result: Any) -> Any:
-        return _calls_of(result.library), super().reduce(result)
+        library = result.library
+        return _calls_of(library), super().reduce(result)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         calls, payload = payload
         # they must be there before the code is, in which their symbols are looked up
-        libraries = []
+        called = []
         for name, types, symbol in calls:
             if name not in _dispatchers:  # a module has another name in the process that runs it than in one that imports it
                 raise _Outdated
             _dispatchers[name].compile(types)
-            called = _dispatchers[name].overloads[types]
-            if called.fndesc.mangled_name != symbol:
+            called.append(_dispatchers[name].overloads[types])
+            if called[-1].fndesc.mangled_name != symbol:
                 raise _Outdated
-            libraries.append(called.library)
         result = super().rebuild(target_context, payload)
-        result.library.calls, result.library.called = calls, libraries
+        library = result.library
+        # what is called lives as long as its caller
+        library.calls, library.called = calls, called
         return result
 
 
