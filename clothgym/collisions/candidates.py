@@ -217,6 +217,9 @@ def faces_of(p, triangles, faces):
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
         cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        faces[0, t], faces[1, t], faces[2, t] = cx, cy, cz
+    for t in range(triangles.shape[0]):  # side by side: roots of many at once
+        cx, cy, cz = faces[0, t], faces[1, t], faces[2, t]
         scale = 1.0 / np.sqrt(cx * cx + cy * cy + cz * cz + TINY)
         faces[0, t], faces[1, t], faces[2, t] = cx * scale, cy * scale, cz * scale
 

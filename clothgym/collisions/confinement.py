@@ -44,25 +44,27 @@ def confine(x, v, w, sheet, block, h):
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    out = np.zeros(lanes, np.bool_)
+    out, far = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
     if lanes == 1:
-        out[0] = _leaves(x, start, bounds, samples)
+        out[0], far[0] = _leaves(x, start, bounds, limits, samples)
     else:
-        _leave(x, start, bounds, samples, out)
+        _leave(x, start, bounds, limits, samples, out, far)
     beyond = np.empty(x.shape[0], np.bool_)
     for l in range(memory.used[block]):
+        # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
         if not out[l]:
             continue
-        # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
-        due, close = _mark(x, start, bounds, limits, samples, l, beyond), False
+        due = far[l]
         if not due and setting.strict:
-            due, close = _comes_close(x, memory, block, l, beyond)
-        if close and not due:
-            _hold_apart(x, v, w, sheet, block, l, beyond)
-            # what has stayed has not shared the motion of the others
-            due = _mark(x, start, bounds, limits, samples, l, beyond)
+            _mark(x, start, bounds, limits, samples, l, beyond)
+            touched = np.empty(memory.tight[block, l], np.int32)
+            number = _list_touched(memory.ties[block, l], beyond, touched)
+            due, close = _comes_close(x, memory, block, l, touched[:number])
+            if close and not due:
+                _hold_apart(x, v, w, sheet, block, l, beyond, touched, number)
+                # what has stayed has not shared the motion of the others
+                due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
-            beyond[:] = True
             _renew(x, v, w, sheet, block, l, h, beyond)
     for p in range(x.shape[0]):
         for c in range(3):
@@ -72,8 +74,8 @@ def confine(x, v, w, sheet, block, h):
 
 
 @kernel
-def _leave(x, start, bounds, samples, beyond):
-    """Mark lanes of which a vertex has left its bound, but for a motion that all share: it changes no distance."""
+def _leave(x, start, bounds, limits, samples, beyond, far):
+    """Mark lanes of which a vertex has left its bound, or its limit, but for a motion that all share: it changes no distance."""
     lanes = x.shape[2]
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
@@ -83,11 +85,13 @@ def _leave(x, start, bounds, samples, beyond):
             for l in range(lanes):
                 mean[c, l] += (xs[c, l] - ss[c, l]) * share
     for p in range(x.shape[0]):
-        xp, sp, bp = x[p], start[p], bounds[p]
+        xp, sp, bp, lp = x[p], start[p], bounds[p], limits[p]
         for l in range(lanes):
             dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
-            inside = dx * dx + dy * dy + dz * dz <= bp[l]
+            square = dx * dx + dy * dy + dz * dz
+            inside, allowed = square <= bp[l], square <= lp[l]
             beyond[l] |= not inside
+            far[l] |= not allowed
 
 
 @kernel
@@ -104,15 +108,17 @@ def _shift(x, start, samples, l):
 
 
 @kernel
-def _leaves(x, start, bounds, samples):
-    """Whether a vertex of the one lane there is has left its bound; without loops of one round."""
+def _leaves(x, start, bounds, limits, samples):
+    """Whether a vertex of the one lane there is has left its bound, and its limit; without loops of one round."""
     mx, my, mz = _shift(x, start, samples, 0)
-    beyond = False
+    beyond, far = False, False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, 0] - start[p, 0, 0] - mx, x[p, 1, 0] - start[p, 1, 0] - my, x[p, 2, 0] - start[p, 2, 0] - mz
-        inside = dx * dx + dy * dy + dz * dz <= bounds[p, 0]
+        square = dx * dx + dy * dy + dz * dz
+        inside, allowed = square <= bounds[p, 0], square <= limits[p, 0]
         beyond |= not inside
-    return beyond
+        far |= not allowed
+    return beyond, far
 
 
 @kernel
@@ -154,136 +160,169 @@ def _catch_up(x, w, lag, l, h):
 
 @inlined
 def _renew(x, v, w, sheet, block, l, h, beyond):
-    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it; all are beyond.
+    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it.
 
     Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a tie or since it
     may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand holds does
     not go with the others: else a jam would carry the hands away.
     """
-    memory = sheet.memory
-    look_around(memory.old[block], v, w, sheet, block, l, h)
+    memory, particles = sheet.memory, x.shape[0]
+    place, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
+    look_around(memory.old[block], v, w, sheet, block, l, h, place, limits, held)
     if sheet.setting.strict:
-        start, limits, tight = memory.start[block], memory.limits[block], memory.tight[block, l]
-        zero = x.dtype.type(0)
+        start, zero = memory.start[block], x.dtype.type(0)
         mx, my, mz = _shift(x, start, sheet.pairs.samples, l)
         together = True
-        for p in range(x.shape[0]):
-            together &= limits[p, l] > zero
-            if w[p, l] <= zero:
+        for p in range(particles):
+            together &= limits[p] > zero
+            if held[p]:
                 dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
-                together &= dx * dx + dy * dy + dz * dz <= limits[p, l]
+                together &= dx * dx + dy * dy + dz * dz <= limits[p]
         if not together:
             mx, my, mz = zero, zero, zero
-        _draw_back(x, v, w, memory, block, l, h, mx, my, mz)
-        close = np.empty(tight, np.int32)
-        count, _ = _look_at_ties(x, memory.ties[block, l], memory.planes[block, l], 0, tight, beyond, l, close)
-        if count > 0:
-            _draw_back(x, v, w, memory, block, l, h, zero, zero, zero)
-            _hold_apart(x, v, w, sheet, block, l, beyond)
+        _draw_back(x, v, memory, block, l, h, place, limits, held, mx, my, mz)
+        ties, planes, tight, close = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l], False
+        for t in range(tight):
+            close |= _is_close(x, ties, planes, t, l)
+        if close:
+            _draw_back(x, v, memory, block, l, h, place, limits, held, zero, zero, zero)
+            beyond[:] = True
+            touched = np.empty(tight, np.int32)
+            _hold_apart(x, v, w, sheet, block, l, beyond, touched, _list_touched(ties, beyond, touched))
         _note_lag(w, memory, block, l)
 
 
 @kernel
-def _draw_back(x, v, w, memory, block, l, h, mx, my, mz):
-    """Draw one lane's vertices back to their limits about a common motion m since the query [m]."""
-    start, limits, lag, report = memory.start[block], memory.limits[block], memory.lag[block], memory.report[block, l]
-    zero = x.dtype.type(0)
+def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
+    """Draw one lane's vertices back to their limits about a common motion m since the query [m].
+
+    start: where they were at the query, (particles, 3); limits: the squares of how far they may go [m^2], (particles,).
+    """
+    lag, report = memory.lag[block], memory.report[block, l]
+    real = x.dtype.type
     for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+        sx, sy, sz = real(start[p, 0]), real(start[p, 1]), real(start[p, 2])
+        dx, dy, dz = x[p, 0, l] - sx - mx, x[p, 1, l] - sy - my, x[p, 2, l] - sz - mz
         square = dx * dx + dy * dy + dz * dz
-        if square > limits[p, l]:
-            keep = np.sqrt(limits[p, l] / square)
+        if square > limits[p]:
+            keep = np.sqrt(limits[p] / square)
             report[CLAMPED] += 1
-            held = w[p, l] <= zero
-            for c, m, d in ((0, mx, dx), (1, my, dy), (2, mz, dz)):
+            for c, s, m, d in ((0, sx, mx, dx), (1, sy, my, dy), (2, sz, mz, dz)):
                 # from the start, so that what may not move at all does not creep by rounding
-                place = start[p, c, l] + (m + keep * d)
-                if held:
-                    lag[p, c, l] += x[p, c, l] - place
+                goal = s + (m + keep * d)
+                if held[p]:
+                    lag[p, c, l] += x[p, c, l] - goal
                 else:
                     v[p, c, l] = m / h + keep * (v[p, c, l] - m / h)
-                x[p, c, l] = place
+                x[p, c, l] = goal
+
+
+@inlined
+def _touches(ties, t, beyond):
+    """Whether a tied pair has a vertex beyond its bound: one of the first four, or of what others it has."""
+    some = beyond[ties[t, VERTICES]] | beyond[ties[t, VERTICES + 1]] | beyond[ties[t, VERTICES + 2]] | beyond[ties[t, VERTICES + 3]]
+    for m in range(4, ties[t, NUMBER]):
+        some |= beyond[ties[t, VERTICES + m]]
+    return some
 
 
 @kernel
-def _look_at_ties(x, ties, planes, begin, end, beyond, l, close):
-    """List which tied pairs of one lane, of those from ``begin`` to ``end``, are closer than they may be; only those with a vertex
-    beyond its bound are looked at.  Returns how many are close, and how many were looked at."""
-    count, looks = 0, 0
-    for t in range(begin, end):
-        own, number, some = ties[t, OWN], ties[t, NUMBER], False
-        for m in range(number):
-            some |= beyond[ties[t, VERTICES + m]]
-        if not some:
-            continue
-        looks += 1
-        nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
-        low, high = np.inf, -np.inf
-        for m in range(number):
-            p = ties[t, VERTICES + m]
-            place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
-            if m < own:
-                low = min(low, place)
-            else:
-                high = max(high, place)
-        # not what is not a number: that has diverged, and is not held
-        if low - high < planes[t, KEPT]:
-            close[count] = t
-            count += 1
-    return count, looks
+def _list_touched(ties, beyond, touched):
+    """List the tied pairs with a vertex beyond its bound, all there is room for; returns how many."""
+    number = 0
+    for t in range(touched.shape[0]):
+        touched[number] = t
+        number += _touches(ties, t, beyond)
+    return number
 
 
 @kernel
-def _comes_close(x, memory, block, l, beyond):
-    """Whether a query is due for tied pairs of one lane, and whether one with a vertex beyond its bound is closer than it may be.
+def _is_close(x, ties, planes, t, l):
+    """Whether a tied pair of one lane is closer than it may be."""
+    own = ties[t, OWN]
+    nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
+    low, high = np.inf, -np.inf
+    for m in range(ties[t, NUMBER]):
+        p = ties[t, VERTICES + m]
+        place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
+        if m < own:
+            low = min(low, place)
+        else:
+            high = max(high, place)
+    # not what is not a number: that has diverged, and is not held
+    return low - high < planes[t, KEPT]
+
+
+@kernel
+def _comes_close(x, memory, block, l, touched):
+    """Whether a query is due for tied pairs of one lane, and whether one that is touched is closer than it may be.
 
     Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
     looked at than it is worth.
     """
     ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
-    close, due = np.empty(tight, np.int32), False
-    count, looks = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
-    for c in range(count):
-        due |= ties[close[c], GROUP] != JAMMED
-    memory.looks[block, l] += tight // PASSING + looks
-    return due or memory.looks[block, l] > PATIENCE * tight, count > 0
+    due, close = False, False
+    for c in range(touched.shape[0]):
+        if _is_close(x, ties, planes, touched[c], l):
+            close = True
+            due |= ties[touched[c], GROUP] != JAMMED
+    memory.looks[block, l] += tight // PASSING + touched.shape[0]
+    return due or memory.looks[block, l] > PATIENCE * tight, close
 
 
 @apart
-def _hold_apart(x, v, w, sheet, block, l, beyond):
+def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
     """Where a tied pair of one lane would come closer than it may, halve the way of its vertices, and in the end leave them where
-    they were; others may follow."""
+    they were; others may follow.
+
+    touched: room for all tied pairs; the first ``number`` are those with a vertex beyond its bound.
+    """
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
-    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
+    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], touched.shape[0]
     zero, half = x.dtype.type(0), x.dtype.type(0.5)
-    close = np.empty(tight, np.int32)
-    count, _ = _look_at_ties(x, ties, planes, 0, tight, beyond, l, close)
-    for c in range(count):
-        ties[close[c], GROUP] = JAMMED
-    halved, going = np.zeros(x.shape[0], np.int64), count > 0
+    going = False
+    for c in range(number):
+        if _is_close(x, ties, planes, touched[c], l):
+            ties[touched[c], GROUP] = JAMMED
+            going = True
+    halved = np.zeros(x.shape[0], np.int64)
     while going:
-        going = False
-        for t in range(tight):
-            count, _ = _look_at_ties(x, ties, planes, t, t + 1, beyond, l, close)
-            if count > 0:
-                for m in range(ties[t, NUMBER]):
-                    p = ties[t, VERTICES + m]
-                    if halved[p] > HALVES:
-                        continue
-                    report[CLAMPED] += halved[p] == 0
-                    halved[p] += 1
-                    beyond[p] = going = True
-                    share = half if halved[p] <= HALVES else zero
-                    for c in range(3):
-                        place = old[p, c, l]
-                        if share > zero:  # what is not finite stays, too
-                            place += share * (x[p, c, l] - place)
-                        if w[p, l] <= zero:
-                            lag[p, c, l] += x[p, c, l] - place
-                        else:
-                            v[p, c, l] *= share
-                        x[p, c, l] = place
+        # in their order, round by round; once others are touched, the rest of the round looks at all
+        going, spread, c, t = False, False, 0, -1
+        while c < number or spread:
+            if spread:
+                t += 1
+                if t == tight:
+                    break
+                if not _touches(ties, t, beyond):
+                    continue
+            else:
+                t = touched[c]
+                c += 1
+            if not _is_close(x, ties, planes, t, l):
+                continue
+            for m in range(ties[t, NUMBER]):
+                p = ties[t, VERTICES + m]
+                if halved[p] > HALVES:
+                    continue
+                report[CLAMPED] += halved[p] == 0
+                halved[p] += 1
+                going = True
+                spread |= not beyond[p]
+                beyond[p] = True
+                share = half if halved[p] <= HALVES else zero
+                for k in range(3):
+                    place = old[p, k, l]
+                    if share > zero:  # what is not finite stays, too
+                        place += share * (x[p, k, l] - place)
+                    if w[p, l] <= zero:
+                        lag[p, k, l] += x[p, k, l] - place
+                    else:
+                        v[p, k, l] *= share
+                    x[p, k, l] = place
+        if spread:
+            number = _list_touched(ties, beyond, touched)
     _note_lag(w, memory, block, l)
 
 
@@ -300,12 +339,15 @@ def _note_lag(w, memory, block, l):
 
 
 @inlined
-def look_around(x, v, w, sheet, block, l, h):
-    """Query one lane at the given positions; where it is fast it looks farther."""
+def look_around(x, v, w, sheet, block, l, h, p, limits, held):
+    """Query one lane at the given positions; where it is fast it looks farther.
+
+    p, limits and held become its positions in float64 [m], (particles, 3), the squares of how far they may go before the next query
+    [m^2], (particles,), and whether they are held, (particles,): lanes lie far apart, so what is read again is copied.
+    """
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
     particles = x.shape[0]
-    p, held = np.empty((particles, 3)), np.empty(particles, np.bool_)
     room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
     _foresee(v, sheet, l, h, extra)
     for k in range(particles):
@@ -327,7 +369,8 @@ def look_around(x, v, w, sheet, block, l, h):
         free[:] = room + 2.0 * SHARE * extra
     for k in range(particles):
         bounds[k, l] = (INSIDE * room[k]) ** 2
-        memory.limits[block, k, l] = (INSIDE * free[k]) ** 2
+        limits[k] = (INSIDE * free[k]) ** 2
+        memory.limits[block, k, l] = limits[k]
     _take_over(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
     memory.contacts[block, l] = count
     # what has been found is swept over at once
@@ -367,8 +410,9 @@ def _foresee(v, sheet, l, h, extra):
     share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, FORESEEN * far
     for p in range(v.shape[0]):
         dx, dy, dz = v[p, 0, l] - share * mx, v[p, 1, l] - share * my, v[p, 2, l] - share * mz
-        way = ahead * np.sqrt(dx * dx + dy * dy + dz * dz) - 0.5 * far
-        extra[p] = min(max(way, 0.0), most)
+        extra[p] = dx * dx + dy * dy + dz * dz
+    for p in range(v.shape[0]):  # side by side: roots of many at once
+        extra[p] = min(max(ahead * np.sqrt(extra[p]) - 0.5 * far, 0.0), most)
 
 
 @kernel

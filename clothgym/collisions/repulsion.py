@@ -40,16 +40,16 @@ def press_again(x, v, w, sheet, block, carried):
         some |= memory.contacts[block, l] > 0
     if not some:
         return
-    lanes = x.shape[2]
+    # what changes no bit when it is added; two selects of x and v instead would keep the loop from being one of vectors
+    nothing = -zero
     for p in range(x.shape[0]):
         wp = w[p]
         for c in range(3):
             xc, vc, pc = x[p, c], v[p, c], memory.pressed[block, p, c]
-            for l in range(lanes):
-                pressed = pc[l] if wp[l] > zero else zero
-                moved, faster = xc[l] + carried * pressed, vc[l] + pressed
-                xc[l] = moved if pressed != zero else xc[l]
-                vc[l] = faster if pressed != zero else vc[l]
+            for l in range(x.shape[2]):
+                pressed = pc[l] if (wp[l] > zero) & (pc[l] != zero) else nothing
+                xc[l] += carried * pressed
+                vc[l] += pressed
 
 
 @apart
