@@ -1,7 +1,7 @@
 """Which primitives of one sheet may be close: the broad phase of self-collision's query.
 
 Near pairs (see ``pairs``) by the distances of their vertices; all others by the boxes of a tree, boxes, balls and planes of leaves,
-and balls of primitives.  What is left out is surely farther apart than the query's reach.
+and boxes of primitives.  What is left out is surely farther apart than the query's reach.
 """
 
 from __future__ import annotations
@@ -42,20 +42,17 @@ def along(p, v, nx, ny, nz):
 
 @kernel
 def stretches(p, edges, rest_edges, triangles, triangle_edges, stretch):
-    """The largest (length over rest length)^2, at least 1, of the edges of each vertex' triangles; returns that of the sheet."""
+    """The largest (length over rest length)^2, at least 1, of the edges of each vertex' triangles."""
     ratio = np.empty(edges.shape[0])
-    largest = 1.0
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]
         dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         ratio[e] = max((dx * dx + dy * dy + dz * dz) * rest_edges[e], 1.0)
-        largest = max(largest, ratio[e])
     stretch[:] = 1.0
     for t in range(triangles.shape[0]):
         own = max(ratio[triangle_edges[t, 0]], max(ratio[triangle_edges[t, 1]], ratio[triangle_edges[t, 2]]))
         for c in range(3):
             stretch[triangles[t, c]] = max(stretch[triangles[t, c]], own)
-    return largest
 
 
 @kernel
@@ -73,11 +70,11 @@ def come_close(p, ends, slack, stretch, near, wide, out):
 
 @apart
 def near_candidates(p, pairs, near, extra):
-    """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), edges
-    and edges, (candidates, 2), and the sheet's largest stretch."""
+    """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), and edges
+    and edges, (candidates, 2)."""
     near_pairs, begins, near_list, vertex_triangles = pairs.near_pairs, pairs.near, pairs.near_list, pairs.vertex_triangles
     stretch = np.empty(p.shape[0])
-    largest = stretches(p, pairs.edges, pairs.rest_edges, pairs.triangles, pairs.triangle_edges, stretch)
+    stretches(p, pairs.edges, pairs.rest_edges, pairs.triangles, pairs.triangle_edges, stretch)
     # a primitive's extra is the largest of its vertices
     wide = np.zeros(p.shape[0])
     for t in range(pairs.triangles.shape[0]):
@@ -104,7 +101,7 @@ def near_candidates(p, pairs, near, extra):
             else:
                 edges[second, 0], edges[second, 1] = near_pairs[n, 0], near_pairs[n, 1]
                 second += 1
-    return corners[:first], edges[:second], np.sqrt(largest)
+    return corners[:first], edges[:second]
 
 
 @kernel
@@ -159,6 +156,20 @@ def within(box, ball, beside, bit, leaf, first, number, far):
     return bits
 
 
+@inlined
+def leaves_within(box, first, number, hulls, node, far):
+    """Which of ``number`` leaves, from ``first`` on, may be within reach of a node, as bits; a vector, too."""
+    lx, ly, lz = hulls[0, node] - far, hulls[1, node] - far, hulls[2, node] - far
+    hx, hy, hz = hulls[3, node] + far, hulls[4, node] + far, hulls[5, node] + far
+    bits = 0
+    for m in range(number):
+        leaf = np.uint64(first + m)
+        beyond = (box[0, leaf] > hx) | (box[1, leaf] > hy) | (box[2, leaf] > hz)
+        beyond |= (lx > box[3, leaf]) | (ly > box[4, leaf]) | (lz > box[5, leaf])
+        bits |= (not beyond) << m
+    return bits
+
+
 @kernel
 def far_leaves(pairs, far, ball, box, hulls, out):
     """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more are written than fit
@@ -185,8 +196,9 @@ def far_leaves(pairs, far, ball, box, hulls, out):
                 continue
             first = nodes[inside, BEGIN]
             number = nodes[inside, END] - first
+            some = leaves_within(box, begin, end - begin, hulls, inside, far)
             for leaf in range(begin, end):
-                if out_of_reach(box, leaf, hulls, inside, far):
+                if not (some >> (leaf - begin)) & 1:
                     continue
                 bits = within(box, ball, beside, 1 << (leaf - begin), leaf, first, number, far)
                 if bits == 0:
@@ -268,18 +280,20 @@ def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, wide, 
 
 
 @kernel
-def far_vertices(p, leaves, ball, far, wide, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
+def far_vertices(p, leaves, box, far, wide, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
     """Vertices and triangles of leaves' pairs that may be close, with the number of the pair; returns how many, though no more than
     fit are written."""
     count = 0
     for pair in range(leaves.shape[0]):
         for way in range(2):
             leaf, other = leaves[pair, way], leaves[pair, 1 - way]
-            r = ball[3, other] + far + wide[leaf]
+            r = far + wide[leaf]
+            lx, ly, lz = box[0, other] - r, box[1, other] - r, box[2, other] - r
+            hx, hy, hz = box[3, other] + r, box[4, other] + r, box[5, other] + r
             for m in range(leaf_vertices[leaf], leaf_vertices[leaf + 1]):
                 v = own_vertices[m]
-                dx, dy, dz = p[v, 0] - ball[0, other], p[v, 1] - ball[1, other], p[v, 2] - ball[2, other]
-                if dx * dx + dy * dy + dz * dz <= r * r:
+                x, y, z = p[v, 0], p[v, 1], p[v, 2]
+                if (lx <= x) & (ly <= y) & (lz <= z) & (x <= hx) & (y <= hy) & (z <= hz):
                     for n in range(leaf_triangles[other], leaf_triangles[other + 1]):
                         if count < out.shape[0]:
                             out[count, 0], out[count, 1], out[count, 2] = v, own_triangles[n], pair
@@ -288,18 +302,19 @@ def far_vertices(p, leaves, ball, far, wide, leaf_vertices, own_vertices, leaf_t
 
 
 @kernel
-def far_edges(p, leaves, layered, ridges, stretch, far, extra, leaf_edges, own_edges, edges, half_edges, out):
+def far_edges(p, leaves, layered, ridges, far, extra, leaf_edges, own_edges, edges, out):
     """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more are written than fit
     with one to spare."""
     count, last, size = 0, out.shape[0] - 1, own_edges.shape[0]
-    # balls around edges, in their leaves' order: twice the centre, and the radius
-    ball, ridge = np.empty((4, size)), np.empty(size, np.bool_)
+    # boxes around edges, wider by their extra, in their leaves' order
+    box, ridge = np.empty((6, size)), np.empty(size, np.bool_)
     for m in range(size):
         e = own_edges[m]
         i, j = edges[e, 0], edges[e, 1]
+        wide = max(extra[i], extra[j])
         for c in range(3):
-            ball[c, m] = p[i, c] + p[j, c]
-        ball[3, m] = half_edges[e] * stretch + max(extra[i], extra[j])
+            a, b = p[i, c], p[j, c]
+            box[c, m], box[3 + c, m] = min(a, b) - wide, max(a, b) + wide
         ridge[m] = ridges[e]
     for pair in range(leaves.shape[0]):
         leaf, other, any_edge = leaves[pair, 0], leaves[pair, 1], not layered[pair]
@@ -307,12 +322,14 @@ def far_edges(p, leaves, layered, ridges, stretch, far, extra, leaf_edges, own_e
         for m in range(leaf_edges[leaf], leaf_edges[leaf + 1]):
             if not (any_edge or ridge[m]):
                 continue
-            mx, my, mz, reach = ball[0, m], ball[1, m], ball[2, m], ball[3, m] + far
+            lx, ly, lz = box[0, m] - far, box[1, m] - far, box[2, m] - far
+            hx, hy, hz = box[3, m] + far, box[4, m] + far, box[5, m] + far
             for n in range(begin, end):
-                dx, dy, dz, r = ball[0, n] - mx, ball[1, n] - my, ball[2, n] - mz, ball[3, n] + reach
                 place = min(count, last)
                 out[place, 0], out[place, 1] = own_edges[m], own_edges[n]
-                count += (dx * dx + dy * dy + dz * dz <= 4.0 * r * r) & (any_edge or ridge[n])
+                near = (lx <= box[3, n]) & (ly <= box[4, n]) & (lz <= box[5, n])
+                near &= (box[0, n] <= hx) & (box[1, n] <= hy) & (box[2, n] <= hz)
+                count += near & (any_edge or ridge[n])
     return count
 
 
@@ -334,23 +351,19 @@ def far_pairs(p, pairs, far, extra, faces):
     leaves = found[:number]
     vertices = np.empty((4 * number, 3), np.int32)
     owned = pairs.leaf_vertices, pairs.own_vertices, pairs.leaf_triangles, pairs.own_triangles
-    count = far_vertices(p, leaves, ball, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
+    count = far_vertices(p, leaves, box, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
     if count > vertices.shape[0]:
         vertices = np.empty((count, 3), np.int32)
-        far_vertices(p, leaves, ball, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
+        far_vertices(p, leaves, box, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
     return leaves, gaps[:number], vertices[:count]
 
 
 @apart
-def far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra):
-    """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges.
-
-    stretch: the largest of an edge.
-    """
+def far_sides(p, pairs, leaves, layered, ridges, far, extra):
+    """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges."""
     sides = np.empty((4 * leaves.shape[0] + 1, 2), np.int32)
-    owned = pairs.leaf_edges, pairs.own_edges, pairs.edges, pairs.half_edges
-    count = far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
+    count = far_edges(p, leaves, layered, ridges, far, extra, pairs.leaf_edges, pairs.own_edges, pairs.edges, sides)
     if count >= sides.shape[0]:
         sides = np.empty((count + 1, 2), np.int32)
-        far_edges(p, leaves, layered, ridges, stretch, far, extra, owned[0], owned[1], owned[2], owned[3], sides)
+        far_edges(p, leaves, layered, ridges, far, extra, pairs.leaf_edges, pairs.own_edges, pairs.edges, sides)
     return sides[:count]

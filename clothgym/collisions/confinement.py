@@ -44,11 +44,12 @@ def confine(x, v, w, sheet, block, h):
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
+    left = np.empty((x.shape[0], lanes), np.bool_)
     out, far = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
     if lanes == 1:
-        out[0], far[0] = _leaves(x, start, bounds, limits, samples)
+        out[0], far[0] = _mark(x, start, bounds, limits, samples, 0, left[:, 0])
     else:
-        _leave(x, start, bounds, limits, samples, out, far)
+        _leave(x, start, bounds, limits, samples, left, out, far)
     beyond = np.empty(x.shape[0], np.bool_)
     for l in range(memory.used[block]):
         # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
@@ -56,14 +57,15 @@ def confine(x, v, w, sheet, block, h):
             continue
         due = far[l]
         if not due and setting.strict:
-            _mark(x, start, bounds, limits, samples, l, beyond)
+            for p in range(x.shape[0]):
+                beyond[p] = left[p, l]
             touched = np.empty(memory.tight[block, l], np.int32)
             number = _list_touched(memory.ties[block, l], beyond, touched)
             due, close = _comes_close(x, memory, block, l, touched[:number])
             if close and not due:
                 _hold_apart(x, v, w, sheet, block, l, beyond, touched, number)
                 # what has stayed has not shared the motion of the others
-                due = _mark(x, start, bounds, limits, samples, l, beyond)
+                _, due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
             _renew(x, v, w, sheet, block, l, h, beyond)
     for p in range(x.shape[0]):
@@ -74,8 +76,11 @@ def confine(x, v, w, sheet, block, h):
 
 
 @kernel
-def _leave(x, start, bounds, limits, samples, beyond, far):
-    """Mark lanes of which a vertex has left its bound, or its limit, but for a motion that all share: it changes no distance."""
+def _leave(x, start, bounds, limits, samples, left, some, far):
+    """Which vertices have left their bounds, (particles, lanes), in which lanes some have, and in which one has left its limit.
+
+    A motion that all share does not count: it changes no distance.
+    """
     lanes = x.shape[2]
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
@@ -85,12 +90,13 @@ def _leave(x, start, bounds, limits, samples, beyond, far):
             for l in range(lanes):
                 mean[c, l] += (xs[c, l] - ss[c, l]) * share
     for p in range(x.shape[0]):
-        xp, sp, bp, lp = x[p], start[p], bounds[p], limits[p]
+        xp, sp, bp, lp, out = x[p], start[p], bounds[p], limits[p], left[p]
         for l in range(lanes):
             dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
             square = dx * dx + dy * dy + dz * dz
             inside, allowed = square <= bp[l], square <= lp[l]
-            beyond[l] |= not inside
+            out[l] = not inside
+            some[l] |= not inside
             far[l] |= not allowed
 
 
@@ -108,31 +114,18 @@ def _shift(x, start, samples, l):
 
 
 @kernel
-def _leaves(x, start, bounds, limits, samples):
-    """Whether a vertex of the one lane there is has left its bound, and its limit; without loops of one round."""
-    mx, my, mz = _shift(x, start, samples, 0)
-    beyond, far = False, False
-    for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, 0] - start[p, 0, 0] - mx, x[p, 1, 0] - start[p, 1, 0] - my, x[p, 2, 0] - start[p, 2, 0] - mz
-        square = dx * dx + dy * dy + dz * dz
-        inside, allowed = square <= bounds[p, 0], square <= limits[p, 0]
-        beyond |= not inside
-        far |= not allowed
-    return beyond, far
-
-
-@kernel
-def _mark(x, start, bounds, limits, samples, l, beyond):
-    """Mark the vertices of one lane that have left their bounds, until one has left its limit; returns whether one has."""
+def _mark(x, start, bounds, limits, samples, l, left):
+    """The same of one lane; left: (particles,).  Without loops of one round."""
     mx, my, mz = _shift(x, start, samples, l)
+    some, far = False, False
     for p in range(x.shape[0]):
         dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
         square = dx * dx + dy * dy + dz * dz
         inside, allowed = square <= bounds[p, l], square <= limits[p, l]
-        if not allowed:
-            return True
-        beyond[p] = not inside
-    return False
+        left[p] = not inside
+        some |= not inside
+        far |= not allowed
+    return some, far
 
 
 @kernel

@@ -36,7 +36,6 @@ class Pairs(NamedTuple):
     triangles, edges, triangle_edges: vertices of each, (triangles, 3) and (edges, 2), and the edges of each triangle, opposite its
     corners, (triangles, 3).
     edge_triangles: both triangles of each edge, (edges, 2), the same twice on the border.
-    half_edges: half the rest length of each edge [m], (edges,).
     rest_edges: one over the square of its rest length [1/m^2], (edges,).
     vertex_owner, edge_owner: the triangle that stands for each in contacts with a triangle's border, (particles,), (edges,).
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
@@ -54,7 +53,6 @@ class Pairs(NamedTuple):
     edges: Int
     triangle_edges: Int
     edge_triangles: Int
-    half_edges: Real
     rest_edges: Real
     vertex_owner: Int
     edge_owner: Int
@@ -111,7 +109,6 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         edges=_int(edges),
         triangle_edges=_int(triangle_edges),
         edge_triangles=_int(np.stack([edge_owner, last], axis=1)),
-        half_edges=0.5 * np.sqrt(length2),
         rest_edges=1 / length2,
         vertex_owner=_int(vertex_owner),
         edge_owner=_int(edge_owner),

@@ -299,7 +299,7 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
     faces_of(p, triangles, faces)
     ridges_of(faces, pairs.edge_triangles, ridges)
     near, far, thin, thick = reach.near, reach.far, reach.near_thickness, reach.far_thickness
-    corners, sides, stretch = near_candidates(p, pairs, near, extra)
+    corners, sides = near_candidates(p, pairs, near, extra)
     closest = np.zeros((1, 4))
     closest[0, 0] = near
     # a literal would have a type, and so a version of the kernel, of its own
@@ -325,7 +325,7 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
     tight = tie_layers(
         p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes
     )
-    sides = far_sides(p, pairs, leaves, layered, ridges, stretch, far, extra)
+    sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
     count, tight = edge_contacts(
         p, sides, edges, ridges, far, extra, thick, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
         figures, tight, ties, planes, report,

@@ -363,7 +363,7 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
     extra = np.zeros(mesh.num_particles)
     leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
-    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), 1.0, reach, extra)
+    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), reach, extra)
     figures = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
     no_contacts = np.empty((0, 4), np.int32), np.empty((0, FIGURES), dtype)
     none = *no_contacts, 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
