@@ -14,6 +14,8 @@ from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.pairs import BEGIN, END, LEAVES, NEXT
 
 TINY = 1e-300
+ALL = 2**LEAVES - 1  # a bit for each leaf of a node
+WIDE, STRETCH = 3, 4  # in a row of ``near_rows``
 FLAT = 0.2  # angle [rad] up to which neighbouring faces are taken for flat: there vertices alone keep layers apart
 
 
@@ -41,30 +43,37 @@ def along(p, v, nx, ny, nz):
 
 
 @kernel
-def stretches(p, edges, rest_edges, triangles, triangle_edges, stretch):
-    """The largest (length over rest length)^2, at least 1, of the edges of each vertex' triangles."""
+def near_rows(p, pairs, extra, rows):
+    """What is asked of each vertex of a near pair, side by side, (particles, 5): its place; the most that its triangles look farther
+    for, since a primitive's extra is the largest of its vertices [m]; and the largest (length over rest length)^2, at least 1, of
+    the edges of its triangles."""
+    edges, triangles, triangle_edges = pairs.edges, pairs.triangles, pairs.triangle_edges
     ratio = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]
         dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
-        ratio[e] = max((dx * dx + dy * dy + dz * dz) * rest_edges[e], 1.0)
-    stretch[:] = 1.0
+        ratio[e] = max((dx * dx + dy * dy + dz * dz) * pairs.rest_edges[e], 1.0)
+    for v in range(p.shape[0]):
+        rows[v, 0], rows[v, 1], rows[v, 2], rows[v, WIDE], rows[v, STRETCH] = p[v, 0], p[v, 1], p[v, 2], 0.0, 1.0
     for t in range(triangles.shape[0]):
-        own = max(ratio[triangle_edges[t, 0]], max(ratio[triangle_edges[t, 1]], ratio[triangle_edges[t, 2]]))
-        for c in range(3):
-            stretch[triangles[t, c]] = max(stretch[triangles[t, c]], own)
+        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        wide = max(extra[i], max(extra[j], extra[k]))
+        stretch = max(ratio[triangle_edges[t, 0]], max(ratio[triangle_edges[t, 1]], ratio[triangle_edges[t, 2]]))
+        for v in (i, j, k):
+            rows[v, WIDE], rows[v, STRETCH] = max(rows[v, WIDE], wide), max(rows[v, STRETCH], stretch)
 
 
 @kernel
-def come_close(p, ends, slack, stretch, near, wide, out):
+def come_close(rows, partners, partner, slack, near, out):
     """Near pairs of vertices that are so close that some of their primitives may be within reach; returns how many."""
     count = 0
-    for q in range(ends.shape[0]):
-        i, j = ends[q, 0], ends[q, 1]
-        dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
-        within = near + wide[i] + wide[j]
-        out[count] = q
-        count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch[i], stretch[j])
+    for i in range(rows.shape[0]):
+        x, y, z, wide, stretch = rows[i, 0], rows[i, 1], rows[i, 2], near + rows[i, WIDE], rows[i, STRETCH]
+        for q in range(partners[i], partners[i + 1]):
+            j = partner[q]
+            dx, dy, dz, within = rows[j, 0] - x, rows[j, 1] - y, rows[j, 2] - z, wide + rows[j, WIDE]
+            out[count] = q
+            count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch, rows[j, STRETCH])
     return count
 
 
@@ -73,16 +82,9 @@ def near_candidates(p, pairs, near, extra):
     """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), and edges
     and edges, (candidates, 2)."""
     near_pairs, begins, near_list, vertex_triangles = pairs.near_pairs, pairs.near, pairs.near_list, pairs.vertex_triangles
-    stretch = np.empty(p.shape[0])
-    stretches(p, pairs.edges, pairs.rest_edges, pairs.triangles, pairs.triangle_edges, stretch)
-    # a primitive's extra is the largest of its vertices
-    wide = np.zeros(p.shape[0])
-    for t in range(pairs.triangles.shape[0]):
-        i, j, k = pairs.triangles[t, 0], pairs.triangles[t, 1], pairs.triangles[t, 2]
-        most = max(extra[i], max(extra[j], extra[k]))
-        wide[i], wide[j], wide[k] = max(wide[i], most), max(wide[j], most), max(wide[k], most)
-    close = np.empty(pairs.ends.shape[0] + 1, np.int32)
-    number = come_close(p, pairs.ends, pairs.slack, stretch, near, wide, close)
+    rows, close = np.empty((p.shape[0], 5)), np.empty(pairs.partner.shape[0] + 1, np.int32)
+    near_rows(p, pairs, extra, rows)
+    number = come_close(rows, pairs.partners, pairs.partner, pairs.slack, near, close)
     room = 0
     for c in range(number):
         room += begins[close[c] + 1] - begins[close[c]]
@@ -137,8 +139,8 @@ def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
 
 
 @inlined
-def within(box, ball, beside, bit, leaf, first, number, far):
-    """Which of ``number`` leaves, from ``first`` on, come after a leaf, are not beside it and may be within its reach, as bits.
+def within(box, ball, leaf, first, number, far):
+    """Which of ``number`` leaves, from ``first`` on, may be within a leaf's reach, as bits.
 
     All fit in a vector, for which their number must not be known to the compiler, nor their places be signed.
     """
@@ -151,8 +153,7 @@ def within(box, ball, beside, bit, leaf, first, number, far):
         dx, dy, dz, r = ball[0, other] - bx, ball[1, other] - by, ball[2, other] - bz, ball[3, other] + br
         beyond = (box[0, other] > hx) | (box[1, other] > hy) | (box[2, other] > hz)
         beyond |= (lx > box[3, other]) | (ly > box[4, other]) | (lz > box[5, other])
-        kept = (not beyond) & (dx * dx + dy * dy + dz * dz <= r * r) & (first + m > leaf) & ((beside[other] & bit) == 0)
-        bits |= kept << m
+        bits |= ((not beyond) & (dx * dx + dy * dy + dz * dz <= r * r)) << m
     return bits
 
 
@@ -174,19 +175,15 @@ def leaves_within(box, first, number, hulls, node, far):
 def far_leaves(pairs, far, ball, box, hulls, out):
     """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more are written than fit
     with one to spare."""
-    nodes, neighbours, next_leaves = pairs.nodes, pairs.neighbours, pairs.next_leaves
-    # a bit for each leaf of a node beside which a leaf is
-    beside = np.zeros(box.shape[1], np.int64)
+    nodes, beside, beside_nodes, beside_leaves = pairs.nodes, pairs.beside, pairs.beside_nodes, pairs.beside_leaves
     count, last = 0, out.shape[0] - 1
     for one in range(nodes.shape[0]):
         if nodes[one, NEXT] > one + 1:
             continue
-        begin, end = nodes[one, BEGIN], nodes[one, END]
-        for leaf in range(begin, end):
-            for n in range(neighbours[leaf], neighbours[leaf + 1]):
-                beside[next_leaves[n]] |= 1 << (leaf - begin)
-        # what comes after it in the tree; a node that is out of reach is passed over with all that is in it
-        two = one
+        begin, number = nodes[one, BEGIN], nodes[one, END] - nodes[one, BEGIN]
+        # what comes after it in the tree, and of that, in the same order, what is beside it; a node that is out of reach is passed
+        # over with all that is in it
+        two, next_beside = one, beside[one]
         while two < nodes.shape[0]:
             inside, two = two, nodes[two, NEXT]
             if out_of_reach(hulls, one, hulls, inside, far):
@@ -194,23 +191,25 @@ def far_leaves(pairs, far, ball, box, hulls, out):
             if two > inside + 1:
                 two = inside + 1
                 continue
-            first = nodes[inside, BEGIN]
-            number = nodes[inside, END] - first
-            some = leaves_within(box, begin, end - begin, hulls, inside, far)
-            for leaf in range(begin, end):
-                if not (some >> (leaf - begin)) & 1:
+            while next_beside < beside[one + 1] and beside_nodes[next_beside] < inside:
+                next_beside += 1
+            known = 0
+            if next_beside < beside[one + 1] and beside_nodes[next_beside] == inside:
+                known = beside_leaves[next_beside]
+            first, others = nodes[inside, BEGIN], nodes[inside, END] - nodes[inside, BEGIN]
+            some = leaves_within(box, begin, number, hulls, inside, far)
+            for k in range(number):
+                searched = ~(known >> (LEAVES * k)) & ALL
+                if not (some >> k) & 1 or searched == 0:
                     continue
-                bits = within(box, ball, beside, 1 << (leaf - begin), leaf, first, number, far)
+                bits = within(box, ball, begin + k, first, others, far) & searched
                 if bits == 0:
                     continue
                 # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
                 for m in range(LEAVES):
                     place = min(count, last)
-                    out[place, 0], out[place, 1] = leaf, first + m
+                    out[place, 0], out[place, 1] = begin + k, first + m
                     count += (bits >> m) & 1
-        for leaf in range(begin, end):
-            for n in range(neighbours[leaf], neighbours[leaf + 1]):
-                beside[next_leaves[n]] = 0
     return count
 
 

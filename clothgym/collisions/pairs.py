@@ -41,8 +41,11 @@ class Pairs(NamedTuple):
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
     nodes: of the tree, each before its halves, the first of which follows it: see ``BEGIN``, (nodes, 3).
-    neighbours: where the leaves that share a vertex with each leaf and come after it begin, (leaves + 1,); ``next_leaves``.
-    ends, slack: near pairs of vertices, (near, 2), and the slack of the primitive pairs they are in, at rest [m^2], (near,).
+    beside: where the nodes that hold leaves beside those of each node that is not halved begin, itself and some after it,
+    (nodes + 1,); ``beside_nodes`` says which, and ``beside_leaves`` which pairs of theirs are none to search: a leaf k of the first
+    and m of the second, which share a vertex or come in this order elsewhere, are bit ``LEAVES * k + m``.
+    partners: where near pairs of vertices of each first begin, (particles + 1,); partner: the second, and slack: of the primitive
+    pairs they are in, at rest [m^2], (near,).
     near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
     near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
     edges.
@@ -64,9 +67,11 @@ class Pairs(NamedTuple):
     leaf_triangles: Int
     own_triangles: Int
     nodes: Int
-    neighbours: Int
-    next_leaves: Int
-    ends: Int
+    beside: Int
+    beside_nodes: Int
+    beside_leaves: NDArray[np.int64]
+    partners: Int
+    partner: Int
     slack: Real
     near: Int
     near_list: Int
@@ -99,11 +104,11 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         for vertex in set(own.tolist()):
             around[vertex].append(leaf)
     beside = [sorted({other for vertex in set(own.tolist()) for other in around[vertex]}) for own in corners]
-    after = [[other for other in each if other > leaf] for leaf, each in enumerate(beside)]
     vertex_triangle, edge_edge = _near_pairs(triangles, edges, members, beside, vertex_leaf, edge_leaf)
     ends, slack, near, near_list = _near_vertices(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge)
     counted = [_ranges(np.bincount(of, minlength=len(members))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
+    begins, beside_nodes, beside_leaves = _beside(np.array(nodes), beside)
     return Pairs(
         triangles=_int(triangles),
         edges=_int(edges),
@@ -120,9 +125,11 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         leaf_triangles=counted[2],
         own_triangles=_int(by_leaf[2]),
         nodes=_int(np.array(nodes)),
-        neighbours=_ranges(np.array([len(each) for each in after])),
-        next_leaves=_int(np.concatenate([np.array(each, np.int64) for each in after])),
-        ends=_int(ends),
+        beside=begins,
+        beside_nodes=beside_nodes,
+        beside_leaves=beside_leaves,
+        partners=_ranges(np.bincount(ends[:, 0], minlength=len(x))),
+        partner=_int(ends[:, 1]),
         slack=slack,
         near=near,
         near_list=_int(near_list),
@@ -185,6 +192,24 @@ def _compact(centres: NDArray) -> tuple[list[int], list[list[int]]]:
 
     halve(np.arange(len(centres)))
     return order, nodes
+
+
+def _beside(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
+    """Pairs of leaves that are not searched, by the nodes that hold them: see ``Pairs.beside``."""
+    whole = np.flatnonzero(nodes[:, NEXT] == np.arange(len(nodes)) + 1).tolist()
+    node_of = {leaf: k for k in whole for leaf in range(nodes[k, BEGIN], nodes[k, END])}
+    counts, others, bits = np.zeros(len(nodes), np.int64), [], []
+    for node in whole:
+        begin, end = nodes[node, [BEGIN, END]].tolist()
+        found = {node: 0}
+        for leaf in range(begin, end):
+            for other in {*range(begin, leaf + 1), *(other for other in beside[leaf] if other > leaf)}:
+                bit = LEAVES * (leaf - begin) + other - int(nodes[node_of[other], BEGIN])
+                found[node_of[other]] = found.get(node_of[other], 0) | 1 << bit
+        counts[node] = len(found)
+        others += sorted(found)
+        bits += [found[other] for other in sorted(found)]
+    return _ranges(counts), _int(np.array(others)), np.array(bits, np.uint64).view(np.int64)
 
 
 def _near_pairs(
