@@ -44,9 +44,9 @@ def along(p, v, nx, ny, nz):
 
 @kernel
 def near_rows(p, pairs, extra, rows):
-    """What is asked of each vertex of a near pair, side by side, (particles, 5): its place; the most that its triangles look farther
-    for, since a primitive's extra is the largest of its vertices [m]; and the largest (length over rest length)^2, at least 1, of
-    the edges of its triangles."""
+    """What is asked of each vertex of a near pair, side by side, (particles, 5): its place [m]; the most that its triangles look
+    farther, since a primitive's extra is the largest of its vertices [m]; and the largest (length over rest length)^2, at least 1,
+    of the edges of its triangles."""
     edges, triangles, triangle_edges = pairs.edges, pairs.triangles, pairs.triangle_edges
     ratio = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
