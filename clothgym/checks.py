@@ -17,7 +17,7 @@ def number(name: str, value: Any) -> float:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         array = np.array(np.nan)
-    if array.shape != () or not np.isfinite(array):
+    if array.shape != () or not np.isfinite(array) or isinstance(value, (bool, np.bool_)):
         raise ValueError(f"{name}={value!r}: must be a finite number")
     return float(array)
 
@@ -58,7 +58,10 @@ def one_of(name: str, value: Any, *known: str) -> None:
 def finite(name: str, value: ArrayLike) -> NDArray:
     """An array of finite numbers that float32 can reckon with, as float64."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
+        if array.dtype.kind == "c":
+            raise TypeError
+        array = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name}={value!r}: must be numbers") from None
     if not np.all(np.isfinite(array)):

@@ -397,6 +397,8 @@ def starts(
         ValueError: an unknown kind, or whatever ``Simulation`` does not take.
         RuntimeError: a sheet that is not at rest after ``MOST_SETTLING`` seconds, or that intersects itself.
     """
+    if not isinstance(mesh, ClothMesh):
+        raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, as grid() and disc() make")
     one_of("kind", kind, *STARTS)
     checks.count("count", count)
     checks.count("seed", seed, least=0)

@@ -165,7 +165,7 @@ class Simulation(Observed):
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
         self._planned_substeps = 0
-        self.set_state(
+        self._go_on(
             at_rest(
                 mesh,
                 self.num_envs,
@@ -366,11 +366,14 @@ class Simulation(Observed):
         Raises:
             ValueError: the state does not fit; nothing is changed then.
         """
-        counts = len(self.anchors), len(self.grippers), len(self.colliders)
-        check_fits(state, self.num_envs, self.mesh.num_particles, self._hands.members, *counts, self._sheet)
+        check_fits(state, self.get_state())
         guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
         self._contact.check_memory(state)
-        self._contact.check(state.positions)
+        self._contact.check(state.positions[~state.diverged])
+        self._go_on(state)
+
+    def _go_on(self, state: State) -> None:
+        """Take over what a state holds."""
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = blocks(state.positions, dtype)
         self._v = blocks(state.velocities, dtype)

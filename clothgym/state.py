@@ -21,6 +21,7 @@ from clothgym.mesh import NUM_KINDS, SHEAR, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
+ALIKE = {"f": "fiu", "i": "iu", "u": "iu", "b": "b"}  # kinds of numbers that a state may hold, by the kind that it keeps
 VECTOR = 16  # float32 lanes of the widest vector unit in use; blocks are padded to a multiple of it
 
 
@@ -142,7 +143,10 @@ class Layout(NamedTuple):
             if index.shape != (self.num_envs,):
                 raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
-        return indices("envs", envs, self.num_envs, "this batch's environments")
+        index = indices("envs", envs, self.num_envs, "this batch's environments")
+        if len(np.unique(index)) < len(index):
+            raise ValueError(f"envs={envs!r}: names an environment twice")
+        return index
 
 
 @dataclass
@@ -236,30 +240,36 @@ class State:
             return State(**{field.name: file[field.name] for field in fields(State)})
 
 
-def check_fits(
-    state: State, num_envs: int, particles: int, held: NDArray, anchors: int, grippers: int, colliders: int, sheet: NDArray
-) -> None:
-    """Refuse to go on in another simulation; held: its anchored particles.
+def check_fits(state: State, own: State) -> None:
+    """Refuse to go on in another simulation, which has a state of its ``own``; see ``SelfCollision`` for what is contact's.
 
     Raises:
         ValueError: what differs.
     """
+    advice = "give what get_state() gave, or State.load(path)"
     if not isinstance(state, State):
-        raise ValueError(f"state={state!r}: must be what get_state() gave, or State.load(path)")
-    if state.positions.shape != (num_envs, particles, 3):
-        here = f"this simulation (num_envs, particles, 3) = {(num_envs, particles, 3)}"
+        raise ValueError(f"state={state!r}: {advice}")
+    for field in fields(State):
+        name, given, kept = field.name, getattr(state, field.name), np.asarray(getattr(own, field.name))
+        if not isinstance(given, (np.ndarray, np.generic)) or given.dtype.kind not in ALIKE[kept.dtype.kind]:
+            raise ValueError(f"the state's {name} is no array of {kept.dtype.name}: {advice}")
+    if state.positions.shape != own.positions.shape:
+        here = f"this simulation (num_envs, particles, 3) = {own.positions.shape}"
         raise ValueError(f"the state holds positions of shape {state.positions.shape}, {here}")
-    if not np.array_equal(state.anchors, np.tile(held, (num_envs, 1))):
-        raise ValueError(f"the state has anchors {state.anchors[0].tolist()}, this simulation {held.tolist()}")
-    if state.hand_positions.shape[1] != anchors + grippers:
-        here = f"{anchors} anchors and {grippers} grippers"
-        raise ValueError(f"the state has {state.hand_positions.shape[1]} hands, this simulation {here}")
-    if state.colliders.shape[1] != colliders:
-        raise ValueError(f"the state has {state.colliders.shape[1]} colliders, this simulation {colliders}")
-    if not np.array_equal(state.sheet, sheet):
+    if not np.array_equal(state.anchors, own.anchors):
+        raise ValueError(f"the state has anchors {state.anchors[:1].tolist()}, this simulation {own.anchors[:1].tolist()}")
+    for name, what in (("hand_positions", "hands (anchors, then grippers)"), ("colliders", "colliders")):
+        here, there = getattr(own, name).shape, getattr(state, name).shape
+        if len(there) == 3 and there[1] != here[1]:
+            raise ValueError(f"the state has {there[1]} {what}, this simulation {here[1]}")
+    if not np.array_equal(state.sheet, own.sheet):
         raise ValueError(
             "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's"
         )
+    for field in fields(State):
+        given, kept = getattr(state, field.name), getattr(own, field.name)
+        if not field.name.startswith("contact_") and given.shape != kept.shape:
+            raise ValueError(f"the state's {field.name} has shape {given.shape}, this simulation's {kept.shape}: {advice}")
 
 
 def at_rest(

@@ -116,6 +116,10 @@ def test_what_cannot_be_started():
         MANOEUVRES["fold"](GRID, times=4)
     with pytest.raises(ValueError, match="count=0: must be an integer of at least 1"):
         starts(GRID, count=0)
+    with pytest.raises(ValueError, match="mesh=None: must be a ClothMesh"):
+        starts(None)
+    with pytest.raises(ValueError, match="thickness=True: must be a finite number"):
+        starts(grid(5, 5, 1.0, 1.0), self_collision={"thickness": True})
     with pytest.raises(ValueError, match="seed=-1"):
         starts(GRID, seed=-1)
     with pytest.raises(ValueError, match="a manoeuvre has its own"):

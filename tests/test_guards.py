@@ -192,7 +192,7 @@ def test_divergence_is_part_of_the_state():
     [
         (lambda: Simulation(grid(5, 5, 2.0, 2.0), anchors=[0]).get_state(), "another shape or size"),
         (lambda: Simulation(MESH, anchors=[0], bending="hinge").get_state(), "another bending model"),
-        (lambda: None, "must be what get_state"),
+        (lambda: None, "state=None: give what get_state"),
     ],
 )
 def test_a_state_of_another_sheet_is_refused(state, told):

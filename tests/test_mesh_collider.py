@@ -103,6 +103,9 @@ def test_meshes_that_are_no_solids_are_refused(make, message):
         ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "rotation": (0, 0, 0, 0)}, "rotation"),
         ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "scale": 0}, "scale"),
         ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "resolution": 0}, "resolution"),
+        ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "resolution": 10**5}, "resolution=100000: a grid of .*e.1. nodes"),
+        ({"vertices": box_mesh()[0] + 1j, "triangles": box_mesh()[1]}, "must be numbers"),
+        ({"path": box_mesh()[0], "vertices": box_mesh()[1]}, "path is of type ndarray.*give arrays as vertices="),
         ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "friction": -1}, "friction"),
     ],
 )

@@ -35,6 +35,12 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
         ("contact_figures", lambda a: a[:, :1], r"contact_figures has shape \(1, 1, 8\)"),
         ("contact_impulses", lambda a: np.tile(a, (1, 999, 1)), "contact_impulses has shape"),
         ("contact_count", lambda a: a + 1000, "contact_particles has shape"),
+        ("contact_count", lambda a: a + 0.5, "contact_count is no array of int32"),
+        ("contact_bounds", lambda a: a + np.inf, "contact_bounds holds a value that is not finite"),
+        ("contact_planes", lambda a: a * np.nan, "contact_planes holds a value that is not finite"),
+        ("contact_span", lambda a: a - 100, "contact_span holds -"),
+        ("contact_lag", lambda a: None, "contact_lag is no array"),
+        ("free_inverse_mass", lambda a: a[:, 1:], r"free_inverse_mass has shape \(1, 168\), this simulation's \(1, 169\)"),
     ],
 )
 def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(name, spoil, message):
@@ -43,10 +49,24 @@ def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(n
         made.step()
     state, before = made.simulation.get_state(), made.simulation.positions
     setattr(state, name, spoil(getattr(state, name)))
-    state.positions += 1
+    state.positions = state.positions + 1
     with pytest.raises(ValueError, match=message):
         made.simulation.set_state(state)
     np.testing.assert_array_equal(made.simulation.positions, before)
+
+
+def test_a_state_in_which_one_environment_has_diverged_is_taken():
+    simulation = clothgym.Simulation(sheet(7), num_envs=2, self_collision="strict")
+    state = simulation.get_state()
+    state.velocities[0, 3] = np.nan
+    simulation.set_state(state)
+    with pytest.warns(RuntimeWarning, match="environment 0"):
+        simulation.step()
+    assert simulation.diverged.tolist() == [True, False]
+    state, before = simulation.get_state(), simulation.positions
+    simulation.reset()
+    simulation.set_state(state)
+    np.testing.assert_array_equal(simulation.positions, before)
 
 
 def test_an_environment_does_not_feel_its_batch():

@@ -85,6 +85,8 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=name):
             s.set_state(other.get_state())
+    with pytest.raises(ValueError, match="envs=.0, 0.: names an environment twice"):
+        s.reset(envs=[0, 0])
     np.savez(tmp_path / "old.npz", positions=np.zeros(3))
     with pytest.raises(ValueError, match="lacks velocities"):
         State.load(tmp_path / "old.npz")

@@ -19,6 +19,7 @@ from clothgym.collisions.closest import closest_on_triangle
 BAND = 2  # cells around a triangle's bounds in which distances to it are exact
 MARGIN = 3  # cells around the mesh's bounds
 SWEEPS = 2  # of all eight directions
+MOST_NODES = 2e7  # making them takes some 70 bytes each
 
 
 class DistanceGrid(NamedTuple):
@@ -33,12 +34,17 @@ def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> Dis
     """Of a closed surface, with ``resolution`` cells along its longest side.
 
     Raises:
-        ValueError: a part of the surface is inside out.
+        ValueError: a grid that is too large, or a part of the surface that is inside out.
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell = float((high - low).max()) / resolution
     corner = low - MARGIN * cell
-    sizes = np.ceil((high - low) / cell).astype(np.int64) + 1 + 2 * MARGIN
+    nodes = np.ceil((high - low) / cell) + 1 + 2 * MARGIN
+    if nodes.prod() > MOST_NODES:
+        raise ValueError(
+            f"resolution={resolution}: a grid of {nodes.prod():.2g} nodes: at most {MOST_NODES:.0g} are kept; take fewer cells"
+        )
+    sizes = nodes.astype(np.int64)
     distance = np.full(sizes, 1e30)
     nearest = np.full(sizes, -1, np.int32)
     winding = np.zeros(sizes, np.int32)

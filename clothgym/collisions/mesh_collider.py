@@ -56,6 +56,9 @@ class MeshCollider(Collider):
         turned("MeshCollider rotation", self.rotation)
         positive("MeshCollider scale", self.scale)
         count("MeshCollider resolution", self.resolution)
+        if not isinstance(self.path, (str, Path, type(None))):
+            kind = type(self.path).__name__
+            raise ValueError(f"MeshCollider path is of type {kind}: must be a file's; give arrays as vertices=..., triangles=...")
         if (self.path is None) == (self.vertices is None or self.triangles is None) or (
             self.path is not None and (self.vertices is not None or self.triangles is not None)
         ):

@@ -147,7 +147,7 @@ class SelfCollision:
         Raises:
             ValueError: a sheet that intersects itself, or that is too far from the origin to be certified.
         """
-        if not self.strict:
+        if not self.strict or len(positions) == 0:
             return
         x = np.asarray(positions, self.dtype)
         farthest = float(np.abs(x).max())
@@ -248,6 +248,13 @@ class SelfCollision:
                 fits = given.shape == blank.shape
             if not fits:
                 raise ValueError(f"the state's {name} has shape {given.shape}, which is none of this simulation's: {advice}")
+            # what a pair may come no closer than is infinite where it may not move
+            wrong = np.isnan(given) if array == "planes" else ~np.isfinite(given)
+            if wrong[~state.diverged].any():
+                raise ValueError(f"the state's {name} holds a value that is not finite: {advice}")
+        for name in ("contact_looks", "contact_waited", "contact_span"):
+            if getattr(state, name).min() < 0:
+                raise ValueError(f"the state's {name} holds {getattr(state, name).min()}, and counts: {advice}")
         for name, vertices in (("particles", state.contact_particles), ("ties", state.contact_ties[:, :, VERTICES:])):
             if np.any((vertices < 0) | (vertices >= particles)):
                 raise ValueError(f"the state's contact_{name} name particles beyond the {particles} of the sheet: {advice}")
