@@ -81,8 +81,8 @@ class _CacheFolder:
         if self.writable:
             self.writable = False
             warnings.warn(
-                f"clothgym cannot write its kernel cache {str(self.path.parent)!r} ({error}): kernels will be compiled anew in "
-                "this process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder that can be written.",
+                f"clothgym cannot write its kernel cache {str(self.path.parent)!r} ({error}): kernels that it lacks are compiled "
+                "anew in each process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder that can be written.",
                 stacklevel=2,
             )
 
