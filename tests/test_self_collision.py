@@ -7,9 +7,10 @@ from folded import SIDE, sheet, three_layers
 
 import clothgym
 from clothgym.collisions import self_contact
-from clothgym.collisions.candidates import Reach
+from clothgym.collisions.candidates import Reach, enclose, far_leaves
 from clothgym.collisions.pairs import pairs_of
 from clothgym.collisions.proximity import FIGURES, REPORT, TIE, query
+from clothgym.collisions.repulsion import MOST, _correct
 from clothgym.crumpling import MANOEUVRES
 
 
@@ -18,6 +19,34 @@ def count_intersections(triangles, x):
 
 
 # --- the query, against brute force -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mesh", [sheet(13), clothgym.disc(0.5, 5), clothgym.grid(2, 2, 1.0, 1.0), clothgym.grid(3, 6, 1.0, 1.0)])
+@pytest.mark.parametrize("far", [0.0, 0.03, 2.0])
+def test_the_tree_finds_all_pairs_of_leaves_once(mesh, far):
+    """Of all that share no vertex, those whose boxes and balls are within reach; worked out here one by one."""
+    random, pairs = np.random.default_rng(0), pairs_of(mesh)
+    x = mesh.rest_positions @ random.normal(size=(3, 3)) * 0.3 + 0.02 * random.normal(size=(mesh.num_particles, 3))
+    extra = 0.01 * random.random(mesh.num_particles)
+    leaves = len(pairs.corners)
+    boxes, balls, hulls = np.empty((6, leaves)), np.empty((4, leaves)), np.empty((6, len(pairs.nodes)))
+    enclose(x, pairs.corners, pairs.nodes, extra, np.empty(leaves), boxes, balls, hulls)
+    found = np.full((leaves * leaves + 1, 2), -1, np.int32)
+    number = far_leaves(pairs, far, balls, boxes, hulls, found)
+    wide = extra[pairs.corners].max(axis=1)
+    low, high = x[pairs.corners].min(axis=1) - wide[:, None], x[pairs.corners].max(axis=1) + wide[:, None]
+    centre = x[pairs.corners].mean(axis=1)
+    radius = np.linalg.norm(x[pairs.corners] - centre[:, None], axis=2).max(axis=1) + wide
+    expected = {
+        (a, b) for a in range(leaves) for b in range(a + 1, leaves)
+        if not set(pairs.corners[a]) & set(pairs.corners[b])
+        and np.all(low[a] <= high[b] + far) and np.all(low[b] <= high[a] + far)
+        and np.linalg.norm(centre[a] - centre[b]) <= radius[a] + radius[b] + far
+    }  # fmt: skip
+    assert number == len(expected)
+    assert {tuple(pair) for pair in found[:number].tolist()} == expected
+    if far == 2.0:
+        assert number == sum(not set(a) & set(b) for k, a in enumerate(pairs.corners) for b in pairs.corners[:k])
 
 
 def pairs_by_sampling(mesh, x, points=25):
@@ -309,3 +338,16 @@ def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
         simulation.move_anchors(targets)
         simulation.step()
     np.testing.assert_allclose(simulation.positions[0, 0], targets[0, 0], atol=1e-3)
+
+
+def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
+    """What a jam keeps from substep to substep would grow for ever: a vertex hits a triangle at 1000 m/s."""
+    real = np.float32
+    x, v = np.zeros((4, 3), real), np.zeros((4, 3), real)
+    x[1:, :2], x[0, 2], v[0, 2] = [[1, 0], [-1, 1], [-1, -1]], 0.001, -1000.0
+    figures, impulses = np.array([[1, -1 / 3, -1 / 3, -1 / 3, 0, 0, 1, 0.008]], real), np.zeros((1, 3), real)
+    mobility, chosen = np.full(4, 2.0, real), np.zeros(1, np.int32)
+    h = real(1e-3)
+    _correct(x, v, mobility, np.arange(4, dtype=np.int32)[None], figures, impulses, chosen, 1, h, real(0), real(0), h, 1)
+    np.testing.assert_allclose(impulses[0], [0, 0, MOST / (2 * (1 + 3 / 9))], rtol=1e-6)
+    np.testing.assert_allclose(2 * (v[0] / 2 + v[1:].sum(axis=0) / 2), [0, 0, -1000], rtol=1e-6)
