@@ -62,10 +62,12 @@ class Manoeuvre:
         thickness: float = 0.008,
         **options: Any,
     ) -> None:
+        if not isinstance(mesh, ClothMesh):
+            raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, as grid() and disc() make")
         if own := {"num_envs", "colliders", "anchors", "grippers"} & set(options):
             raise ValueError(f"{', '.join(sorted(own))}: a manoeuvre has its own")
         self.mesh = mesh
-        self.random = [np.random.default_rng(seed) for seed in seeds]
+        self.random = [np.random.default_rng(seed) for seed in checks.indices("seeds", seeds, 2**63 - 1, "seeds")]
         self.thickness = positive("thickness", thickness)
         self.rest = mesh.rest_positions - (mesh.rest_positions.max(axis=0) + mesh.rest_positions.min(axis=0)) / 2
         self.side = float(np.ptp(self.rest, axis=0).max())
@@ -397,8 +399,6 @@ def starts(
         ValueError: an unknown kind, or whatever ``Simulation`` does not take.
         RuntimeError: a sheet that is not at rest after ``MOST_SETTLING`` seconds, or that intersects itself.
     """
-    if not isinstance(mesh, ClothMesh):
-        raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, as grid() and disc() make")
     one_of("kind", kind, *STARTS)
     checks.count("count", count)
     checks.count("seed", seed, least=0)
@@ -408,28 +408,28 @@ def starts(
         manoeuvre.step()
     simulation = manoeuvre.simulation
     simulation.set_parameters(air_drag=CALM * simulation.material.density)
-    while (speed := _rms_speed(simulation)).max() > REST_SPEED:
-        if manoeuvre.time > manoeuvre.seconds + MOST_SETTLING:
-            if speed.max() <= TREMBLING:
-                break
+    # each sheet as it is when it comes to rest, which does not depend on the others
+    x, moving = simulation.positions, np.ones(count, bool)
+    while moving.any():
+        late = manoeuvre.time > manoeuvre.seconds + MOST_SETTLING
+        speed = np.where(moving, np.sqrt((simulation.velocities.astype(np.float64) ** 2).sum(axis=2).mean(axis=1)), 0)
+        if late and speed.max() > TREMBLING:
             raise RuntimeError(
                 f"{kind} sheet of seed {seed + int(speed.argmax())} moves at {speed.max():.2g} m/s: take another seed or fabric"
             )
+        calm = moving & (speed <= (TREMBLING if late else REST_SPEED))
+        x[calm] = simulation.positions[calm]
+        moving &= ~calm
         simulation.step(6)
         manoeuvre.frames += 6
-    found = find_intersections(mesh.triangles, simulation.positions)
+    found = find_intersections(mesh.triangles, x)
     if len(found):
         env, first, second = found[0].tolist()
         raise RuntimeError(
             f"{kind} sheet of seed {seed + env} intersects itself {np.sum(found[:, 0] == env)} times, at triangles {first} and "
             f"{second} for instance: take self_collision='strict', and a thickness that fits the mesh"
         )
-    return simulation.positions
-
-
-def _rms_speed(simulation: Simulation) -> NDArray[np.float64]:
-    """Root of the mean squared speed of each sheet [m/s], (num_envs,)."""
-    return np.sqrt((simulation.velocities.astype(np.float64) ** 2).sum(axis=2).mean(axis=1))
+    return x
 
 
 def _eased(share: float) -> float:

@@ -438,5 +438,6 @@ def settle_lag(first, last, lag, behind, holder, anchors, reach2, w, free_w):
                     for c in range(3):
                         lag[b, p, c, l] -= own[k, c]
                 elif lag[b, p, 0, l] ** 2 + lag[b, p, 1, l] ** 2 + lag[b, p, 2, l] ** 2 > reach2[k]:
-                    holder[b, p, l] = -1
+                    holder[b, p, l] = FREE
                     w[b, p, l] = free_w[b, p, l]
+                    lag[b, p, 0, l] = lag[b, p, 1, l] = lag[b, p, 2, l] = 0

@@ -22,7 +22,7 @@ from clothgym.collisions.response import needed
 from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
 from clothgym.forces import Oscillators, add_air_forces
 from clothgym.guards import mark_diverged
-from clothgym.hands import Gripper, Grippers, Hands
+from clothgym.hands import FREE, Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
 from clothgym.limiting import checked_limit
@@ -201,10 +201,14 @@ class Simulation(Observed):
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
 
         def work(first: int, last: int) -> None:
+            held, blocks = None, slice(first, last)
             if self._contact.strict:
                 memory = self._contact.sheet.memory
                 self._hands.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
+                held = self._hands.holder[blocks].copy() if len(self.grippers) and memory.behind[blocks].any() else None
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
+            if held is not None:
+                self._contact.forgive(self._hands.holder[blocks] != held, blocks)
             self._advance(
                 first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
                 self._solids.shapes, self._solids.rows, self._contact.sheet, h, carried, self.substeps, air_every, look_every,
@@ -216,6 +220,7 @@ class Simulation(Observed):
             self._solids.end_step()
             if self._hands.can_slip:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
+                self._forgive_lag()
             self._steps += 1
             self._contact.warn(self._steps)
             if self._diverged.any() and self.on_divergence != "ignore":
@@ -254,6 +259,7 @@ class Simulation(Observed):
         """Let go: pairs of environment and anchor (its place in ``anchors``), or all anchors, or all environments."""
         block, lane, which = self._pairs(envs, anchors)
         self._hands.let_go(block, which, lane)
+        self._forgive_lag()
         self._apply_masses(block, lane)
 
     def attach(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
@@ -262,9 +268,14 @@ class Simulation(Observed):
         self._hands.hold(block, which, lane, self._x)
         self._apply_masses(block, lane)
 
+    def _forgive_lag(self) -> None:
+        """What has been let go no longer lags behind a hand."""
+        if self._contact.strict and self._contact.sheet.memory.behind.any():
+            self._contact.forgive(self._hands.holder == FREE)
+
     def _pairs(self, envs: ArrayLike | None, anchors: ArrayLike | None) -> tuple[NDArray, NDArray, NDArray]:
         """Block, lane and anchor of each pair."""
-        env, count = self.layout.chosen(envs), self.anchors.size
+        env, count = self.layout.chosen(envs, once=anchors is None), self.anchors.size
         if anchors is None:
             return (*self.layout.place(np.repeat(env, count)), np.tile(np.arange(count), len(env)))
         which = spread("anchors", indices("anchors", anchors, count, "this simulation's anchors"), env.shape)
@@ -287,7 +298,7 @@ class Simulation(Observed):
         x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
         if positions is not None:
-            self._contact.check(x)
+            self._contact.check(x, env)
         block, lane = self.layout.place(env)
         self._x[block, :, :, lane] = np.broadcast_to(x, shape)
         self._v[block, :, :, lane] = np.broadcast_to(v, shape)
@@ -369,7 +380,8 @@ class Simulation(Observed):
         check_fits(state, self.get_state())
         guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
         self._contact.check_memory(state)
-        self._contact.check(state.positions[~state.diverged])
+        sound = np.flatnonzero(~state.diverged)
+        self._contact.check_apart(state.positions[sound], sound)
         self._go_on(state)
 
     def _go_on(self, state: State) -> None:

@@ -130,11 +130,11 @@ class Layout(NamedTuple):
         """Block and lane of each environment."""
         return np.divmod(envs, self.lanes)
 
-    def chosen(self, envs: ArrayLike | None) -> NDArray:
-        """The environments that someone names: all of them, those of a mask, or by index.
+    def chosen(self, envs: ArrayLike | None, once: bool = True) -> NDArray:
+        """The environments that someone names: all of them, those of a mask, or by index; each but ``once``, or as often as wanted.
 
         Raises:
-            ValueError: there is no such environment, or the mask is not one of this batch.
+            ValueError: there is no such environment, one is named twice, or the mask is not one of this batch.
         """
         if envs is None:
             return np.arange(self.num_envs)
@@ -144,7 +144,7 @@ class Layout(NamedTuple):
                 raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
         index = indices("envs", envs, self.num_envs, "this batch's environments")
-        if len(np.unique(index)) < len(index):
+        if once and len(np.unique(index)) < len(index):
             raise ValueError(f"envs={envs!r}: names an environment twice")
         return index
 
@@ -268,8 +268,19 @@ def check_fits(state: State, own: State) -> None:
         )
     for field in fields(State):
         given, kept = getattr(state, field.name), getattr(own, field.name)
-        if not field.name.startswith("contact_") and given.shape != kept.shape:
+        if field.name.startswith("contact_") or given.shape == ():
+            continue
+        if given.shape != kept.shape:
             raise ValueError(f"the state's {field.name} has shape {given.shape}, this simulation's {kept.shape}: {advice}")
+        if given.dtype.kind == "f" and not np.isfinite(given[~state.diverged]).all():
+            raise ValueError(f"the state's {field.name} holds a value that is not finite: {advice}")
+    if state.free_inverse_mass.min() < 0:
+        raise ValueError(f"the state's free_inverse_mass holds {state.free_inverse_mass.min():g}: {advice}")
+    hands = own.hand_positions.shape[1]
+    if state.holder.min() < -1 or state.holder.max() >= hands:
+        raise ValueError(
+            f"the state's holder names hands from {state.holder.min()} to {state.holder.max()}, there are {hands}: {advice}"
+        )
 
 
 def at_rest(

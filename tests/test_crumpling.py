@@ -104,6 +104,11 @@ def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
     assert x[:, :, 2].max() > 0.008  # not flat
 
 
+def test_a_start_does_not_depend_on_the_others():
+    mesh = grid(9, 9, 0.8, 0.8)
+    np.testing.assert_array_equal(starts(mesh, kind="folded", count=3, seed=1)[1:2], starts(mesh, kind="folded", seed=2))
+
+
 def test_starts_that_intersect_are_refused():
     with pytest.raises(RuntimeError, match="folded sheet of seed 3 intersects itself .* times, at triangles"):
         starts(GRID, kind="folded", seed=3, self_collision=False)
@@ -122,5 +127,7 @@ def test_what_cannot_be_started():
         starts(grid(5, 5, 1.0, 1.0), self_collision={"thickness": True})
     with pytest.raises(ValueError, match="seed=-1"):
         starts(GRID, seed=-1)
+    with pytest.raises(ValueError, match="seeds=.-1.: must be integers"):
+        MANOEUVRES["heap"](GRID, seeds=[-1])
     with pytest.raises(ValueError, match="a manoeuvre has its own"):
         starts(GRID, colliders=[])

@@ -356,7 +356,7 @@ def test_a_saved_state_with_grippers_goes_on_bit_for_bit(tmp_path):
     assert np.array_equal(s.pulls(), other.pulls())
     # the orders to the hands are part of it: the fingers went on closing, the tips on their way
     assert np.all(other.grippers.openings == 0) and other.grippers.positions[0, 0, 2] > 0.15
-    with pytest.raises(ValueError, match="4 hands, this simulation 2 anchors and 1 grippers"):
+    with pytest.raises(ValueError, match="4 hands .anchors, then grippers., this simulation 3"):
         simulation(num_envs=3, anchors=[[20, 21], 24], grippers=[gripper(6)]).set_state(s.get_state())
 
 

@@ -174,6 +174,7 @@ def test_a_jam_without_room_for_ties_does_not_creep(monkeypatch):
         wring.step()
         gap = min(gap, wring.simulation.self_contacts.gap.min())
     assert wring.simulation.self_contacts.clamped.min() > 100
+    assert wring.simulation.self_contacts.dropped.min() > 100  # told
     # pairs move while their distance is above 1e-5 m, and what rounding takes from that is less than a hundredth
     assert 0.99e-5 < gap < 1.01e-5
     assert not wring.simulation.intersections().any()

@@ -40,6 +40,9 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
         ("contact_planes", lambda a: a * np.nan, "contact_planes holds a value that is not finite"),
         ("contact_span", lambda a: a - 100, "contact_span holds -"),
         ("contact_lag", lambda a: None, "contact_lag is no array"),
+        ("holder", lambda a: a + 32000, "names hands from 31999 to 31999, there are 0"),
+        ("free_inverse_mass", lambda a: -a, "free_inverse_mass holds -"),
+        ("gravity", lambda a: a * np.nan, "gravity holds a value that is not finite"),
         ("free_inverse_mass", lambda a: a[:, 1:], r"free_inverse_mass has shape \(1, 168\), this simulation's \(1, 169\)"),
     ],
 )
@@ -57,9 +60,9 @@ def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(n
 
 def test_a_state_in_which_one_environment_has_diverged_is_taken():
     simulation = clothgym.Simulation(sheet(7), num_envs=2, self_collision="strict")
-    state = simulation.get_state()
-    state.velocities[0, 3] = np.nan
-    simulation.set_state(state)
+    velocities = np.zeros((2, 49, 3))
+    velocities[0, 3] = 1e20
+    simulation.reset(velocities=velocities)
     with pytest.warns(RuntimeWarning, match="environment 0"):
         simulation.step()
     assert simulation.diverged.tolist() == [True, False]
@@ -67,6 +70,63 @@ def test_a_state_in_which_one_environment_has_diverged_is_taken():
     simulation.reset()
     simulation.set_state(state)
     np.testing.assert_array_equal(simulation.positions, before)
+
+
+def test_a_state_of_a_sheet_beyond_what_can_be_certified_is_taken_too():
+    simulation = clothgym.Simulation(sheet(5), num_envs=2, self_collision="strict")
+    velocities = np.zeros((2, 25, 3))
+    velocities[1, :, 0] = 60.0
+    simulation.reset(positions=simulation.mesh.rest_positions + (15.5, 0, 0), velocities=velocities)
+    with pytest.warns(RuntimeWarning, match="environment 1: .* more than 16 m"):
+        simulation.step(4)
+    state = simulation.get_state()
+    simulation.set_state(state)
+    np.testing.assert_array_equal(simulation.get_state().contact_start, state.contact_start)
+    # the one that intersects is named by its own number
+    state.diverged[0], state.positions[1] = True, state.positions[1] * (1, 0, 0)
+    with pytest.raises(ValueError, match="in environment 1 triangles"):
+        simulation.set_state(state)
+
+
+def test_what_changes_hands_owes_the_new_one_nothing():
+    """A corner lags behind the gripper that pulls it at the sheet; another takes it there, and carries it as far as it goes."""
+    mesh = sheet(13)
+    away = np.abs(mesh.rest_positions[:, :2] - mesh.rest_positions[0, :2]).max(axis=1)
+    grippers = [clothgym.Gripper(position=(0, 0, z), reach=0.05, speed=2, closing_time=1e-3) for z in (0.5, 0.6)]
+    simulation = clothgym.Simulation(
+        mesh, anchors=np.flatnonzero(away > 0.3).tolist(), self_collision="strict", gravity=(0, 0, 0), grippers=grippers
+    )
+
+    def go(first, second, openings, frames):
+        for _ in range(frames):
+            simulation.grippers.move([[first, second]], [openings])
+            simulation.step()
+
+    corner, far = simulation.positions[0, 0], np.array([0, 0, 0.6])
+    simulation.grippers.place([[corner, far]])
+    go(corner, far, (0, 1), 2)
+    for place, frames in (((0, 0, 0.15), 30), ((0.12, 0.12, 0.1), 30), ((0.12, 0.12, -0.02), 14)):
+        go(place, far, (0, 1), frames)
+    assert simulation.self_contacts.lag[0] > 0.01
+    place, first = simulation.positions[0, 0], simulation.grippers.positions[0, 0]
+    simulation.grippers.place([[first, place]])
+    go(first, place, (1, 0), 1)
+    assert simulation.grippers.holder[0, 0] == 1
+    assert simulation.self_contacts.lag[0] == 0
+    before = simulation.positions[0, 0]
+    go(first, place + (0, 0, 0.15), (1, 0), 40)
+    np.testing.assert_allclose(simulation.positions[0, 0] - before, (0, 0, 0.15), atol=1e-4)
+
+
+def test_what_collides_with_itself_does_not_sink_into_the_floor():
+    """Self-collision has the last word in a substep, and pushes what lies below down."""
+    drop, deepest = MANOEUVRES["edge drop"](clothgym.grid(13, 13, 1.0, 1.0), self_collision="strict", time_step=1 / 60), 0.0
+    thickness = drop.simulation._contact.thickness
+    while drop.time < 3:
+        drop.step()
+        deepest = max(deepest, drop.simulation.penetration()[0])
+    assert drop.simulation.self_contacts.rows[0] > 10
+    assert 0 < deepest < 0.2 * thickness
 
 
 def test_an_environment_does_not_feel_its_batch():
@@ -167,3 +227,19 @@ def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbours():
         runs.append(simulation)
     np.testing.assert_array_equal(runs[1].diverged, [False, True, False])
     np.testing.assert_array_equal(runs[0].positions[[0, 2]], runs[1].positions[[0, 2]])
+
+
+def test_sheets_that_strict_mode_cannot_keep_apart_are_named():
+    with pytest.raises(ValueError, match="for this sheet a thickness of 9.9e-05 m is usual: strict mode takes 0.0002 m and more"):
+        clothgym.Simulation(clothgym.grid(9, 9, 0.004, 0.004), self_collision="strict")
+    crossing = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.3, 0.3, -0.5], [0.3, 0.3, 0.5], [0.6, 0.6, 0.5]], float)
+    with pytest.raises(ValueError, match="at rest this sheet intersects itself, for instance triangles 0 and 1"):
+        clothgym.Simulation(clothgym.triangle_mesh(crossing, [[0, 1, 2], [3, 4, 5]]), self_collision="strict")
+    apart = clothgym.triangle_mesh(crossing + np.outer([0, 0, 0, 1, 1, 1], [0, 0, 0.7]), [[0, 1, 2], [3, 4, 5]])
+    simulation = clothgym.Simulation(apart, self_collision="strict")
+    # 0.2 m from the first triangle to the lowest corner of the second
+    assert simulation.get_state().contact_bounds.shape == (1, 6)
+    assert simulation._contact.thickness == pytest.approx(0.28 * 0.2)
+    assert np.isfinite(
+        clothgym.Simulation(clothgym.triangle_mesh(crossing[:3], [[0, 1, 2]]), self_collision="strict")._contact.thickness
+    )

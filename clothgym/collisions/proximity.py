@@ -30,7 +30,7 @@ LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between 
 LOOSE = 0.8  # of the reach below which pairs are tied
 SHARE = 0.45  # of a pair's distance that each side may use; below a half
 SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
-# what is told of each environment, see ``self_collision.SelfContact``
+# what is told of each environment, see ``self_contact.SelfContacts``
 ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 5, 6, 7
 REPORT = 8
 # what is kept of a contact beside its four particles, (room, 4): the gap is n.(sum of weights times positions), with n a unit
@@ -144,6 +144,7 @@ def vertex_contacts(
             tight += 1
         else:
             set_free(v, i, j, k, certified, left, loose, extra, free)
+            report[DROPPED] += left < loose
         if certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
         if certified <= 0.0 or certified > thickness + margin:
@@ -208,6 +209,7 @@ def edge_contacts(
             tight += 1
         else:
             set_free(i, j, k, l, certified, left, loose, extra, free)
+            report[DROPPED] += left < loose
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
             if count < particles.shape[0]:
@@ -220,7 +222,9 @@ def edge_contacts(
 
 
 @apart
-def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, tight, ties, planes):
+def tie_layers(
+    p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, tight, ties, planes, report
+):
     """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
     triangles.  Returns the number of tied pairs.
 
@@ -259,6 +263,7 @@ def tie_layers(p, corners, leaves, gaps, closest, extra, loose, stop, standoff, 
             own, others = max(own, extra[corners[leaf, m]]), max(others, extra[corners[other, m]])
         left = gap - own - others
         tied = left < loose and kept < ties.shape[0]
+        report[DROPPED] += left < loose and not tied
         some = False
         for m in range(4):
             for v in (corners[leaf, m], corners[other, m]):
@@ -323,8 +328,9 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
     tight = tie_layers(
-        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes
-    )
+        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes,
+        report,
+    )  # fmt: skip
     sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
     count, tight = edge_contacts(
         p, sides, edges, ridges, far, extra, thick, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,

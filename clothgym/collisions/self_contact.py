@@ -63,9 +63,11 @@ class SelfContacts(NamedTuple):
     """Self-collision of each environment in the last control step, (num_envs,) each.
 
     rows: contacts within reach; touching: those at which something acted in the last substep.
-    clamped: moves of a vertex in a substep that were cut short.  queries: made.  dropped: contacts for which there was no room
-    (they still bound their vertices).  gap: smallest certified distance at a query [m], 0 where the directions that were tried
-    certify none, inf if nothing was within reach or no query made.
+    clamped: moves of a vertex in a substep that were cut short.  queries: made.
+    dropped: contacts for which there was no room (they still bound their vertices), and pairs that found none to be tied (what they
+    have left is shared out with each query, and less of it each time).
+    gap: smallest certified distance at a query [m], 0 where the directions that were tried certify none, inf if nothing was within
+    reach or no query made.
     lag: how far the slowest held particle is behind its hand [m].  uncertified: whether the sheet went farther from the origin than
     rounding allows.
     """
@@ -127,38 +129,54 @@ class SelfCollision:
         self._reported = np.zeros(layout.blocks * layout.lanes, bool)
         if self.options is None:
             return
+        if (found := first_intersection(mesh.triangles, mesh.rest_positions)) is not None:
+            raise ValueError(
+                f"self_collision: at rest this sheet intersects itself, for instance triangles {found[1]} and {found[2]}: give a "
+                "mesh whose rest shape does not"
+            )
         pairs = pairs_of(mesh)
         reach = reach_of(mesh, pairs, self.options.thickness, dtype)
+        if self.options.mode == "strict" and reach.far_thickness < THINNEST:
+            raise ValueError(
+                f"self_collision: for this sheet a thickness of {reach.far_thickness:.2g} m is usual: strict mode takes "
+                f"{THINNEST:g} m and more; give a larger sheet, or take 'fast'"
+            )
         self.thickness = reach.far_thickness
         real = dtype.type
         friction, push, calm = real(self.options.friction), real(PUSH), real(CALM * self.thickness)
         setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, calm)
         self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
-        self.check(mesh.rest_positions)
+        self.check(mesh.rest_positions[None], np.zeros(1, np.int64))
 
     @property
     def strict(self) -> bool:
         """Whether sheets are kept from passing through themselves."""
         return self.options is not None and self.options.mode == "strict"
 
-    def check(self, positions: NDArray) -> None:
-        """Refuse starts that strict mode cannot keep apart; positions: (sheets, particles, 3) or of one sheet [m].
+    def check(self, positions: NDArray, envs: NDArray) -> None:
+        """Refuse starts that strict mode cannot keep apart; positions: of ``envs``, (envs, particles, 3), or one sheet for all [m].
 
         Raises:
             ValueError: a sheet that intersects itself, or that is too far from the origin to be certified.
         """
+        if self.strict and self.dtype == np.float32 and (farthest := np.abs(positions).max(initial=0)) > FARTHEST:
+            raise ValueError(f"positions: {farthest:.4g} m from the origin: {BEYOND}")
+        self.check_apart(positions, envs)
+
+    def check_apart(self, positions: NDArray, envs: NDArray) -> None:
+        """The same, wherever they are: of a sheet that has gone too far, ``warn`` tells.
+
+        Raises:
+            ValueError: a sheet that intersects itself.
+        """
         if not self.strict or len(positions) == 0:
             return
-        x = np.asarray(positions, self.dtype)
-        farthest = float(np.abs(x).max())
-        if self.dtype == np.float32 and farthest > FARTHEST:
-            raise ValueError(f"positions: {farthest:.4g} m from the origin: {BEYOND}")
-        found = first_intersection(self.sheet.pairs.triangles, x)
+        found = first_intersection(self.sheet.pairs.triangles, np.asarray(positions, self.dtype))
         if found is not None:
-            env, one, two = found
+            which, one, two = found
             raise ValueError(
-                f"positions: in sheet {env} triangles {one} and {two} intersect: self_collision='strict' keeps apart what is "
-                "apart, and does not untangle; start from another sheet (clothgym.crumpling.starts makes some), or take "
+                f"positions: in environment {envs[which]} triangles {one} and {two} intersect: self_collision='strict' keeps apart "
+                "what is apart, and does not untangle; start from another sheet (clothgym.crumpling.starts makes some), or take "
                 "self_collision='fast'"
             )
 
@@ -286,6 +304,12 @@ class SelfCollision:
             array = getattr(state, f"contact_{name}")
             getattr(memory, name)[block, lane, : array.shape[1]] = array
 
+    def forgive(self, who: NDArray, blocks: slice = slice(None)) -> None:
+        """Take from particles, (blocks, particles, lanes), what they lag: one that has left a hand owes the next one nothing."""
+        memory = self.sheet.memory
+        np.moveaxis(memory.lag[blocks], 2, 3)[who] = 0
+        memory.behind[blocks] = np.sqrt((memory.lag[blocks] ** 2).sum(axis=2)).max(axis=1)
+
     def warn(self, steps: NDArray) -> None:
         """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""
         if not self.strict or not self.sheet.memory.report[:, :, UNCERTAIN].any():
@@ -378,7 +402,9 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
     edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *figures, 0, *none)
     apart = float(room.min())
-    usual = USUAL * near
+    # of single triangles nothing is near, and of one alone nothing else
+    shortest = np.sqrt(1 / pairs.rest_edges.max())
+    usual = USUAL * min(near, apart, shortest) if near == np.inf else USUAL * near
     own = usual if thickness is None else thickness
     if own > FAR_MOST * apart:
         raise ValueError(
