@@ -43,6 +43,8 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
         ("holder", lambda a: a + 32000, "names hands from 31999 to 31999, there are 0"),
         ("free_inverse_mass", lambda a: -a, "free_inverse_mass holds -"),
         ("gravity", lambda a: a * np.nan, "gravity holds a value that is not finite"),
+        ("gravity", lambda a: a[0, 0], r"gravity has shape \(\), this simulation's \(1, 3\)"),
+        ("diverged", lambda a: a[:0], r"diverged has shape \(0,\), this simulation's \(1,\)"),
         ("free_inverse_mass", lambda a: a[:, 1:], r"free_inverse_mass has shape \(1, 168\), this simulation's \(1, 169\)"),
     ],
 )
