@@ -22,6 +22,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from operator import attrgetter
 from pathlib import Path
 from types import FunctionType
 from typing import Any, cast
@@ -155,6 +156,9 @@ class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  #
         pass
 
 
+_code_of = attrgetter("library")  # the machine code of one of numba's compile results, with what is linked to it
+
+
 class _Outdated(Exception):
     """Compiled code calls code that is no longer there."""
 
@@ -165,8 +169,7 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
 
     def reduce(self, result: Any) -> Any:
-        library = result.library
-        return _calls_of(library), super().reduce(result)
+        return _calls_of(_code_of(result)), super().reduce(result)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         calls, payload = payload
@@ -180,9 +183,9 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
             if called[-1].fndesc.mangled_name != symbol:
                 raise _Outdated
         result = super().rebuild(target_context, payload)
-        library = result.library
+        code = _code_of(result)
         # what is called lives as long as its caller
-        library.calls, library.called = calls, called
+        code.calls, code.called = calls, called
         return result
 
 
@@ -254,9 +257,9 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
     def _set_apart(self, result: Any) -> None:
         """Give callers nothing to link but the symbol, if the kernel is to stay apart."""
         if self.apart:
-            library = result.library
-            library.stays_apart = self.lock_name, result.signature.args, result.fndesc.mangled_name
-            library._shared_module = llvm.parse_assembly(str(library._codegen._create_empty_module("apart")))
+            code = _code_of(result)
+            code.stays_apart = self.lock_name, result.signature.args, result.fndesc.mangled_name
+            code._shared_module = llvm.parse_assembly(str(code._codegen._create_empty_module("apart")))
 
 
 def kernel(function: Callable[..., Any], apart: bool = False) -> Any:

@@ -121,14 +121,14 @@ def test_what_changes_hands_owes_the_new_one_nothing():
 
 
 def test_what_collides_with_itself_does_not_sink_into_the_floor():
-    """Self-collision has the last word in a substep, and pushes what lies below down."""
+    """It has the last word in a substep, and pushes what lies below down: by less than a tenth of the cloth's thickness."""
     drop, deepest = MANOEUVRES["edge drop"](clothgym.grid(13, 13, 1.0, 1.0), self_collision="strict", time_step=1 / 60), 0.0
     thickness = drop.simulation._contact.thickness
     while drop.time < 3:
         drop.step()
         deepest = max(deepest, drop.simulation.penetration()[0])
     assert drop.simulation.self_contacts.rows[0] > 10
-    assert 0 < deepest < 0.2 * thickness
+    assert deepest < 0.1 * thickness
 
 
 def test_an_environment_does_not_feel_its_batch():
