@@ -62,14 +62,14 @@ def push_apart(x, v, held, rest, diameter):
     """
     for b in range(x.shape[0]):
         for l in range(x.shape[3]):
-            order = np.argsort(x[b, :, 0, l].copy())
+            order = np.argsort(x[b, 0, :, l].copy())
             for m in range(len(order)):
                 i = order[m]
                 for n in range(m + 1, len(order)):
                     j = order[n]
-                    if x[b, j, 0, l] - x[b, i, 0, l] >= diameter:
+                    if x[b, 0, j, l] - x[b, 0, i, l] >= diameter:
                         break
-                    dx, dy, dz = x[b, j, 0, l] - x[b, i, 0, l], x[b, j, 1, l] - x[b, i, 1, l], x[b, j, 2, l] - x[b, i, 2, l]
+                    dx, dy, dz = x[b, 0, j, l] - x[b, 0, i, l], x[b, 1, j, l] - x[b, 1, i, l], x[b, 2, j, l] - x[b, 2, i, l]
                     distance = np.sqrt(dx * dx + dy * dy + dz * dz)
                     shares = (not held[b, i, l]) + (not held[b, j, l])
                     if distance >= diameter or distance == 0 or shares == 0:
@@ -77,17 +77,17 @@ def push_apart(x, v, held, rest, diameter):
                     ex, ey, ez = rest[j, 0] - rest[i, 0], rest[j, 1] - rest[i, 1], rest[j, 2] - rest[i, 2]
                     if ex * ex + ey * ey + ez * ez <= diameter * diameter:
                         continue
-                    closing = (v[b, j, 0, l] - v[b, i, 0, l]) * dx + (v[b, j, 1, l] - v[b, i, 1, l]) * dy
-                    closing += (v[b, j, 2, l] - v[b, i, 2, l]) * dz
+                    closing = (v[b, 0, j, l] - v[b, 0, i, l]) * dx + (v[b, 1, j, l] - v[b, 1, i, l]) * dy
+                    closing += (v[b, 2, j, l] - v[b, 2, i, l]) * dz
                     out = (diameter - distance) / distance / shares
                     stop = -min(closing, 0.0) / (distance * distance) / shares
                     for c, d in ((0, dx), (1, dy), (2, dz)):
                         if not held[b, i, l]:
-                            x[b, i, c, l] -= out * d
-                            v[b, i, c, l] -= stop * d
+                            x[b, c, i, l] -= out * d
+                            v[b, c, i, l] -= stop * d
                         if not held[b, j, l]:
-                            x[b, j, c, l] += out * d
-                            v[b, j, c, l] += stop * d
+                            x[b, c, j, l] += out * d
+                            v[b, c, j, l] += stop * d
 
 
 def with_spheres(name: str, mesh: ClothMesh, seeds: range, thickness: float, diameter: float) -> Iterator[Manoeuvre]:

@@ -262,17 +262,19 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
             code._shared_module = llvm.parse_assembly(str(code._codegen._create_empty_module("apart")))
 
 
-def kernel(function: Callable[..., Any], apart: bool = False) -> Any:
+def kernel(function: Callable[..., Any], apart: bool = False, flags: Callable[[Any], Any] | None = None) -> Any:
     """Compile ``function`` by the project's policy, at its first call, through the locked cache.
 
     Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
 
     apart: compile it once for all its callers, who jump to it.  Of others numba links the code into each kernel above them, and
     optimises it anew there: right for what is short, and minutes in all for what is long and has many callers.
+    flags: changes the compiler's, see ``disjoint``.
     """
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return function
     dispatcher = numba.njit(**OPTIONS)(function)
+    dispatcher.flags = dispatcher._compiler._customize_flags = flags or _counted
     try:
         dispatcher._cache = _Cache(cast(FunctionType, function), apart)
     except RuntimeError:  # it has been typed in, and lies in no file: it is compiled in memory, and linked into its callers
@@ -292,6 +294,41 @@ def kernel(function: Callable[..., Any], apart: bool = False) -> Any:
 
     dispatcher.compile = compile_locked
     return dispatcher
+
+
+# the compiler's flags of each sort of kernel.  All are set: what is not set is taken from whichever kernel is compiled above
+
+
+def _counted(flags: Any) -> Any:
+    flags.nrt, flags.noalias = True, False
+    return flags
+
+
+def _uncounted(flags: Any) -> Any:
+    flags.nrt, flags.noalias = False, False
+    return flags
+
+
+def _disjoint(flags: Any) -> Any:
+    flags.nrt, flags.noalias = False, True
+    return flags
+
+
+def uncounted(function: Callable[..., Any]) -> Any:
+    """An ``apart`` kernel that makes no arrays, and so does not count references to any.
+
+    A count is an atomic addition for each array that is taken from a tuple or sliced: many of them take longer than a small
+    sheet's forces.  It must not call counted kernels that return arrays, nor return any: ``inlined`` ones may.
+    """
+    return kernel(function, apart=True, flags=_uncounted)
+
+
+def disjoint(function: Callable[..., Any]) -> Any:
+    """A ``kernel`` of loops over long rows that makes no arrays, and promises that what it writes to overlaps none of its others.
+
+    Else the compiler tests every pair of rows for overlap whenever the kernel is called: as long as a row of a hundred takes.
+    """
+    return kernel(function, flags=_disjoint)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
@@ -315,8 +352,10 @@ def specialize(function: Any, name: str, apart: bool = False, **callees: Any) ->
 
     This is how one substep loop serves every integrator: numba's disk cache misses in each new process when a dispatcher
     is an argument or a closure variable, and hits when it is a global.  ``name`` keeps the cache entries apart, with a digest
-    of the source of callees from outside this package, which the folder's name does not cover.
+    of the source of callees from outside this package, which the folder's name does not cover.  A ``function`` that is a kernel
+    already is made as it is.
     """
+    flags, function = getattr(function, "flags", None), getattr(function, "py_func", function)
     for callee in callees.values():
         path = Path(getattr(callee, "py_func", callee).__code__.co_filename)
         if Path(__file__).parent not in path.parents:
@@ -325,7 +364,7 @@ def specialize(function: Any, name: str, apart: bool = False, **callees: Any) ->
     bound = FunctionType(code, {**function.__globals__, **callees}, name)
     bound.__qualname__ = name
     bound.__module__ = function.__module__
-    return kernel(bound, apart)
+    return kernel(bound, apart, flags)
 
 
 _pool: ThreadPoolExecutor | None = None

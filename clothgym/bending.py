@@ -3,18 +3,18 @@
 A model is three kernels on one block of lanes, to which ``_jit.specialize`` binds the names ``add_bend_forces``,
 ``add_bend_products`` and ``project_bends`` wherever an integrator uses them:
 
-    add_bend_forces(x, v, f, bends, rigidity, damping_time, scratch)
-        adds the elements' and their dampers' forces to ``f`` [N], (particles, 3, lanes);
-    add_bend_products(x, p, y, bends, scale, scratch)
+    add_bend_forces(x, v, f, elements, elastic, scratch)
+        adds the hinges' and their dampers' forces to ``f`` [N], (3, particles, lanes);
+    add_bend_products(x, p, y, elements, scale, scratch)
         adds their stiffness matrix, without what could make it indefinite, times ``p``: ``y += scale K p``, with scale, (lanes,),
         the rigidity times whatever the caller needs;
     project_bends(x, start, w, bends, scale, damping, relaxation, multipliers, scratch)
-        moves particles in place towards the elements' rest, one after the other, as extended position-based dynamics does (see
-        ``integrators.xpbd``), with scale ``B h^2``, (lanes,), damping ``tau/h``, (lanes,), and the share
-        ``relaxation`` of each move.  multipliers: (elements, 3, lanes),
-        updated; or (0, 3, lanes), where they need no memory.
+        moves particles in place towards the hinges' rest, one after the other, as extended position-based dynamics does (see
+        ``integrators.xpbd``), with scale ``B h^2``, (lanes,), damping ``tau/h``, (lanes,), and the share ``relaxation`` of each
+        move.  multipliers: (hinges, 3, lanes), updated; or (0, 3, lanes), where they need no memory.
 
-``bends`` is ``state.BendArrays``; scratch is (BEND_SCRATCH, 3, lanes), whose content does not outlive the call.
+``elements``, ``elastic``, ``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles lie side by side, the same
+forces are in ``grid_forces``.
 """
 
 from __future__ import annotations
@@ -26,11 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import disjoint, inlined, kernel, uncounted
+from clothgym.elements import ROWS, BendArrays
 from clothgym.mesh import ClothMesh
-from clothgym.state import BendArrays
-
-BEND_SCRATCH = 9
 
 # arctan(z)/z by powers of z^2 for z^2 up to tan(pi/8)^2, interpolated at Chebyshev's points: error at most 8e-13
 ARCTAN = (
@@ -43,12 +41,12 @@ ARCTAN = (
 
 
 @kernel
-def add_bend_forces(x, v, f, bends, rigidity, damping_time, scratch):
+def add_bend_forces(x, v, f, elements, elastic, scratch):
     """Nothing: skip springs are among the springs."""
 
 
 @kernel
-def add_bend_products(x, p, y, bends, scale, scratch):
+def add_bend_products(x, p, y, elements, scale, scratch):
     """Nothing."""
 
 
@@ -60,48 +58,48 @@ def project_bends(x, start, w, bends, scale, damping, relaxation, multipliers, s
 # --- quadratic: isometric bending, Bergou et al. 2006 -------------------------------------------------------------------
 
 
-@kernel
-def _combine(x, ends, q, out):
-    """``sum_i q_i x_i`` of one element into ``out``, (3, lanes)."""
-    a, b, c, d = x[ends[0]], x[ends[1]], x[ends[2]], x[ends[3]]
+@disjoint
+def _combine(a, b, c, d, q, out):
+    """One component of ``sum_i q_i x_i`` of one hinge, (lanes,)."""
     qa, qb, qc, qd = q[0], q[1], q[2], q[3]
-    for e in range(3):
-        for l in range(x.shape[2]):
-            out[e, l] = qa * a[e, l] + qb * b[e, l] + qc * c[e, l] + qd * d[e, l]
+    for l in range(out.shape[0]):
+        out[l] = qa * a[l] + qb * b[l] + qc * c[l] + qd * d[l]
 
 
-@kernel
-def add_quadratic_forces(x, v, f, bends, rigidity, damping_time, scratch):
+@uncounted
+def add_quadratic_forces(x, v, f, elements, elastic, scratch):
     """Of the energy ``B/2 |sum_i q_i x_i|^2``: constant curvature matrix, exact for a sheet that bends and does not stretch."""
-    members, _, _, curves = bends
-    curve, rate = scratch[0], scratch[1]
+    members, curves = elements.bends.particles, elements.bends.curves
+    rigidity, damping_time, rows = elastic.rigidity, elastic.damping_time, scratch.rows
+    curve, rate = rows[0], rows[1]
     for s in range(members.shape[0]):
-        _combine(x, members[s], curves[s], curve)
-        _combine(v, members[s], curves[s], rate)
-        for e in range(3):
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
+        for c in range(3):
+            xc, vc, fc = x[c], v[c], f[c]
+            _combine(xc[i], xc[j], xc[k], xc[m], curves[s], curve)
+            _combine(vc[i], vc[j], vc[k], vc[m], curves[s], rate)
             for l in range(x.shape[2]):
-                curve[e, l] = rigidity[l] * (curve[e, l] + damping_time[l] * rate[e, l])
-        for m in range(4):
-            fm = f[members[s, m]]
-            q = curves[s, m]
-            for e in range(3):
+                curve[l] = rigidity[l] * (curve[l] + damping_time[l] * rate[l])
+            for a in range(4):
+                own, q = fc[members[s, a]], curves[s, a]
                 for l in range(x.shape[2]):
-                    fm[e, l] -= q * curve[e, l]
+                    own[l] -= q * curve[l]
 
 
-@kernel
-def add_quadratic_products(x, p, y, bends, scale, scratch):
+@uncounted
+def add_quadratic_products(x, p, y, elements, scale, scratch):
     """The matrix of the energy itself, which is constant."""
-    members, _, _, curves = bends
-    curve = scratch[0]
+    members, curves = elements.bends.particles, elements.bends.curves
+    curve = scratch.rows[0]
     for s in range(members.shape[0]):
-        _combine(p, members[s], curves[s], curve)
-        for m in range(4):
-            ym = y[members[s, m]]
-            q = curves[s, m]
-            for e in range(3):
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
+        for c in range(3):
+            pc, yc = p[c], y[c]
+            _combine(pc[i], pc[j], pc[k], pc[m], curves[s], curve)
+            for a in range(4):
+                own, q = yc[members[s, a]], curves[s, a]
                 for l in range(x.shape[2]):
-                    ym[e, l] += q * scale[l] * curve[e, l]
+                    own[l] += q * scale[l] * curve[l]
 
 
 @kernel
@@ -109,77 +107,76 @@ def project_quadratic(x, start, w, bends, scale, damping, relaxation, multiplier
     """One vector of constraints an element, ``sum_i q_i x_i = 0``: linear, so a projection solves it exactly."""
     members, _, _, curves = bends
     one = x.dtype.type(1)
-    curve, before, weigh = scratch[0], scratch[1], scratch[2]
+    curve, before, weigh = scratch.rows[0], scratch.rows[1], scratch.rows[2]
     keeps = multipliers.shape[0] > 0
     for s in range(members.shape[0]):
-        _combine(x, members[s], curves[s], curve)
-        _combine(start, members[s], curves[s], before)
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         q = curves[s]
-        a, b, c, d = w[members[s, 0]], w[members[s, 1]], w[members[s, 2]], w[members[s, 3]]
+        a, b, c, d = w[i], w[j], w[k], w[m]
         for l in range(x.shape[2]):
             mobility = q[0] * q[0] * a[l] + q[1] * q[1] * b[l] + q[2] * q[2] * c[l] + q[3] * q[3] * d[l]
-            weigh[0, l] = one / (scale[l] * (one + damping[l]) * mobility + one)
+            weigh[l] = one / (scale[l] * (one + damping[l]) * mobility + one)
         for e in range(3):
+            xe, se = x[e], start[e]
+            _combine(xe[i], xe[j], xe[k], xe[m], q, curve)
+            _combine(se[i], se[j], se[k], se[m], q, before)
             if keeps:
                 known = multipliers[s, e]
                 for l in range(x.shape[2]):
-                    pull = scale[l] * (curve[e, l] + damping[l] * (curve[e, l] - before[e, l]))
-                    curve[e, l] = (pull - known[l]) * weigh[0, l]
-                    known[l] += curve[e, l]
+                    pull = scale[l] * (curve[l] + damping[l] * (curve[l] - before[l]))
+                    curve[l] = (pull - known[l]) * weigh[l]
+                    known[l] += curve[l]
             else:
                 for l in range(x.shape[2]):
-                    pull = scale[l] * (curve[e, l] + damping[l] * (curve[e, l] - before[e, l]))
-                    curve[e, l] = pull * weigh[0, l]
-        for m in range(4):
-            xm, wm = x[members[s, m]], w[members[s, m]]
-            for e in range(3):
+                    pull = scale[l] * (curve[l] + damping[l] * (curve[l] - before[l]))
+                    curve[l] = pull * weigh[l]
+            for n in range(4):
+                xn, wn = xe[members[s, n]], w[members[s, n]]
                 for l in range(x.shape[2]):
-                    xm[e, l] -= relaxation * wm[l] * q[m] * curve[e, l]
+                    xn[l] -= relaxation * wn[l] * q[n] * curve[l]
 
 
 # --- hinge: the angle between triangles, Grinspun et al. 2003 -----------------------------------------------------------
 
 
-@kernel
-def _angle_and_slopes(x, ends, angle, slopes, rows):
+@disjoint
+def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
     """The angle between two triangles [rad] into ``angle``, (lanes,), and its derivatives [1/m] into ``slopes``, (12, lanes).
 
     With e the edge, a and b the opposite corners seen from its first end, and the normals ``N = e x a`` and ``M = b x e``:
     ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  Two more halvings bring it where a short polynomial is the arctangent.
-    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  rows: scratch, (11, lanes).  Loops that write few rows
-    vectorise: one loop for all this would take four times as long.
+    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  Corners: three components each, (lanes,), or
+    (hinges,) where these lie side by side.  rows: scratch, (11, lanes).  Loops that write few rows vectorise: one loop for all this
+    would take four times as long.
     """
-    xi, xj, xk, xl = x[ends[0]], x[ends[1]], x[ends[2]], x[ends[3]]
-    lanes = x.shape[2]
-    t = x.dtype.type
+    lanes = angle.shape[0]
+    t = angle.dtype.type
     one, tiny, least = t(1), t(1e-30), t(1e-9)
     c0, c1, c2, c3 = t(ARCTAN[0]), t(ARCTAN[1]), t(ARCTAN[2]), t(ARCTAN[3])
     c4, c5, c6, c7 = t(ARCTAN[4]), t(ARCTAN[5]), t(ARCTAN[6]), t(ARCTAN[7])
-    n, m = rows[0:3], rows[3:6]
+    ix, iy, iz = xi
+    jx, jy, jz = xj
+    kx, ky, kz = xk
+    lx, ly, lz = xm
+    n0, n1, n2, m0, m1, m2 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
     inverse, foot_k, foot_l, tilt_k, tilt_l = rows[6], rows[7], rows[8], rows[9], rows[10]
     for l in range(lanes):
-        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-        ax, ay, az = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
-        n[0, l], n[1, l], n[2, l] = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
-    for l in range(lanes):
-        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-        bx, by, bz = xl[0, l] - xi[0, l], xl[1, l] - xi[1, l], xl[2, l] - xi[2, l]
-        m[0, l], m[1, l], m[2, l] = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
-    for l in range(lanes):
-        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-        ax, ay, az = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
+        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
+        ax, ay, az = kx[l] - ix[l], ky[l] - iy[l], kz[l] - iz[l]
+        n0[l], n1[l], n2[l] = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
         inverse[l] = one / (ex * ex + ey * ey + ez * ez + tiny)
         foot_k[l] = (ax * ex + ay * ey + az * ez) * inverse[l]
     for l in range(lanes):
-        ex, ey, ez = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-        bx, by, bz = xl[0, l] - xi[0, l], xl[1, l] - xi[1, l], xl[2, l] - xi[2, l]
+        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
+        bx, by, bz = lx[l] - ix[l], ly[l] - iy[l], lz[l] - iz[l]
+        m0[l], m1[l], m2[l] = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
         foot_l[l] = (bx * ex + by * ey + bz * ez) * inverse[l]
-        angle[l] = bx * n[0, l] + by * n[1, l] + bz * n[2, l]
+        angle[l] = bx * n0[l] + by * n1[l] + bz * n2[l]
     for l in range(lanes):
-        nx, ny, nz, mx, my, mz = n[0, l], n[1, l], n[2, l], m[0, l], m[1, l], m[2, l]
-        n2, m2 = nx * nx + ny * ny + nz * nz + tiny, mx * mx + my * my + mz * mz + tiny
+        nx, ny, nz, mx, my, mz = n0[l], n1[l], n2[l], m0[l], m1[l], m2[l]
+        nn, mm = nx * nx + ny * ny + nz * nz + tiny, mx * mx + my * my + mz * mz + tiny
         length = one / np.sqrt(inverse[l])
-        product = np.sqrt(n2) * np.sqrt(m2)
+        product = np.sqrt(nn) * np.sqrt(mm)
         below, lowest = product + (nx * mx + ny * my + nz * mz), least * product
         half = -length * angle[l] / (below if below > lowest else lowest)
         quarter = half / (one + np.sqrt(one + half * half))
@@ -187,9 +184,9 @@ def _angle_and_slopes(x, ends, angle, slopes, rows):
         u = z * z
         series = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * (c5 + u * (c6 + u * c7))))))
         angle[l] = t(8) * z * series
-        tilt_k[l], tilt_l[l] = -length / n2, -length / m2
+        tilt_k[l], tilt_l[l] = -length / nn, -length / mm
     for c in range(3):
-        near, far, of_k, of_l, nc, mc = slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c], n[c], m[c]
+        near, far, of_k, of_l, nc, mc = slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c], rows[c], rows[3 + c]
         for l in range(lanes):
             of_k[l] = tilt_k[l] * nc[l]
         for l in range(lanes):
@@ -200,57 +197,72 @@ def _angle_and_slopes(x, ends, angle, slopes, rows):
             far[l] = -foot_k[l] * of_k[l] - foot_l[l] * of_l[l]
 
 
-@kernel
-def _rate(p, ends, slopes, out):
-    """Derivative of the angle along ``p``, (lanes,)."""
+@disjoint
+def _rate_at(px, py, pz, sx, sy, sz, out):
+    for l in range(out.shape[0]):
+        out[l] += sx[l] * px[l] + sy[l] * py[l] + sz[l] * pz[l]
+
+
+@inlined
+def hinge_rates(pi, pj, pk, pm, slopes, out):
+    """Derivative of the angle along ``p``, (lanes,); corners as for ``hinge_angles``."""
     out[:] = 0
-    for m in range(4):
-        pm, s = p[ends[m]], slopes[3 * m : 3 * m + 3]
-        for l in range(p.shape[2]):
-            out[l] += s[0, l] * pm[0, l] + s[1, l] * pm[1, l] + s[2, l] * pm[2, l]
+    _rate_at(pi[0], pi[1], pi[2], slopes[0], slopes[1], slopes[2], out)
+    _rate_at(pj[0], pj[1], pj[2], slopes[3], slopes[4], slopes[5], out)
+    _rate_at(pk[0], pk[1], pk[2], slopes[6], slopes[7], slopes[8], out)
+    _rate_at(pm[0], pm[1], pm[2], slopes[9], slopes[10], slopes[11], out)
 
 
-@kernel
-def _hinge_rows(scratch):
-    """Rows of scratch that a hinge's kernels use: angle, rate, derivatives, geometry, and two more, (., lanes)."""
-    rows = scratch.reshape((3 * scratch.shape[0], scratch.shape[2]))
+@inlined
+def hinge_rows(scratch, lanes):
+    """Rows that a hinge's kernels use, of ``Scratch.rows``: angle, rate, derivatives, geometry and two more, (., lanes)."""
+    rows = scratch.reshape(scratch.size)[: ROWS * lanes].reshape((ROWS, lanes))
     return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
 
 
-@apart
-def add_hinge_forces(x, v, f, bends, rigidity, damping_time, scratch):
+@inlined
+def _at(x, p):
+    """Components of one particle's vectors, (lanes,) each."""
+    return x[0, p], x[1, p], x[2, p]
+
+
+@uncounted
+def add_hinge_forces(x, v, f, elements, elastic, scratch):
     """Of the energy ``B/2 weight (angle - rest angle)^2``."""
-    members, weight, rest_angle, _ = bends
-    angle, rate, slopes, geometry, _, _ = _hinge_rows(scratch)
+    members, weight, rest_angle, _ = elements.bends
+    rigidity, damping_time = elastic.rigidity, elastic.damping_time
+    angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, x.shape[2])
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes, geometry)
-        _rate(v, members[s], slopes, rate)
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
+        hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
+        hinge_rates(_at(v, i), _at(v, j), _at(v, k), _at(v, m), slopes, rate)
         share, rest = weight[s], rest_angle[s]
         for l in range(x.shape[2]):
             angle[l] = share * rigidity[l] * (angle[l] - rest + damping_time[l] * rate[l])
-        for m in range(4):
-            fm = f[members[s, m]]
+        for corner in range(4):
             for e in range(3):
+                fe, slope = f[e, members[s, corner]], slopes[3 * corner + e]
                 for l in range(x.shape[2]):
-                    fm[e, l] -= slopes[3 * m + e, l] * angle[l]
+                    fe[l] -= slope[l] * angle[l]
 
 
-@apart
-def add_hinge_products(x, p, y, bends, scale, scratch):
+@uncounted
+def add_hinge_products(x, p, y, elements, scale, scratch):
     """The part of the energy's matrix that is never negative: the derivatives' outer product (Gauss and Newton)."""
-    members, weight, _, _ = bends
-    angle, rate, slopes, geometry, _, _ = _hinge_rows(scratch)
+    members, weight, _, _ = elements.bends
+    angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, x.shape[2])
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes, geometry)
-        _rate(p, members[s], slopes, rate)
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
+        hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
+        hinge_rates(_at(p, i), _at(p, j), _at(p, k), _at(p, m), slopes, rate)
         share = weight[s]
         for l in range(x.shape[2]):
             rate[l] *= share * scale[l]
-        for m in range(4):
-            ym = y[members[s, m]]
+        for corner in range(4):
             for e in range(3):
+                ye, slope = y[e, members[s, corner]], slopes[3 * corner + e]
                 for l in range(x.shape[2]):
-                    ym[e, l] += rate[l] * slopes[3 * m + e, l]
+                    ye[l] += rate[l] * slope[l]
 
 
 @kernel
@@ -258,32 +270,35 @@ def project_hinges(x, start, w, bends, scale, damping, relaxation, multipliers, 
     """The constraint ``angle = rest angle``; the damper sees what has been done along its derivative in the substep."""
     members, weight, rest_angle, _ = bends
     one = x.dtype.type(1)
-    angle, rate, slopes, geometry, before, mobility = _hinge_rows(scratch)
+    angle, rate, slopes, geometry, before, mobility = hinge_rows(scratch.rows, x.shape[2])
     keeps = multipliers.shape[0] > 0
     for s in range(members.shape[0]):
-        _angle_and_slopes(x, members[s], angle, slopes, geometry)
-        _rate(x, members[s], slopes, rate)
-        _rate(start, members[s], slopes, before)
+        i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
+        hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
+        hinge_rates(_at(x, i), _at(x, j), _at(x, k), _at(x, m), slopes, rate)
+        hinge_rates(_at(start, i), _at(start, j), _at(start, k), _at(start, m), slopes, before)
         mobility[:] = 0
-        for m in range(4):
-            wm = w[members[s, m]]
+        for corner in range(4):
+            wm = w[members[s, corner]]
             for e in range(3):
+                slope = slopes[3 * corner + e]
                 for l in range(x.shape[2]):
-                    mobility[l] += wm[l] * slopes[3 * m + e, l] * slopes[3 * m + e, l]
+                    mobility[l] += wm[l] * slope[l] * slope[l]
         share, rest = weight[s], rest_angle[s]
         for l in range(x.shape[2]):
-            k = share * scale[l]
-            pull = k * (angle[l] - rest + damping[l] * (rate[l] - before[l]))
+            stiff = share * scale[l]
+            pull = stiff * (angle[l] - rest + damping[l] * (rate[l] - before[l]))
             known = multipliers[s, 0, l] if keeps else x.dtype.type(0)
-            angle[l] = (pull - known) / (k * (one + damping[l]) * mobility[l] + one)
+            angle[l] = (pull - known) / (stiff * (one + damping[l]) * mobility[l] + one)
         if keeps:
             for l in range(x.shape[2]):
                 multipliers[s, 0, l] += angle[l]
-        for m in range(4):
-            xm, wm = x[members[s, m]], w[members[s, m]]
+        for corner in range(4):
+            wm = w[members[s, corner]]
             for e in range(3):
+                xe, slope = x[e, members[s, corner]], slopes[3 * corner + e]
                 for l in range(x.shape[2]):
-                    xm[e, l] -= relaxation * wm[l] * slopes[3 * m + e, l] * angle[l]
+                    xe[l] -= relaxation * wm[l] * slope[l] * angle[l]
 
 
 # --- the table ----------------------------------------------------------------------------------------------------------

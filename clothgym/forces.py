@@ -1,8 +1,7 @@
 """Floor 3: forces on one block of lanes, and what they say about the largest stable step.
 
-In all kernels ``x``: positions [m] and ``v``: velocities [m/s] are (particles, 3, lanes); loops over lanes are innermost.
-Two simple loops through a small scratch row beat one loop that reads and writes: LLVM tests every pair of rows of a loop
-for overlap at run time.
+In all kernels ``x``: positions [m] and ``v``: velocities [m/s] are (3, particles, lanes); loops over lanes are innermost.  For a grid
+whose particles lie side by side the same forces are in ``grid_forces``.
 """
 
 from __future__ import annotations
@@ -12,154 +11,129 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import Bending
+from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
-from clothgym.state import Elements, State
+from clothgym.state import State
 
 POWER_STEPS = 16
 TINY = 1e-30  # [m^2]: a spring of no length, as in a sheet that is folded on itself, has no direction to pull in
 
 
-@apart
-def add_spring_forces(x, v, f, springs, stiffness, damping_time, row):
-    """Add Hooke's force and the damper's along each spring to ``f`` [N], (particles, 3, lanes).
+@disjoint
+def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, gi, hi, fj, gj, hj):
+    """One spring's force on both its ends, in lanes: components of positions, velocities and forces, (lanes,)."""
+    one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        g = share * k[l] * ((one - r * q) + tau[l] * (ux * dx + uy * dy + uz * dz) * q * q)
+        fx, fy, fz = g * dx, g * dy, g * dz
+        fi[l] += fx
+        gi[l] += fy
+        hi[l] += fz
+        fj[l] -= fx
+        gj[l] -= fy
+        hj[l] -= fz
+
+
+@uncounted
+def add_spring_forces(x, v, f, elements, elastic, scratch):
+    """Add Hooke's force and the damper's along each spring to ``f`` [N], (3, particles, lanes).
 
     On the first end, with d the vector to the second, u its velocity, r the rest length and tau the damping time:
-    ``f = k ((1 - r/|d|) + tau (u . d)/|d|^2) d``.  stiffness: k [N/m], (kinds, lanes); damping_time [s], (lanes,);
-    row: scratch, (3, lanes).
+    ``f = k ((1 - r/|d|) + tau (u . d)/|d|^2) d``.  The stiffness k [N/m] is a row of ``elastic.stiffness``, (kinds, lanes), times the
+    spring's weight.
     """
+    stiffness, damping_time = elastic.stiffness, elastic.damping_time
     if x.shape[2] == 1:
-        _add_spring_forces_of_one(x[:, :, 0], v[:, :, 0], f[:, :, 0], springs, stiffness[:, 0], damping_time[0])
+        rows = (3, x.shape[1])
+        _add_spring_forces_of_one(
+            x.reshape(rows), v.reshape(rows), f.reshape(rows), elements.springs, stiffness[:, 0], damping_time[0]
+        )  # fmt: skip
         return
-    ends, rest_length, kind, weight = springs
-    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
-    lanes = x.shape[2]
-    # components and lanes of a particle lie side by side: one loop adds all three
-    flat = f.reshape((x.shape[0], 3 * lanes))
-    force = row.reshape(3 * lanes)
+    ends, rest_length, kind, weight = elements.springs
+    x0, x1, x2, v0, v1, v2, f0, f1, f2 = x[0], x[1], x[2], v[0], v[1], v[2], f[0], f[1], f[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, vi, vj, fi, fj = x[i], x[j], v[i], v[j], flat[i], flat[j]
-        k = stiffness[kind[s]]
-        share = weight[s]
-        r = rest_length[s]
-        for l in range(lanes):
-            dx = xj[0, l] - xi[0, l]
-            dy = xj[1, l] - xi[1, l]
-            dz = xj[2, l] - xi[2, l]
-            ux = vj[0, l] - vi[0, l]
-            uy = vj[1, l] - vi[1, l]
-            uz = vj[2, l] - vi[2, l]
-            q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-            g = share * k[l] * ((one - r * q) + damping_time[l] * (ux * dx + uy * dy + uz * dz) * q * q)
-            row[0, l] = g * dx
-            row[1, l] = g * dy
-            row[2, l] = g * dz
-        for e in range(3 * lanes):
-            fi[e] += force[e]
-        for e in range(3 * lanes):
-            fj[e] -= force[e]
+        _pull(
+            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], v0[i], v1[i], v2[i], v0[j], v1[j], v2[j], stiffness[kind[s]], weight[s],
+            rest_length[s], damping_time, f0[i], f1[i], f2[i], f0[j], f1[j], f2[j],
+        )  # fmt: skip
 
 
 @kernel
 def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
-    """The same arithmetic on a single environment, (particles, 3), in less than half the time: no loops of one round."""
+    """The same arithmetic on a single environment, (3, particles), in less than half the time: no loops of one round."""
     ends, rest_length, kind, weight = springs
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         r = rest_length[s]
-        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-        ux, uy, uz = v[j, 0] - v[i, 0], v[j, 1] - v[i, 1], v[j, 2] - v[i, 2]
+        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
+        ux, uy, uz = v[0, j] - v[0, i], v[1, j] - v[1, i], v[2, j] - v[2, i]
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         g = weight[s] * stiffness[kind[s]] * ((one - r * q) + damping_time * (ux * dx + uy * dy + uz * dz) * q * q)
         fx, fy, fz = g * dx, g * dy, g * dz
-        f[i, 0] += fx
-        f[i, 1] += fy
-        f[i, 2] += fz
-        f[j, 0] -= fx
-        f[j, 1] -= fy
-        f[j, 2] -= fz
+        f[0, i] += fx
+        f[1, i] += fy
+        f[2, i] += fz
+        f[0, j] -= fx
+        f[1, j] -= fy
+        f[2, j] -= fz
 
 
-@apart
-def add_spring_products(x, p, y, springs, along, across, row):
-    """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (particles, 3, lanes).
+@disjoint
+def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, share, r, fi, gi, hi, fj, gj, hj):
+    """One spring's part of ``add_spring_products``, in lanes; arguments as of ``_pull``."""
+    one, zero, tiny = xi.dtype.type(1), xi.dtype.type(0), xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        stretched = one - r * q
+        aside = share * across[l] * (stretched if stretched > zero else zero)
+        g = (share * along[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+        fx, fy, fz = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
+        fi[l] -= fx
+        gi[l] -= fy
+        hi[l] -= fz
+        fj[l] += fx
+        gj[l] += fy
+        hj[l] += fz
+
+
+@uncounted
+def add_spring_products(x, p, y, elements, along, across, bend, scratch):
+    """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (3, particles, lanes).
 
     With n the direction, ``along n n^T + across max(1 - r/d, 0) (I - n n^T)`` a spring, both proportional to its stiffness: what a
     compressed one would push aside is left out, so that the matrix has no negative eigenvalue (Choi and Ko 2002).
-    along, across: by kind, (kinds, lanes); row: scratch, (3, lanes).
+    along, across: by kind, (kinds, lanes).  bend: of what bends linearly along with springs, which here nothing does.
     """
-    if x.shape[2] == 1:
-        _add_spring_products_of_one(x[:, :, 0], p[:, :, 0], y[:, :, 0], springs, along[:, 0], across[:, 0])
-        return
-    ends, rest_length, kind, weight = springs
-    one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
-    lanes = x.shape[2]
-    flat = y.reshape((x.shape[0], 3 * lanes))
-    product = row.reshape(3 * lanes)
+    ends, rest_length, kind, weight = elements.springs
+    x0, x1, x2, p0, p1, p2, y0, y1, y2 = x[0], x[1], x[2], p[0], p[1], p[2], y[0], y[1], y[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, pi, pj, yi, yj = x[i], x[j], p[i], p[j], flat[i], flat[j]
-        kn, kt = along[kind[s]], across[kind[s]]
-        share = weight[s]
-        r = rest_length[s]
-        for l in range(lanes):
-            dx = xj[0, l] - xi[0, l]
-            dy = xj[1, l] - xi[1, l]
-            dz = xj[2, l] - xi[2, l]
-            ux = pj[0, l] - pi[0, l]
-            uy = pj[1, l] - pi[1, l]
-            uz = pj[2, l] - pi[2, l]
-            q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-            stretched = one - r * q
-            aside = share * kt[l] * (stretched if stretched > zero else zero)
-            g = (share * kn[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
-            row[0, l] = g * dx + aside * ux
-            row[1, l] = g * dy + aside * uy
-            row[2, l] = g * dz + aside * uz
-        for e in range(3 * lanes):
-            yi[e] -= product[e]
-        for e in range(3 * lanes):
-            yj[e] += product[e]
+        _multiply(
+            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], p0[i], p1[i], p2[i], p0[j], p1[j], p2[j], along[kind[s]], across[kind[s]],
+            weight[s], rest_length[s], y0[i], y1[i], y2[i], y0[j], y1[j], y2[j],
+        )  # fmt: skip
 
 
-@kernel
-def _add_spring_products_of_one(x, p, y, springs, along, across):
-    """The same arithmetic on a single environment, (particles, 3)."""
-    ends, rest_length, kind, weight = springs
-    one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
-    for s in range(ends.shape[0]):
-        i = ends[s, 0]
-        j = ends[s, 1]
-        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-        ux, uy, uz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
-        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-        stretched = one - rest_length[s] * q
-        aside = weight[s] * across[kind[s]] * (stretched if stretched > zero else zero)
-        g = (weight[s] * along[kind[s]] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
-        tx, ty, tz = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
-        y[i, 0] -= tx
-        y[i, 1] -= ty
-        y[i, 2] -= tz
-        y[j, 0] += tx
-        y[j, 1] += ty
-        y[j, 2] += tz
-
-
-@apart
-def add_air_forces(x, v, f, surface, resistance, wind, row):
-    """Add the air's force on each triangle to ``f`` [N], (particles, 3, lanes).
+@uncounted
+def add_air_forces(x, v, f, surface, resistance, wind, scratch):
+    """Add the air's force on each triangle to ``f`` [N], (3, particles, lanes).
 
     With A the area, n the normal and u the wind relative to the triangle:
     ``rho/2 A |u| (C_D (u . n) n + C_F (u - (u . n) n))``.  Face on that is the drag ``rho/2 C_D A u^2``; at an angle the part
     across the wind is lift, of coefficient ``(C_D - C_F) sin cos`` as of a flat plate that has stalled (Hoerner, Fluid-Dynamic
-    Drag, 1965, 3-15).  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes); wind [m/s], (3, lanes); row: scratch,
-    (3, lanes).
+    Drag, 1965, 3-15).  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes); wind [m/s], (3, lanes).
     """
     triangles, shares = surface
     half = x.dtype.type(0.5)
@@ -167,20 +141,18 @@ def add_air_forces(x, v, f, surface, resistance, wind, row):
     one = x.dtype.type(1)
     lanes = x.shape[2]
     across, along = resistance[0], resistance[1]
-    flat = f.reshape((x.shape[0], 3 * lanes))
-    force = row.reshape(3 * lanes)
+    row = scratch.rows
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         a, b, c = shares[t, 0], shares[t, 1], shares[t, 2]
-        xi, xj, xk, vi, vj, vk = x[i], x[j], x[k], v[i], v[j], v[k]
         for l in range(lanes):
-            px, py, pz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-            qx, qy, qz = xk[0, l] - xi[0, l], xk[1, l] - xi[1, l], xk[2, l] - xi[2, l]
+            px, py, pz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
+            qx, qy, qz = x[0, k, l] - x[0, i, l], x[1, k, l] - x[1, i, l], x[2, k, l] - x[2, i, l]
             # normal times twice the area
             nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-            ux = wind[0, l] - (a * vi[0, l] + b * vj[0, l] + c * vk[0, l])
-            uy = wind[1, l] - (a * vi[1, l] + b * vj[1, l] + c * vk[1, l])
-            uz = wind[2, l] - (a * vi[2, l] + b * vj[2, l] + c * vk[2, l])
+            ux = wind[0, l] - (a * v[0, i, l] + b * v[0, j, l] + c * v[0, k, l])
+            uy = wind[1, l] - (a * v[1, i, l] + b * v[1, j, l] + c * v[1, k, l])
+            uz = wind[2, l] - (a * v[2, i, l] + b * v[2, j, l] + c * v[2, k, l])
             n2 = nx * nx + ny * ny + nz * nz + tiny
             speed = np.sqrt(ux * ux + uy * uy + uz * uz)
             twice = np.sqrt(n2)
@@ -190,10 +162,11 @@ def add_air_forces(x, v, f, surface, resistance, wind, row):
             row[1, l] = face * ny + skin * uy
             row[2, l] = face * nz + skin * uz
         for corner in range(3):
-            fp = flat[triangles[t, corner]]
             share = shares[t, corner]
-            for e in range(3 * lanes):
-                fp[e] += share * force[e]
+            for e in range(3):
+                fp, force = f[e, triangles[t, corner]], row[e]
+                for l in range(lanes):
+                    fp[l] += share * force[l]
 
 
 class Oscillators(NamedTuple):

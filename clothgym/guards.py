@@ -8,13 +8,14 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart
+from clothgym._jit import apart, kernel
 from clothgym.bending import Bending
+from clothgym.elements import Elements
 from clothgym.forces import Oscillators
 from clothgym.integrators import Integrator
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import FIGURES
-from clothgym.state import Elements, Fabric
+from clothgym.state import Fabric
 
 FASTEST = 1e3  # no cloth moves at a kilometre a second [m/s]
 
@@ -23,11 +24,23 @@ FASTEST = 1e3  # no cloth moves at a kilometre a second [m/s]
 def mark_diverged(x, v, diverged):
     """Set the flags, (lanes,), of lanes where something is not finite, or faster than ``FASTEST``."""
     limit = x.dtype.type(FASTEST)
-    for p in range(x.shape[0]):
-        for c in range(3):
+    if diverged.shape[0] == 1:
+        diverged[0] |= not (_all_within(v.reshape(v.size), limit) and _all_within(x.reshape(x.size), x.dtype.type(np.inf)))
+        return
+    for c in range(3):
+        for p in range(x.shape[1]):
             for l in range(x.shape[2]):
-                fine = abs(v[p, c, l]) < limit and abs(x[p, c, l]) < np.inf
+                fine = abs(v[c, p, l]) < limit and abs(x[c, p, l]) < np.inf
                 diverged[l] |= not fine
+
+
+@kernel
+def _all_within(values, limit):
+    """Whether all are smaller than ``limit``, whatever their sign; what is not a number is not."""
+    beyond = 0
+    for e in range(values.shape[0]):
+        beyond |= not abs(values[e]) < limit
+    return beyond == 0
 
 
 def oscillators(

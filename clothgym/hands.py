@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym._jit import apart, kernel, run_spans, specialize
-from clothgym.bending import BEND_SCRATCH, Bending, add_bend_forces
+from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.collisions import DESK, ROWS, Solids, keep_out, stop_at_solids
+from clothgym.elements import Elastic, Weave, room_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
-from clothgym.state import Elements, Fabric, Layout, State, SurfaceArrays
+from clothgym.grid_forces import kernels_of
+from clothgym.state import Fabric, Layout, State
 
 # columns of what a kernel must know of each hand
 SPEED, FINGER_STEP, REACH2, SLIP2 = 0, 1, 2, 3
@@ -122,13 +124,13 @@ class Hands:
     def begin(self, block: NDArray, lane: NDArray, particles: NDArray) -> None:
         """Put hands back: anchors hold their particles where these are, grippers are open and at home.
 
-        particles: positions of environments' particles [m], (particles, 3) or (len(block), particles, 3).
+        particles: positions of environments' particles [m], (len(block), particles, 3).
         """
         count = len(self.anchors)
         self.holder[block, :, lane] = FREE
         self.holder[block[:, None], self.members, lane[:, None]] = self.member_of
         for array in (self.x, self.targets):
-            array[block, :count, :, lane] = particles[..., self.anchors, :]
+            array[block, :count, :, lane] = particles[:, self.anchors]
         self.blocked[block, :, lane] = False
         self.place(block, lane, self.homes)
         self.opening[block, count:, lane] = self.wanted[block, count:, lane] = 1
@@ -147,7 +149,7 @@ class Hands:
         for k, first in enumerate(self.anchors):
             b, l = block[anchor == k], lane[anchor == k]
             loose = self.holder[b, first, l] == FREE
-            self.x[b[loose], k, :, l[loose]] = self.targets[b[loose], k, :, l[loose]] = x[b[loose], first, :, l[loose]]
+            self.x[b[loose], k, :, l[loose]] = self.targets[b[loose], k, :, l[loose]] = x[b[loose], :, first, l[loose]]
             for particle in self.members[self.member_of == k]:
                 free = self.holder[b, particle, l] == FREE
                 self.holder[b[free], particle, l[free]] = k
@@ -187,17 +189,16 @@ class Hands:
         x: NDArray,
         v: NDArray,
         free_w: NDArray,
-        elements: Elements,
+        weave: Weave,
         bending: Bending,
-        surface: SurfaceArrays,
         fabric: Fabric,
         threads: int,
     ) -> NDArray:
         """Force of the cloth on each hand [N], (blocks, hands, 3, lanes)."""
-        out, add = np.empty_like(self.x), _pulls_with(bending)
+        out, add = np.empty_like(self.x), _pulls_with(bending, self.layout.by_particle)
 
         def work(first: int, last: int) -> None:
-            add(first, last, x, v, free_w, elements, surface, fabric, self.holder, out)
+            add(first, last, x, v, free_w, weave, fabric, self.holder, out)
 
         run_spans(work, self.layout.blocks, threads)
         return out
@@ -303,7 +304,7 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
             p = anchors[k]
             for c in range(3):
                 for l in range(lanes):
-                    hand[k, c, l] = x[p, c, l] if holder[p, l] == k else hand[k, c, l]
+                    hand[k, c, l] = x[c, p, l] if holder[p, l] == k else hand[k, c, l]
         else:
             step = limits[k, FINGER_STEP]
             for l in range(lanes):
@@ -311,13 +312,13 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
                 now = min(max(wanted[k, l], before - step), before + step)
                 opening[k, l] = now
                 if now > zero and before <= zero:
-                    for p in range(x.shape[0]):
+                    for p in range(x.shape[1]):
                         if holder[p, l] == k:
                             holder[p, l] = FREE
                             w[p, l] = free_w[p, l]
                 elif now <= zero and before > zero:
-                    for p in range(x.shape[0]):
-                        dx, dy, dz = x[p, 0, l] - hand[k, 0, l], x[p, 1, l] - hand[k, 1, l], x[p, 2, l] - hand[k, 2, l]
+                    for p in range(x.shape[1]):
+                        dx, dy, dz = x[0, p, l] - hand[k, 0, l], x[1, p, l] - hand[k, 1, l], x[2, p, l] - hand[k, 2, l]
                         near = dx * dx + dy * dy + dz * dz <= limits[k, REACH2]
                         if near and holder[p, l] == FREE:
                             holder[p, l] = k
@@ -330,11 +331,11 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
         for c in range(3):
             for l in range(lanes):
                 hand[k, c, l] += move[c, l] * time_step
-        for p in range(x.shape[0]):
+        for p in range(x.shape[1]):
             for l in range(lanes):
                 if holder[p, l] == k:
                     for c in range(3):
-                        v[p, c, l] = move[c, l]
+                        v[c, p, l] = move[c, l]
 
 
 @kernel
@@ -344,7 +345,7 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
     Where nothing is in its way that is its target.  (In ``steer`` it would be compiled once more with each caller.)
     """
     one = x.dtype.type(1)
-    point, rows, desk = np.empty((1, 3, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
+    point, rows, desk = np.empty((3, 1, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
     tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
     for b in range(first, last):
         for k in range(hand.shape[1]):
@@ -352,7 +353,7 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
                 held = k < anchors.shape[0] and holder[b, anchors[k], l] == k
                 length2 = one - one
                 for c in range(3):
-                    tip[c] = x[b, anchors[k], c, l] if held else hand[b, k, c, l]
+                    tip[c] = x[b, c, anchors[k], l] if held else hand[b, k, c, l]
                     way[c] = targets[b, k, c, l] - tip[c]
                     length2 += way[c] * way[c]
                     allowed[b, k, c, l] = targets[b, k, c, l]
@@ -360,15 +361,15 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
                 for c in range(3):
                     way[c] *= slow
                 changed = stop_at_solids(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
-                for p in range(x.shape[1]):
+                for p in range(x.shape[2]):
                     if holder[b, p, l] == k:
                         for c in range(3):
-                            tip[c] = x[b, p, c, l]
+                            tip[c] = x[b, c, p, l]
                         changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
                 blocked[b, k, l] = changed
                 if changed:
                     for c in range(3):
-                        allowed[b, k, c, l] = (x[b, anchors[k], c, l] if held else hand[b, k, c, l]) + way[c]
+                        allowed[b, k, c, l] = (x[b, c, anchors[k], l] if held else hand[b, k, c, l]) + way[c]
 
 
 @kernel
@@ -377,27 +378,28 @@ def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, h
         steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
 
 
-def add_pulls(first, last, x, v, free_w, elements, surface, fabric, holder, out):
+def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):
     """Force of the cloth on each hand [N], (blocks, hands, 3, lanes): elements, weight and air of the particles that it holds."""
     stiffness, rigidity, damping_time, _, resistance, gravity, wind = fabric
+    f, scratch = np.empty(x.shape[1:], x.dtype), room_for_forces(x[first], weave.offset)
     for b in range(first, last):
-        f = np.zeros(x.shape[1:], x.dtype)
-        scratch = np.empty((BEND_SCRATCH, 3, x.shape[3]), x.dtype)
-        add_spring_forces(x[b], v[b], f, elements.springs, stiffness[b], damping_time[b], scratch[0])
-        add_bend_forces(x[b], v[b], f, elements.bends, rigidity[b], damping_time[b], scratch)
-        add_air_forces(x[b], v[b], f, surface, resistance[b], wind[b], scratch[0])
+        f[:] = 0
+        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
+        add_spring_forces(x[b], v[b], f, weave.elements, elastic, scratch)
+        add_bend_forces(x[b], v[b], f, weave.elements, elastic, scratch)
+        add_air_forces(x[b], v[b], f, weave.air, resistance[b], wind[b], scratch)
         out[b] = 0
-        for p in range(x.shape[1]):
+        for p in range(x.shape[2]):
             for l in range(x.shape[3]):
                 k = holder[b, p, l]
                 if k >= 0:
                     for c in range(3):
-                        out[b, k, c, l] += f[p, c, l] + gravity[b, c, l] / free_w[b, p, l]
+                        out[b, k, c, l] += f[c, p, l] + gravity[b, c, l] / free_w[b, p, l]
 
 
 @cache
-def _pulls_with(bending: Bending) -> Any:
-    return specialize(add_pulls, f"add_pulls_{bending.name}", add_bend_forces=bending.kernels["add_bend_forces"])
+def _pulls_with(bending: Bending, by_particle: bool) -> Any:
+    return specialize(add_pulls, f"add_pulls_{bending.name}_{by_particle}", **kernels_of(bending, by_particle))
 
 
 @kernel
@@ -419,7 +421,7 @@ def settle_lag(first, last, lag, behind, holder, anchors, reach2, w, free_w):
     """Before the hands move: an anchor goes on from where its particle is, and so owes nothing for it; what has come out of the
     reach of a gripper's fingers has slipped.
 
-    lag: (blocks, particles, 3, lanes).  behind: (blocks, lanes).  holder: (blocks, particles, lanes).  anchors: their particles.
+    lag: (blocks, 3, particles, lanes).  behind: (blocks, lanes).  holder: (blocks, particles, lanes).  anchors: their particles.
     reach2: squares of what the hands reach [m^2], (hands,).
     """
     for b in range(first, last):
@@ -429,15 +431,15 @@ def settle_lag(first, last, lag, behind, holder, anchors, reach2, w, free_w):
             own = np.zeros((anchors.shape[0], 3), lag.dtype)
             for k in range(anchors.shape[0]):
                 for c in range(3):
-                    own[k, c] = lag[b, anchors[k], c, l]
+                    own[k, c] = lag[b, c, anchors[k], l]
             for p in range(holder.shape[1]):
                 k = holder[b, p, l]
                 if k < 0:
                     continue
                 if k < anchors.shape[0]:
                     for c in range(3):
-                        lag[b, p, c, l] -= own[k, c]
-                elif lag[b, p, 0, l] ** 2 + lag[b, p, 1, l] ** 2 + lag[b, p, 2, l] ** 2 > reach2[k]:
+                        lag[b, c, p, l] -= own[k, c]
+                elif lag[b, 0, p, l] ** 2 + lag[b, 1, p, l] ** 2 + lag[b, 2, p, l] ** 2 > reach2[k]:
                     holder[b, p, l] = FREE
                     w[b, p, l] = free_w[b, p, l]
-                    lag[b, p, 0, l] = lag[b, p, 1, l] = lag[b, p, 2, l] = 0
+                    lag[b, 0, p, l] = lag[b, 1, p, l] = lag[b, 2, p, l] = 0

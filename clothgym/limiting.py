@@ -52,7 +52,7 @@ class Limiting(NamedTuple):
 def limit_strain(x, v, w, springs, limit, report):
     """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
 
-    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes).  report: rows BEFORE, AFTER and USED, (3, lanes): the first
+    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes).  report: rows BEFORE, AFTER and USED, (3, lanes): the first
     and the last keep the largest of the control step.
     """
     lanes = x.shape[2]
@@ -89,10 +89,10 @@ def _largest_strain(x, springs, largest):
     for s in range(ends.shape[0]):
         if kind[s] > SHEAR:
             continue
-        xi, xj = x[ends[s, 0]], x[ends[s, 1]]
+        i, j = ends[s, 0], ends[s, 1]
         inverse = one / (rest_length[s] * rest_length[s])
         for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            dx, dy, dz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
             largest[l] = max(largest[l], (dx * dx + dy * dy + dz * dz) * inverse)
     for l in range(x.shape[2]):
         largest[l] = np.sqrt(largest[l]) - one
@@ -107,10 +107,10 @@ def _sweep(x, v, w, springs, limit, enough, largest):
         if kind[s] > SHEAR:
             continue
         i, j = ends[s, 0], ends[s, 1]
-        xi, xj, vi, vj, wi, wj = x[i], x[j], v[i], v[j], w[i], w[j]
+        wi, wj = w[i], w[j]
         longest = (one + limit) * rest_length[s]
         for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+            dx, dy, dz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
             mobile = wi[l] + wj[l]
             if largest[l] > enough and length >= longest and mobile > zero:
@@ -118,20 +118,20 @@ def _sweep(x, v, w, springs, limit, enough, largest):
                 excess = length - longest
                 own = half if wi[l] > zero and wj[l] > zero else (one if wi[l] > zero else zero)
                 first, second = own * excess, (one - own) * excess
-                xi[0, l] += first * nx
-                xi[1, l] += first * ny
-                xi[2, l] += first * nz
-                xj[0, l] -= second * nx
-                xj[1, l] -= second * ny
-                xj[2, l] -= second * nz
-                parting = (vj[0, l] - vi[0, l]) * nx + (vj[1, l] - vi[1, l]) * ny + (vj[2, l] - vi[2, l]) * nz
+                x[0, i, l] += first * nx
+                x[1, i, l] += first * ny
+                x[2, i, l] += first * nz
+                x[0, j, l] -= second * nx
+                x[1, j, l] -= second * ny
+                x[2, j, l] -= second * nz
+                parting = (v[0, j, l] - v[0, i, l]) * nx + (v[1, j, l] - v[1, i, l]) * ny + (v[2, j, l] - v[2, i, l]) * nz
                 impulse = max(parting, zero) / mobile
-                vi[0, l] += wi[l] * impulse * nx
-                vi[1, l] += wi[l] * impulse * ny
-                vi[2, l] += wi[l] * impulse * nz
-                vj[0, l] -= wj[l] * impulse * nx
-                vj[1, l] -= wj[l] * impulse * ny
-                vj[2, l] -= wj[l] * impulse * nz
+                v[0, i, l] += wi[l] * impulse * nx
+                v[1, i, l] += wi[l] * impulse * ny
+                v[2, i, l] += wi[l] * impulse * nz
+                v[0, j, l] -= wj[l] * impulse * nx
+                v[1, j, l] -= wj[l] * impulse * ny
+                v[2, j, l] -= wj[l] * impulse * nz
 
 
 @kernel

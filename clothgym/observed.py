@@ -7,11 +7,12 @@ from numpy.typing import NDArray
 
 from clothgym.bending import Bending
 from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids, count_intersections
+from clothgym.elements import Elements, SurfaceArrays, Weave
 from clothgym.forces import Energy, energy, structural_strain
 from clothgym.hands import Hands
 from clothgym.limiting import Limiting
 from clothgym.mesh import ClothMesh
-from clothgym.state import Elements, Fabric, Layout, State, SurfaceArrays, View
+from clothgym.state import Fabric, Layout, State, View
 
 
 class Observed:
@@ -31,6 +32,7 @@ class Observed:
     _elements: Elements
     _exact_elements: Elements
     _surface: SurfaceArrays
+    _weave: Weave
     _fabric: Fabric
     _parameters: NDArray
     _diverged: NDArray
@@ -43,12 +45,12 @@ class Observed:
     @property
     def positions(self) -> NDArray:
         """[m], (num_envs, particles, 3); a fresh copy."""
-        return self.layout.to_public(self._x)
+        return self.layout.vectors_to_public(self._x)
 
     @property
     def velocities(self) -> NDArray:
         """[m/s], (num_envs, particles, 3); a fresh copy."""
-        return self.layout.to_public(self._v)
+        return self.layout.vectors_to_public(self._v)
 
     @property
     def view(self) -> View:
@@ -91,8 +93,7 @@ class Observed:
         return self.layout.to_public(self._pulls())
 
     def _pulls(self) -> NDArray:
-        sheet = self._elements, self.bending, self._surface, self._fabric
-        return self._hands.pulls(self._x, self._v, self._free_w, *sheet, self.threads)
+        return self._hands.pulls(self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads)
 
     def strain(self) -> NDArray:
         """Stretch over rest length, minus one, of the structural springs (threads or edges), (num_envs, those springs)."""

@@ -13,63 +13,80 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, guards, integrators, limiting
-from clothgym._jit import specialize
+from clothgym._jit import specialize, uncounted
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
 from clothgym.collisions import DESK, Collider, SelfCollision, Solids, room_for_touches
 from clothgym.collisions.response import KERNELS as CONTACT
 from clothgym.collisions.response import needed
 from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
-from clothgym.forces import Oscillators, add_air_forces
+from clothgym.elements import Elastic, digest_of, element_arrays, is_regular, surface_arrays, weave_of
+from clothgym.forces import Oscillators
+from clothgym.grid_forces import kernels_of
 from clothgym.guards import mark_diverged
 from clothgym.hands import FREE, Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
-from clothgym.integrators.base import Preparation
+from clothgym.integrators.base import Preparation, room_for_work
 from clothgym.limiting import checked_limit
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.observed import Observed
 from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
-from clothgym.state import Elastic, Fabric, Layout, State, at_rest, check_fits, digest_of, element_arrays, surface_arrays
+from clothgym.state import Fabric, Layout, State, at_rest, check_fits
 
 GRAVITY = 9.81
 SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
 
 
+def advance_one(
+    x, v, w, weave, elastic, drag_rate, resistance, gravity, wind, shapes, colliders, sheet, block, h, carried, substeps, air_every,
+    look_every, options, plan, push, work, touches, desk, limit, limited,
+):  # fmt: skip
+    """All substeps of one block."""
+    for step in range(substeps):
+        if air_every > 0 and step % air_every == 0:
+            push[:] = 0
+            add_air_forces(x, v, push, weave.air, resistance, wind, work.scratch)  # noqa: F821
+        substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)  # noqa: F821
+        restrain(x, v, w, weave.springs, limit, limited)  # noqa: F821
+        press(x, v, w, sheet, block, step, h, carried)  # noqa: F821
+        look = step % look_every == 0
+        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, touches, desk)  # noqa: F821
+        keep_apart(x, v, w, sheet, block, h, carried)  # noqa: F821
+    remeasure(x, weave.springs, limited)  # noqa: F821
+
+
 def advance(
-    first, last, x, v, w, elements, surface, fabric, shapes, colliders, sheet, h, carried, substeps, air_every, look_every, options,
-    plan, rows, limit, limited, diverged,
+    first, last, x, v, w, weave, fabric, shapes, colliders, sheet, h, carried, substeps, air_every, look_every, options, plan, room,
+    limit, limited, diverged,
 ):  # fmt: skip
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
+    work, push = room_for_work(x[first], weave.offset, room), np.zeros(x.shape[1:], x.dtype)
+    touches = room_for_touches(x[first], weave.triangles, shapes)
+    desk = np.empty((DESK, x.shape[3]), x.dtype)
     for b in range(first, last):
-        work = np.empty((rows, 3, x.shape[3]), x.dtype)
-        push = np.zeros(x.shape[1:], x.dtype)
-        touches = room_for_touches(x[b], surface.triangles, shapes)
-        desk = np.empty((DESK, x.shape[3]), x.dtype)
-        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
+        push[:] = 0
         limited[b] = 0
-        for step in range(substeps):
-            if air_every > 0 and step % air_every == 0:
-                push[:] = 0
-                add_air_forces(x[b], v[b], push, surface, resistance[b], wind[b], work[-1])
-            substep(x[b], v[b], w[b], elements, elastic, drag_rate[b], gravity[b], push, h, options, plan, work)  # noqa: F821
-            restrain(x[b], v[b], w[b], elements.springs, limit, limited[b])  # noqa: F821
-            press(x[b], v[b], w[b], sheet, b, step, h, carried)  # noqa: F821
-            look = step % look_every == 0
-            resolve(x[b], v[b], w[b], surface.triangles, shapes, colliders[b], h, carried, look, touches, desk)  # noqa: F821
-            keep_apart(x[b], v[b], w[b], sheet, b, h, carried)  # noqa: F821
-        remeasure(x[b], elements.springs, limited[b])  # noqa: F821
+        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
+        advance_block(  # noqa: F821
+            x[b], v[b], w[b], weave, elastic, drag_rate[b], resistance[b], gravity[b], wind[b], shapes, colliders[b], sheet, b, h,
+            carried, substeps, air_every, look_every, options, plan, push, work, touches, desk, limit, limited[b],
+        )  # fmt: skip
         mark_diverged(x[b], v[b], diverged[b])
 
 
 @cache
-def _compiled(substep: Any, name: str, model: Bending, limits: bool, collides: bool, contact: str) -> Any:
-    """The main loop around an integrator's substep, in which the model's kernels bend."""
-    bound = specialize(getattr(substep, "py_func", substep), f"{name}_{model.name}", apart=True, **model.kernels)
+def _compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str) -> Any:
+    """The main loop around an integrator's substep, in which the forces are those of the model and of the layout."""
+    forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
+    bound = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **forces)
     parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | CONTACT[contact]
-    return specialize(advance, f"advance_{name}_{model.name}_{limits}_{collides}_{contact}", substep=bound, **parts)
+    parts |= {"add_air_forces": forces["add_air_forces"], "substep": bound}
+    which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
+    block = specialize(uncounted(advance_one), f"advance_one_{which}", apart=True, **parts)
+    return specialize(advance, f"advance_{which}", advance_block=block)
 
 
 class Simulation(Observed):
@@ -146,7 +163,9 @@ class Simulation(Observed):
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
-        self.layout = Layout.choose(self.num_envs, self.threads)
+        # where the springs' order does not matter, the particles of a grid lie side by side
+        by_particle = is_regular(mesh) and self.integrator.any_order
+        self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
@@ -154,13 +173,14 @@ class Simulation(Observed):
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self._barriers = self._solids if contact == "sheet" else Solids(self.layout, (), self.time_step, self.dtype)
         self.colliders = self._solids.colliders
-        self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.springs_by_particle)
-        self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, by_particle=False)
+        self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.any_order)
+        self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, any_order=False)
         self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
+        self._weave = weave_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
         touched = needed(contact, self._solids.shapes.kinds)
-        parts = self.bending, strain_limit is not None, self._contact.options is not None, touched
+        parts = self.bending, by_particle, strain_limit is not None, self._contact.options is not None, touched
         self._advance = _compiled(self.integrator.substep, self.integrator.name, *parts)
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -195,7 +215,7 @@ class Simulation(Observed):
         h = self.dtype.type(self.time_step / self.substeps)
         carried = self.dtype.type(h * self.integrator.carried)
         self._prepare()
-        rows = self.integrator.work_rows(self.mesh.num_particles, *(len(part.weight) for part in self._elements))
+        room = self.integrator.room(len(self._elements.springs.weight), len(self._elements.bends.weight))
         options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
         look_every = max(1, int(SURFACE_INTERVAL / h))
         air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
@@ -210,9 +230,9 @@ class Simulation(Observed):
             if held is not None:
                 self._contact.forgive(self._hands.holder[blocks] != held, blocks)
             self._advance(
-                first, last, self._x, self._v, self._w, self._elements, self._surface, self._fabric,
+                first, last, self._x, self._v, self._w, self._weave, self._fabric,
                 self._solids.shapes, self._solids.rows, self._contact.sheet, h, carried, self.substeps, air_every, look_every,
-                options, self._plan, rows, limit, self._limited, self._diverged,
+                options, self._plan, room, limit, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
@@ -300,10 +320,10 @@ class Simulation(Observed):
         if positions is not None:
             self._contact.check(x, env)
         block, lane = self.layout.place(env)
-        self._x[block, :, :, lane] = np.broadcast_to(x, shape)
-        self._v[block, :, :, lane] = np.broadcast_to(v, shape)
+        self._x[block, :, :, lane] = np.swapaxes(np.broadcast_to(x, shape), 1, 2)
+        self._v[block, :, :, lane] = np.swapaxes(np.broadcast_to(v, shape), 1, 2)
         self._solids.begin(block, lane)
-        self._hands.begin(block, lane, self._x[block, :, :, lane])
+        self._hands.begin(block, lane, np.broadcast_to(x, shape))
         self._steps[env] = 0
         self._diverged[block, lane] = False
         self._limited[block, :, lane] = 0
@@ -387,8 +407,8 @@ class Simulation(Observed):
     def _go_on(self, state: State) -> None:
         """Take over what a state holds."""
         blocks, dtype = self.layout.to_blocks, self.dtype
-        self._x = blocks(state.positions, dtype)
-        self._v = blocks(state.velocities, dtype)
+        self._x = self.layout.vectors_to_blocks(state.positions, dtype)
+        self._v = self.layout.vectors_to_blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
         self._hands.restore(state)
         self._solids.restore(state)

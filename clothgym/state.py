@@ -1,13 +1,16 @@
 """Floor 2: how a batch lies in memory, and all that is needed to continue it bit for bit.
 
-Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see blocks of lanes with the environment
-last, ``(block, particle, component, lane)``: the inner loop of every kernel runs over lanes, with the spring's indices and
-rest length shared by all of them, so that nothing is gathered and any integrator vectorises.
+Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see ``(block, component, particle, lane)``, and what
+lies side by side is what they do at once.
+
+For a grid under a method in which the order of the springs does not matter, that is the sheet's own particles: a block is one
+environment, of one lane, and the springs of one kind are one loop with a constant offset (see ``grid_forces``).  One environment
+then costs no more than each of many.  For triangle meshes and Gauss-Seidel methods it is the environments: a block has many lanes,
+which share a spring's indices and rest length, so that nothing is gathered.
 """
 
 from __future__ import annotations
 
-import hashlib
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,55 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices
-from clothgym.mesh import NUM_KINDS, SHEAR, ClothMesh
+from clothgym.elements import SpringArrays
+from clothgym.mesh import NUM_KINDS, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
 ALIKE = {"f": "fiu", "i": "iu", "u": "iu", "b": "b"}  # kinds of numbers that a state may hold, by the kind that it keeps
 VECTOR = 16  # float32 lanes of the widest vector unit in use; blocks are padded to a multiple of it
-
-
-class SpringArrays(NamedTuple):
-    """The mesh's springs in the kernel's dtype, shared by all lanes (see ``mesh.Springs``)."""
-
-    particles: NDArray
-    rest_length: NDArray
-    kind: NDArray
-    weight: NDArray
-
-
-class BendArrays(NamedTuple):
-    """The mesh's hinges in the kernel's dtype, shared by all lanes (see ``mesh.Hinges``); none where skip springs bend instead.
-
-    curves: coefficients q, (hinges, 4), with which the quadratic model's energy is ``B/2 |sum_i q_i x_i|^2``.
-    """
-
-    particles: NDArray
-    weight: NDArray
-    rest_angle: NDArray
-    curves: NDArray
-
-
-class Elements(NamedTuple):
-    """All that holds a sheet together."""
-
-    springs: SpringArrays
-    bends: BendArrays
-
-
-class Elastic(NamedTuple):
-    """What the elements' forces scale with, by lane; a part of ``Fabric``."""
-
-    stiffness: NDArray
-    rigidity: NDArray
-    damping_time: NDArray
-
-
-class SurfaceArrays(NamedTuple):
-    """The mesh's triangles, (triangles, 3), and the shares of each that its corners stand for, (triangles, 3)."""
-
-    triangles: NDArray
-    shares: NDArray
 
 
 class Fabric(NamedTuple):
@@ -87,7 +48,7 @@ class Fabric(NamedTuple):
 
 
 class View(NamedTuple):
-    """The live memory of a simulation, for kernels that read it: see the module for its layout."""
+    """The live memory of a simulation, for kernels that read it, (block, 3, particles, lane): see the module."""
 
     x: NDArray
     v: NDArray
@@ -95,24 +56,30 @@ class View(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Which block and lane an environment has.  Lanes beyond ``num_envs`` are padding; they repeat the last environment."""
+    """Which block and lane an environment has.  Lanes beyond ``num_envs`` are padding; they repeat the last environment.
+
+    by_particle: whether one sheet's particles lie side by side; then a block is one environment.
+    """
 
     num_envs: int
     blocks: int
     lanes: int
+    by_particle: bool
 
     @staticmethod
-    def choose(num_envs: int, threads: int) -> Layout:
-        """As few and as wide blocks as give every thread the same number of them."""
+    def choose(num_envs: int, threads: int, by_particle: bool) -> Layout:
+        """One lane a block where particles lie side by side; else as few and as wide blocks as give every thread the same number."""
+        if by_particle:
+            return Layout(num_envs, num_envs, 1, True)
         blocks = min(-(-num_envs // VECTOR), threads * -(-num_envs // (threads * WIDEST_BLOCK)))
         lanes = -(-num_envs // blocks)
         if lanes >= VECTOR:
             lanes = -(-lanes // VECTOR) * VECTOR
-        return Layout(num_envs, -(-num_envs // lanes), lanes)
+        return Layout(num_envs, -(-num_envs // lanes), lanes, False)
 
     def to_blocks(self, public: NDArray, dtype: NDArray | np.dtype) -> NDArray:
         """(num_envs, ...) to a new contiguous (blocks, ..., lanes)."""
-        if self.num_envs == 1:
+        if self.lanes == 1:
             return np.array(public[..., None], dtype=dtype, order="C")
         spare = self.blocks * self.lanes - self.num_envs
         padded = np.concatenate([public, np.repeat(public[-1:], spare, axis=0)]) if spare else public
@@ -121,10 +88,20 @@ class Layout(NamedTuple):
 
     def to_public(self, blocks: NDArray) -> NDArray:
         """(blocks, ..., lanes) to a new contiguous (num_envs, ...)."""
-        if self.num_envs == 1:  # an axis to drop, none to move: the single environment asks often
+        if self.lanes == 1:  # an axis to drop, none to move
             return blocks[..., 0].copy()
         moved = np.moveaxis(blocks, -1, 1)
         return moved.reshape(self.blocks * self.lanes, *moved.shape[2:])[: self.num_envs].copy()
+
+    def vectors_to_blocks(self, public: NDArray, dtype: NDArray | np.dtype) -> NDArray:
+        """Vectors of particles, (num_envs, particles, 3), to a new contiguous (blocks, 3, particles, lanes)."""
+        return self.to_blocks(np.swapaxes(public, 1, 2), dtype)
+
+    def vectors_to_public(self, blocks: NDArray) -> NDArray:
+        """(blocks, 3, particles, lanes) to a new contiguous (num_envs, particles, 3)."""
+        if self.lanes == 1:
+            return np.swapaxes(blocks[..., 0], 1, 2).copy()
+        return np.ascontiguousarray(np.swapaxes(self.to_public(blocks), 1, 2))
 
     def place(self, envs: NDArray) -> tuple[NDArray, NDArray]:
         """Block and lane of each environment."""
@@ -330,41 +307,3 @@ def at_rest(
         diverged=np.zeros(num_envs, bool),
         sheet=sheet,
     )
-
-
-def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, by_particle: bool) -> Elements:
-    """The mesh's elements as a kernel of this dtype wants them: those that bend are hinges, or springs if not ``hinged``.
-
-    Springs are sorted by colour, or by particle if ``by_particle``: where the order does not matter to the method, the latter is a
-    fifth faster on wide blocks, as a particle's rows are still in the first cache when its next spring comes.  Gauss-Seidel keeps
-    the colours, which have no preferred direction.
-    """
-    s, h = mesh.springs, mesh.hinges
-    order = np.lexsort((s.particles.max(axis=1), s.particles.min(axis=1))) if by_particle else np.arange(len(s.kind))
-    if hinged:
-        order = order[s.kind[order] <= SHEAR]
-    springs = SpringArrays(s.particles[order], s.rest_length[order].astype(dtype), s.kind[order], s.weight[order].astype(dtype))
-    used = slice(None) if hinged else slice(0)
-    curves = np.sqrt(h.weight)[used, None] * h.slopes[used]
-    bends = BendArrays(h.particles[used], h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype), curves.astype(dtype))
-    return Elements(springs, bends)
-
-
-def digest_of(mesh: ClothMesh, hinged: bool, contact: str) -> NDArray[np.uint64]:
-    """What tells one sheet, with what bends it and how it collides with itself, from another."""
-    digest = hashlib.sha256(bytes([hinged]) + contact.encode())
-    for array in (mesh.rest_positions, mesh.triangles, *mesh.springs, *mesh.hinges):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return np.frombuffer(digest.digest()[:8], np.uint64)[0].reshape(())
-
-
-def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
-    """The mesh's triangles as a kernel of this dtype wants them.
-
-    A corner's share of a triangle follows from the area that the particle stands for: on a grid, whose diagonals alternate,
-    thirds would give every second particle twice its neighbours' force.
-    """
-    triangles = mesh.triangles
-    around = np.bincount(triangles.ravel(), minlength=mesh.num_particles)
-    shares = mesh.area[triangles] / np.maximum(around, 1)[triangles]
-    return SurfaceArrays(triangles, (shares / shares.sum(axis=1, keepdims=True)).astype(dtype))

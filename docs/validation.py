@@ -170,7 +170,7 @@ def _stiffness(hanging: Simulation, load: float, links: int) -> float:
     hanging.set_state(state)
     view, h = hanging.view, hanging.time_step / hanging.substeps
     for _ in range(3000):
-        view.v[0, -1, 0, 0] += h * load * (1 + 3.0 * h)  # the substep's drag takes its share of the push as well
+        view.v[0, 0, -1, 0] += h * load * (1 + 3.0 * h)  # the substep's drag takes its share of the push as well
         hanging.step()
     return load * links / (hanging.positions[0, -1, 0] - links)
 

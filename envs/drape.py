@@ -207,7 +207,7 @@ class DrapeTask(Task):
 
     def _coverage(self, env: int) -> float:
         block, lane = divmod(int(env), self.simulation.layout.lanes)
-        sheet = self.simulation.view.x[block, :, :, lane].astype(np.float64)
+        sheet = self.simulation.view.x[block, :, :, lane].T.astype(np.float64)
         return covered_share(sheet, SHEET.triangles, self.targets[env].upper_surface(JUDGED_POINTS), COVERED_WITHIN)
 
     # --- expert and picture ---------------------------------------------------------------------------------------------

@@ -113,7 +113,7 @@ class DrapeGripperTask(DrapeTask):
 
     def _to_places(self, hands: NDArray) -> NDArray:
         """From each gripper to the particle that it is to take [m], (num_envs, grippers, 3)."""
-        return self.simulation.layout.to_public(self.simulation.view.x[:, self.places]) - hands
+        return self.simulation.layout.vectors_to_public(self.simulation.view.x[:, :, self.places]) - hands
 
     # --- how it is rewarded ---------------------------------------------------------------------------------------------
 

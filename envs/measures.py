@@ -1,6 +1,6 @@
 """What tasks measure on a batch of sheets: reductions as kernels, so that no figure depends on who else is in the batch.
 
-Kernels that begin with ``first, last`` work on blocks ``(block, particle, component, lane)``; loops over particles are outer,
+Kernels that begin with ``first, last`` work on blocks ``(block, component, particle, lane)``; loops over particles are outer,
 loops over lanes inner, and nothing is summed across lanes.
 """
 
@@ -36,19 +36,19 @@ def summarize(first, last, x, v, share, springs, structural, out):
         for c in range(SUMMARY):
             for l in range(lanes):
                 total[c, l] = zero
-        for p in range(x.shape[1]):
+        for p in range(x.shape[2]):
             a = share[p]
-            xp, vp = x[b, p], v[b, p]
             for c in range(3):
                 for l in range(lanes):
-                    total[CENTROID + c, l] += a * xp[c, l]
+                    total[CENTROID + c, l] += a * x[b, c, p, l]
             for l in range(lanes):
-                total[SPEED2, l] += a * (vp[0, l] * vp[0, l] + vp[1, l] * vp[1, l] + vp[2, l] * vp[2, l])
+                vx, vy, vz = v[b, 0, p, l], v[b, 1, p, l], v[b, 2, p, l]
+                total[SPEED2, l] += a * (vx * vx + vy * vy + vz * vz)
         for s in structural:
-            xi, xj = x[b, ends[s, 0]], x[b, ends[s, 1]]
+            i, j = ends[s, 0], ends[s, 1]
             scale = one / (rest_length[s] * rest_length[s])
             for l in range(lanes):
-                dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+                dx, dy, dz = x[b, 0, j, l] - x[b, 0, i, l], x[b, 1, j, l] - x[b, 1, i, l], x[b, 2, j, l] - x[b, 2, i, l]
                 stretch2 = (dx * dx + dy * dy + dz * dz) * scale
                 total[STRETCH2, l] = max(total[STRETCH2, l], stretch2)
         for l in range(lanes):
@@ -79,10 +79,10 @@ def stretch_quantile(first, last, x, springs, structural, share, out):
     for b in range(first, last):
         for k in range(structural.shape[0]):
             s = structural[k]
-            xi, xj, own = x[b, ends[s, 0]], x[b, ends[s, 1]], stretch[k]
+            i, j, own = ends[s, 0], ends[s, 1], stretch[k]
             scale = one / rest_length[s]
             for l in range(lanes):
-                dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
+                dx, dy, dz = x[b, 0, j, l] - x[b, 0, i, l], x[b, 1, j, l] - x[b, 1, i, l], x[b, 2, j, l] - x[b, 2, i, l]
                 own[l] = np.sqrt(dx * dx + dy * dy + dz * dz) * scale
         low = np.ones(lanes, x.dtype)
         step = half
@@ -109,7 +109,7 @@ def see_points(first, last, x, v, particles, origin, scale, out):
     for b in range(first, last):
         for k in range(count):
             for c in range(3):
-                xc, vc, here = x[b, particles[k], c], v[b, particles[k], c], origin[b, c]
+                xc, vc, here = x[b, c, particles[k]], v[b, c, particles[k]], origin[b, c]
                 for l in range(x.shape[3]):
                     out[b, 3 * k + c, l] = (xc[l] - here[l]) * scale
                 for l in range(x.shape[3]):
@@ -138,8 +138,8 @@ def soft_coverage(first, last, x, points, reach, out):
         for k in range(points.shape[1]):
             px, py, pz = points[b, k, 0], points[b, k, 1], points[b, k, 2]
             nearest[:] = x.dtype.type(1e9)
-            for p in range(x.shape[1]):
-                xx, xy, xz = x[b, p, 0], x[b, p, 1], x[b, p, 2]
+            for p in range(x.shape[2]):
+                xx, xy, xz = x[b, 0, p], x[b, 1, p], x[b, 2, p]
                 for l in range(lanes):
                     dx, dy, dz = xx[l] - px[l], xy[l] - py[l], xz[l] - pz[l]
                     nearest[l] = min(nearest[l], dx * dx + dy * dy + dz * dz)

@@ -110,7 +110,7 @@ class ReachTask(Task):
     def _corner(self) -> tuple[NDArray, NDArray]:
         """The free corner's vector to the goal [m] and velocity [m/s], (num_envs, 3) each."""
         view, public = self.simulation.view, self.simulation.layout.to_public
-        return self.episode["goal"] - public(view.x[:, FREE]), public(view.v[:, FREE]).astype(np.float64)
+        return self.episode["goal"] - public(view.x[:, :, FREE]), public(view.v[:, :, FREE]).astype(np.float64)
 
     def _nearer(self, away: NDArray) -> NDArray:
         """How much of the way is done, in [0, 1]."""

@@ -259,7 +259,7 @@ class StrainTask(Task):
     def expert_actions(self) -> NDArray:
         """As a rigid pair, gently, see ``carriers.careful``."""
         view, public = self.simulation.view, self.simulation.layout.to_public
-        velocity = np.stack([public(view.v[:, clip[0]]) for clip in CLIPS], axis=1).astype(np.float64)
+        velocity = np.stack([public(view.v[:, :, clip[0]]) for clip in CLIPS], axis=1).astype(np.float64)
         last = self.episode["next"] == WAYPOINTS - 1
         return self._as_actions(carriers.careful(*self._clips_and_places(), velocity, last, SIDE, self.physics.time_step))
 

@@ -22,7 +22,7 @@ def measured_over_nominal_stiffness(chain, q2, iterations, links=8):
     load = 0.01 * k
     for _ in range(round(60 / (h * drag)) + 100):
         # a push on the last particle; the substep's drag takes its share of it
-        simulation._v[0, -1, 0, 0] += h * load / m * (1 + h * drag)
+        simulation._v[0, 0, -1, 0] += h * load / m * (1 + h * drag)
         simulation.step()
     assert np.max(np.abs(simulation.velocities)) < 1e-7
     return load * links / (simulation.positions[0, -1, 0] - links) / k

@@ -21,13 +21,13 @@ TOUCHING = 1e-5  # [m]: nearer than this is at the surface
 def _room(x, collider, shapes, k, lane, spent, point, rows, desk):
     """Distance of a point from one lane's solid, without its thickness [m]; its normal is left in CONTACT + 1 and on.
 
-    spent: for how long the solid has moved [s].  point, rows, desk: scratch, (1, 3, 1), (ROWS, 1) and (DESK, 1).
+    spent: for how long the solid has moved [s].  point, rows, desk: scratch, (3, 1, 1), (ROWS, 1) and (DESK, 1).
     """
     for r in range(ROWS):
         rows[r, 0] = collider[r, lane]
     lay_out(rows, desk)
     for c in range(3):
-        point[0, c, 0] = x[c] - spent * rows[VELOCITY + c, 0]
+        point[c, 0, 0] = x[c] - spent * rows[VELOCITY + c, 0]
     to_axes(point, 0, desk, SPOT)
     measure(desk, SPOT, shapes, k, x.dtype.type(np.inf))
     normal_to_world(desk)

@@ -44,20 +44,20 @@ def confine(x, v, w, sheet, block, h):
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    left = np.empty((x.shape[0], lanes), np.bool_)
+    left = np.empty((x.shape[1], lanes), np.bool_)
     out, far = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
     if lanes == 1:
         out[0], far[0] = _mark(x, start, bounds, limits, samples, 0, left[:, 0])
     else:
         _leave(x, start, bounds, limits, samples, left, out, far)
-    beyond = np.empty(x.shape[0], np.bool_)
+    beyond = np.empty(x.shape[1], np.bool_)
     for l in range(memory.used[block]):
         # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
         if not out[l]:
             continue
         due = far[l]
         if not due and setting.strict:
-            for p in range(x.shape[0]):
+            for p in range(x.shape[1]):
                 beyond[p] = left[p, l]
             touched = np.empty(memory.tight[block, l], np.int32)
             number = _list_touched(memory.ties[block, l], beyond, touched)
@@ -68,11 +68,7 @@ def confine(x, v, w, sheet, block, h):
                 _, due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
             _renew(x, v, w, sheet, block, l, h, beyond)
-    for p in range(x.shape[0]):
-        for c in range(3):
-            xc, oc = x[p, c], old[p, c]
-            for l in range(lanes):
-                oc[l] = xc[l]
+    old[:] = x
 
 
 @kernel
@@ -85,14 +81,16 @@ def _leave(x, start, bounds, limits, samples, left, some, far):
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
     for s in range(samples.shape[0]):
-        xs, ss = x[samples[s]], start[samples[s]]
         for c in range(3):
+            xs, ss = x[c, samples[s]], start[c, samples[s]]
             for l in range(lanes):
-                mean[c, l] += (xs[c, l] - ss[c, l]) * share
-    for p in range(x.shape[0]):
-        xp, sp, bp, lp, out = x[p], start[p], bounds[p], limits[p], left[p]
+                mean[c, l] += (xs[l] - ss[l]) * share
+    for p in range(x.shape[1]):
+        bp, lp, out = bounds[p], limits[p], left[p]
         for l in range(lanes):
-            dx, dy, dz = xp[0, l] - sp[0, l] - mean[0, l], xp[1, l] - sp[1, l] - mean[1, l], xp[2, l] - sp[2, l] - mean[2, l]
+            dx = x[0, p, l] - start[0, p, l] - mean[0, l]
+            dy = x[1, p, l] - start[1, p, l] - mean[1, l]
+            dz = x[2, p, l] - start[2, p, l] - mean[2, l]
             square = dx * dx + dy * dy + dz * dz
             inside, allowed = square <= bp[l], square <= lp[l]
             out[l] = not inside
@@ -107,9 +105,9 @@ def _shift(x, start, samples, l):
     mx, my, mz = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
     for s in range(samples.shape[0]):
         p = samples[s]
-        mx += (x[p, 0, l] - start[p, 0, l]) * share
-        my += (x[p, 1, l] - start[p, 1, l]) * share
-        mz += (x[p, 2, l] - start[p, 2, l]) * share
+        mx += (x[0, p, l] - start[0, p, l]) * share
+        my += (x[1, p, l] - start[1, p, l]) * share
+        mz += (x[2, p, l] - start[2, p, l]) * share
     return mx, my, mz
 
 
@@ -118,8 +116,8 @@ def _mark(x, start, bounds, limits, samples, l, left):
     """The same of one lane; left: (particles,).  Without loops of one round."""
     mx, my, mz = _shift(x, start, samples, l)
     some, far = False, False
-    for p in range(x.shape[0]):
-        dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+    for p in range(x.shape[1]):
+        dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
         square = dx * dx + dy * dy + dz * dz
         inside, allowed = square <= bounds[p, l], square <= limits[p, l]
         left[p] = not inside
@@ -135,18 +133,18 @@ def _catch_up(x, w, lag, l, h):
     zero = x.dtype.type(0)
     left = zero
     most = x.dtype.type(REPAY) * h
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         if w[p, l] > zero:
-            lag[p, 0, l] = lag[p, 1, l] = lag[p, 2, l] = zero
+            lag[0, p, l] = lag[1, p, l] = lag[2, p, l] = zero
             continue
-        lx, ly, lz = lag[p, 0, l], lag[p, 1, l], lag[p, 2, l]
+        lx, ly, lz = lag[0, p, l], lag[1, p, l], lag[2, p, l]
         length = np.sqrt(lx * lx + ly * ly + lz * lz)
         if length > zero:
             share = min(most / length, x.dtype.type(1))
             for c in range(3):
-                way = share * lag[p, c, l]
-                x[p, c, l] += way
-                lag[p, c, l] -= way
+                way = share * lag[c, p, l]
+                x[c, p, l] += way
+                lag[c, p, l] -= way
             left = max(left, length - share * length)
     return left
 
@@ -159,7 +157,7 @@ def _renew(x, v, w, sheet, block, l, h, beyond):
     may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand holds does
     not go with the others: else a jam would carry the hands away.
     """
-    memory, particles = sheet.memory, x.shape[0]
+    memory, particles = sheet.memory, x.shape[1]
     place, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
     look_around(memory.old[block], v, w, sheet, block, l, h, place, limits, held)
     if sheet.setting.strict:
@@ -169,7 +167,7 @@ def _renew(x, v, w, sheet, block, l, h, beyond):
         for p in range(particles):
             together &= limits[p] > zero
             if held[p]:
-                dx, dy, dz = x[p, 0, l] - start[p, 0, l] - mx, x[p, 1, l] - start[p, 1, l] - my, x[p, 2, l] - start[p, 2, l] - mz
+                dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
                 together &= dx * dx + dy * dy + dz * dz <= limits[p]
         if not together:
             mx, my, mz = zero, zero, zero
@@ -193,9 +191,9 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
     """
     lag, report = memory.lag[block], memory.report[block, l]
     real = x.dtype.type
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         sx, sy, sz = real(start[p, 0]), real(start[p, 1]), real(start[p, 2])
-        dx, dy, dz = x[p, 0, l] - sx - mx, x[p, 1, l] - sy - my, x[p, 2, l] - sz - mz
+        dx, dy, dz = x[0, p, l] - sx - mx, x[1, p, l] - sy - my, x[2, p, l] - sz - mz
         square = dx * dx + dy * dy + dz * dz
         if square > limits[p]:
             keep = np.sqrt(limits[p] / square)
@@ -204,10 +202,10 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
                 # from the start, so that what may not move at all does not creep by rounding
                 goal = s + (m + keep * d)
                 if held[p]:
-                    lag[p, c, l] += x[p, c, l] - goal
+                    lag[c, p, l] += x[c, p, l] - goal
                 else:
-                    v[p, c, l] = m / h + keep * (v[p, c, l] - m / h)
-                x[p, c, l] = goal
+                    v[c, p, l] = m / h + keep * (v[c, p, l] - m / h)
+                x[c, p, l] = goal
 
 
 @inlined
@@ -237,7 +235,7 @@ def _is_close(x, ties, planes, t, l):
     low, high = np.inf, -np.inf
     for m in range(ties[t, NUMBER]):
         p = ties[t, VERTICES + m]
-        place = nx * x[p, 0, l] + ny * x[p, 1, l] + nz * x[p, 2, l]
+        place = nx * x[0, p, l] + ny * x[1, p, l] + nz * x[2, p, l]
         if m < own:
             low = min(low, place)
         else:
@@ -279,7 +277,7 @@ def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
         if _is_close(x, ties, planes, touched[c], l):
             ties[touched[c], GROUP] = JAMMED
             going = True
-    halved = np.zeros(x.shape[0], np.int64)
+    halved = np.zeros(x.shape[1], np.int64)
     while going:
         # in their order, round by round; once others are touched, the rest of the round looks at all
         going, spread, c, t = False, False, 0, -1
@@ -306,14 +304,14 @@ def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
                 beyond[p] = True
                 share = half if halved[p] <= HALVES else zero
                 for k in range(3):
-                    place = old[p, k, l]
+                    place = old[k, p, l]
                     if share > zero:  # what is not finite stays, too
-                        place += share * (x[p, k, l] - place)
+                        place += share * (x[k, p, l] - place)
                     if w[p, l] <= zero:
-                        lag[p, k, l] += x[p, k, l] - place
+                        lag[k, p, l] += x[k, p, l] - place
                     else:
-                        v[p, k, l] *= share
-                    x[p, k, l] = place
+                        v[k, p, l] *= share
+                    x[k, p, l] = place
         if spread:
             number = _list_touched(ties, beyond, touched)
     _note_lag(w, memory, block, l)
@@ -326,7 +324,7 @@ def _note_lag(w, memory, block, l):
     largest = lag.dtype.type(0)
     for p in range(w.shape[0]):
         if w[p, l] <= 0:
-            largest = max(largest, lag[p, 0, l] * lag[p, 0, l] + lag[p, 1, l] * lag[p, 1, l] + lag[p, 2, l] * lag[p, 2, l])
+            largest = max(largest, lag[0, p, l] * lag[0, p, l] + lag[1, p, l] * lag[1, p, l] + lag[2, p, l] * lag[2, p, l])
     memory.behind[block, l] = np.sqrt(largest)
     memory.report[block, l, LAG] = max(memory.report[block, l, LAG], np.float64(memory.behind[block, l]))
 
@@ -340,14 +338,14 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
     """
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
-    particles = x.shape[0]
+    particles = x.shape[1]
     room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
     _foresee(v, sheet, l, h, extra)
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
-            start[k, c, l] = x[k, c, l]
-            p[k, c] = x[k, c, l]
+            start[c, k, l] = x[c, k, l]
+            p[k, c] = x[c, k, l]
     report = memory.report[block, l]
     report[QUERIES] += 1
     before = memory.contacts[block, l]
@@ -378,9 +376,9 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
 def note_uncertain(x, report, used):
     """Note which of one block's sheets are too far from the origin to be certified; what is not finite has diverged."""
     farthest = np.zeros(x.shape[2], x.dtype)
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         for c in range(3):
-            xc = x[p, c]
+            xc = x[c, p]
             for l in range(x.shape[2]):
                 farthest[l] = max(farthest[l], abs(xc[l]))
     for l in range(used):
@@ -399,12 +397,12 @@ def _foresee(v, sheet, l, h, extra):
     mx, my, mz = 0.0, 0.0, 0.0
     for s in range(samples.shape[0]):
         p = samples[s]
-        mx, my, mz = mx + v[p, 0, l], my + v[p, 1, l], mz + v[p, 2, l]
+        mx, my, mz = mx + v[0, p, l], my + v[1, p, l], mz + v[2, p, l]
     share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, FORESEEN * far
-    for p in range(v.shape[0]):
-        dx, dy, dz = v[p, 0, l] - share * mx, v[p, 1, l] - share * my, v[p, 2, l] - share * mz
+    for p in range(v.shape[1]):
+        dx, dy, dz = v[0, p, l] - share * mx, v[1, p, l] - share * my, v[2, p, l] - share * mz
         extra[p] = dx * dx + dy * dy + dz * dz
-    for p in range(v.shape[0]):  # side by side: roots of many at once
+    for p in range(v.shape[1]):  # side by side: roots of many at once
         extra[p] = min(max(ahead * np.sqrt(extra[p]) - 0.5 * far, 0.0), most)
 
 

@@ -52,7 +52,7 @@ def may_touch_plane(x, p, collider):
     for l in range(x.shape[2]):
         height = x.dtype.type(0)
         for c in range(3):
-            height += (x[p, c, l] - collider[POINT + c, l]) * collider[AXES + 6 + c, l]
+            height += (x[c, p, l] - collider[POINT + c, l]) * collider[AXES + 6 + c, l]
         near |= height < collider[RADIUS, l]
     return near
 
@@ -62,9 +62,9 @@ def may_touch_solid(x, p, collider):
     """Whether particle ``p`` of any lane is inside another solid's bound."""
     near = False
     for l in range(x.shape[2]):
-        dx = x[p, 0, l] - collider[POINT, l]
-        dy = x[p, 1, l] - collider[POINT + 1, l]
-        dz = x[p, 2, l] - collider[POINT + 2, l]
+        dx = x[0, p, l] - collider[POINT, l]
+        dy = x[1, p, l] - collider[POINT + 1, l]
+        dz = x[2, p, l] - collider[POINT + 2, l]
         near |= dx * dx + dy * dy + dz * dz < collider[REACH2, l]
     return near
 
@@ -81,10 +81,10 @@ def lay_out(collider, desk):
 
 @inlined
 def to_axes(x, p, desk, at):
-    """Write particle ``p`` of x, in the world, (particles, 3, lanes), to three rows of the desk, in the solid's axes."""
+    """Write particle ``p`` of x, in the world, (3, particles, lanes), to three rows of the desk, in the solid's axes."""
     for c in range(3):
         for l in range(desk.shape[1]):
-            desk[at + c, l] = x[p, c, l] - desk[POINT + c, l]
+            desk[at + c, l] = x[c, p, l] - desk[POINT + c, l]
     for l in range(desk.shape[1]):
         dx, dy, dz = desk[at, l], desk[at + 1, l], desk[at + 2, l]
         desk[at, l] = dx * desk[AXES, l] + dy * desk[AXES + 1, l] + dz * desk[AXES + 2, l]

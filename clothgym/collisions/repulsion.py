@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import apart, disjoint, inlined, kernel
 from clothgym.collisions.proximity import NORMAL, SLOP, THICKNESS, TOUCHING
 
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
@@ -42,21 +42,29 @@ def press_again(x, v, w, sheet, block, carried):
         return
     # what changes no bit when it is added; two selects of x and v instead would keep the loop from being one of vectors
     nothing = -zero
-    for p in range(x.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            xc, vc, pc = x[p, c], v[p, c], memory.pressed[block, p, c]
-            for l in range(x.shape[2]):
-                pressed = pc[l] if (wp[l] > zero) & (pc[l] != zero) else nothing
-                xc[l] += carried * pressed
-                vc[l] += pressed
+    for c in range(3):
+        _press(
+            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried, nothing
+        )  # fmt: skip
+
+
+@disjoint
+def _press(x, v, w, pressed, carried, nothing):
+    """One component of what contacts press, by particle and lane."""
+    zero = x.dtype.type(0)
+    for e in range(x.shape[0]):
+        change = pressed[e] if (w[e] > zero) & (pressed[e] != zero) else nothing
+        x[e] += carried * change
+        v[e] += change
 
 
 @apart
 def repel(x, v, w, sheet, block, h, carried):
     """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
     memory, setting = sheet.memory, sheet.setting
-    place, motion, mobility = np.empty(x.shape[:2], x.dtype), np.empty(x.shape[:2], x.dtype), np.empty(x.shape[0], x.dtype)
+    particles_count = x.shape[1]
+    place, motion = np.empty((particles_count, 3), x.dtype), np.empty((particles_count, 3), x.dtype)
+    mobility = np.empty(particles_count, x.dtype)
     for l in range(memory.used[block]):
         count = memory.contacts[block, l]
         if count == 0:
@@ -70,8 +78,8 @@ def repel(x, v, w, sheet, block, h, carried):
         impulses, chosen, pressing = memory.impulses[block, l], memory.chosen[block, l], memory.pressing[block, l]
         pressed = memory.pressed[block, :, :, l]
         if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-            memory.choices[block, l] = _choose(x[:, :, l], v[:, :, l], particles, figures, impulses, chosen, count, h)
-            memory.pressers[block, l] = _list_particles(particles, chosen, memory.choices[block, l], pressing, x.shape[0])
+            memory.choices[block, l] = _choose(x[:, :, l].T, v[:, :, l].T, particles, figures, impulses, chosen, count, h)
+            memory.pressers[block, l] = _list_particles(particles, chosen, memory.choices[block, l], pressing, x.shape[1])
             memory.aged[block, l] = 0
             pressed[:] = 0
         choices, pressing = memory.choices[block, l], pressing[: memory.pressers[block, l]]
@@ -85,7 +93,7 @@ def repel(x, v, w, sheet, block, h, carried):
         for m in range(pressing.shape[0]):
             p = pressing[m]
             for c in range(3):
-                pressed[p, c] = motion[p, c]
+                pressed[c, p] = motion[p, c]
         memory.report[block, l, TOUCHING] = touching
         memory.waited[block, l] = 0
         memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
@@ -113,8 +121,8 @@ def _take(x, v, w, l, pressing, place, motion, mobility):
         p = pressing[m]
         mobility[p] = w[p, l]
         for c in range(3):
-            place[p, c] = x[p, c, l]
-            motion[p, c] = v[p, c, l]
+            place[p, c] = x[c, p, l]
+            motion[p, c] = v[c, p, l]
 
 
 @kernel
@@ -123,8 +131,8 @@ def _put_back(x, v, l, pressing, place, motion):
     for m in range(pressing.shape[0]):
         p = pressing[m]
         for c in range(3):
-            x[p, c, l] = place[p, c]
-            v[p, c, l] = motion[p, c]
+            x[c, p, l] = place[p, c]
+            v[c, p, l] = motion[p, c]
 
 
 @inlined

@@ -45,7 +45,7 @@ def _push_out(x, v, w, p, carried, desk):
     tiny = x.dtype.type(1e-12)
     for c in range(3):
         for l in range(x.shape[2]):
-            desk[MOTION + c, l] = v[p, c, l]
+            desk[MOTION + c, l] = v[c, p, l]
     for l in range(x.shape[2]):
         desk[YIELDING, l] = w[p, l]
     for l in range(x.shape[2]):
@@ -71,14 +71,14 @@ def _push_out(x, v, w, p, carried, desk):
         desk[MOTION + 2, l] = stopped * nz - lost * tz
     for c in range(3):
         for l in range(x.shape[2]):
-            x[p, c, l] += desk[SPOT + c, l]
+            x[c, p, l] += desk[SPOT + c, l]
         for l in range(x.shape[2]):
-            v[p, c, l] += desk[MOTION + c, l]
+            v[c, p, l] += desk[MOTION + c, l]
 
 
 def _resolve_solid(x, v, w, collider, shapes, k, carried, desk):
     """Resolve the contacts of one block's particles with the solid on the desk."""
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         if may_touch(x, p, collider):  # noqa: F821
             to_axes(x, p, desk, SPOT)
             measure_solid(desk, SPOT, shapes, k, x.dtype.type(0))  # noqa: F821
@@ -98,7 +98,7 @@ _resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_s
 def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
     """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
-    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
+    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
     ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the positions already [s];
     desk: scratch, (DESK, lanes).  The others are for ``resolve``.
     """
@@ -157,7 +157,7 @@ def signed_distances(first, last, x, shapes, colliders, out):
         desk = np.empty((DESK, x.shape[3]), x.dtype)
         for k in range(colliders.shape[1]):
             lay_out(colliders[b, k], desk)
-            for p in range(x.shape[1]):
+            for p in range(x.shape[2]):
                 measure_in_world(x[b], p, desk, shapes, k)
                 out[b, k, p] = desk[CONTACT]
 
@@ -173,9 +173,9 @@ def contacts(layout: Layout, x: NDArray, shapes: Shapes, colliders: NDArray) -> 
     """Those of a batch; x and colliders in blocks."""
     count = colliders.shape[1]
     if not count:
-        shape = (layout.num_envs, x.shape[1])
+        shape = (layout.num_envs, x.shape[2])
         return Contacts(np.full(shape, np.inf, x.dtype), np.full(shape, -1))
-    out = np.empty((layout.blocks, count, x.shape[1], layout.lanes), x.dtype)
+    out = np.empty((layout.blocks, count, x.shape[2], layout.lanes), x.dtype)
     signed_distances(0, layout.blocks, x, shapes, colliders, out)
     distances = layout.to_public(out)
     return Contacts(distances.min(axis=1), distances.argmin(axis=1))

@@ -222,16 +222,16 @@ class SelfCollision:
         """The arrays of ``State`` that are contact's; no more contacts than some environment has."""
         if self.options is None:
             return self.blank()
-        memory, public = self.sheet.memory, self.layout.to_public
+        memory, public, vectors = self.sheet.memory, self.layout.to_public, self.layout.vectors_to_public
         state = {
-            "contact_start": public(memory.start),
+            "contact_start": vectors(memory.start),
             "contact_bounds": public(memory.bounds),
             "contact_limits": public(memory.limits),
-            "contact_lag": public(memory.lag),
+            "contact_lag": vectors(memory.lag),
             "contact_count": public(memory.contacts),
             "contact_tight": public(memory.tight),
             "contact_looks": public(memory.looks),
-            "contact_pressed": public(memory.pressed),
+            "contact_pressed": vectors(memory.pressed),
             "contact_waited": public(memory.waited),
             "contact_span": public(memory.span),
         }
@@ -284,20 +284,21 @@ class SelfCollision:
         """Take over from a state, with positions x in blocks [m]."""
         if self.options is None:
             return
-        memory, blocks = self.sheet.memory, self.layout.to_blocks
+        memory, blocks, vectors = self.sheet.memory, self.layout.to_blocks, self.layout.vectors_to_blocks
         env = np.arange(self.layout.num_envs)
         block, lane = self.layout.place(env)
         self.begin(block, lane, x)
-        memory.lag[:] = blocks(state.contact_lag, self.dtype)
-        memory.behind[:] = np.sqrt((memory.lag**2).sum(axis=2)).max(axis=1)
+        memory.lag[:] = vectors(state.contact_lag, self.dtype)
+        memory.behind[:] = np.sqrt((memory.lag**2).sum(axis=1)).max(axis=1)
         due = np.any(state.contact_bounds < 0, axis=1).reshape(-1)
-        memory.start[block, :, :, lane] = np.where(due[:, None, None], self.layout.to_public(x), state.contact_start)
+        start = np.where(due[:, None, None], self.layout.vectors_to_public(x), state.contact_start)
+        memory.start[block, :, :, lane] = np.swapaxes(start, 1, 2)
         memory.bounds[:] = blocks(state.contact_bounds, self.dtype)
         memory.limits[:] = blocks(state.contact_limits, self.dtype)
         memory.contacts[block, lane] = state.contact_count
         memory.tight[block, lane] = state.contact_tight
         memory.looks[block, lane] = state.contact_looks
-        memory.pressed[:] = blocks(state.contact_pressed, self.dtype)
+        memory.pressed[:] = vectors(state.contact_pressed, self.dtype)
         memory.waited[block, lane] = state.contact_waited
         memory.span[block, lane] = state.contact_span
         for name in ROW_ARRAYS:
@@ -307,8 +308,8 @@ class SelfCollision:
     def forgive(self, who: NDArray, blocks: slice = slice(None)) -> None:
         """Take from particles, (blocks, particles, lanes), what they lag: one that has left a hand owes the next one nothing."""
         memory = self.sheet.memory
-        np.moveaxis(memory.lag[blocks], 2, 3)[who] = 0
-        memory.behind[blocks] = np.sqrt((memory.lag[blocks] ** 2).sum(axis=2)).max(axis=1)
+        np.moveaxis(memory.lag[blocks], 1, 3)[who] = 0
+        memory.behind[blocks] = np.sqrt((memory.lag[blocks] ** 2).sum(axis=1)).max(axis=1)
 
     def warn(self, steps: NDArray) -> None:
         """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""
@@ -340,11 +341,11 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
     shape, room = (layout.blocks, layout.lanes), ROOM * particles
     used = np.clip(layout.num_envs - layout.lanes * np.arange(layout.blocks), 0, layout.lanes)
     return Memory(
-        start=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        start=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         bounds=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
         limits=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
-        old=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
-        lag=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        old=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
+        lag=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         behind=np.zeros(shape, dtype),
         contacts=np.zeros(shape, np.int32),
         # contacts are written where they are needed only: an operating system gives no memory to what has never been touched
@@ -355,7 +356,7 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         planes=np.empty((*shape, TIGHT * particles, 4)),
         looks=np.zeros(shape, np.int32),
         impulses=np.zeros((*shape, room, 3), dtype),
-        pressed=np.zeros((layout.blocks, particles, 3, layout.lanes), dtype),
+        pressed=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         waited=np.zeros(shape, np.int32),
         span=np.zeros(shape, np.int32),
         aged=np.zeros(shape, np.int32),

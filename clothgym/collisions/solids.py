@@ -13,7 +13,8 @@ from clothgym.collisions.mesh_collider import MeshCollider
 from clothgym.collisions.penetration import deepest
 from clothgym.collisions.response import Contacts, contacts
 from clothgym.collisions.shapes import AFTER, POINT, ROWS, VELOCITY, Collider, check_index, check_replacement
-from clothgym.state import Layout, State, SurfaceArrays
+from clothgym.elements import SurfaceArrays
+from clothgym.state import Layout, State
 
 
 class Solids:

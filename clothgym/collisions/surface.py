@@ -44,7 +44,7 @@ from clothgym.collisions.distance import (
 )
 from clothgym.collisions.shapes import FRICTION, HALF, MESH, PLANE, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
 
-TOUCH = 13  # rows of a touch: weights, each three times; gap, from the solid's point along the normal; normal
+TOUCH = 7  # rows of a touch: weights; gap, from the solid's point along the normal; normal
 RELAXED = 0.05  # of the depth that the last substep's inward motion does not explain is taken back in a substep
 NONE = 1e9  # [m], the gap of a lane that does not touch
 MESH_ROUNDS, BOX_STEPS = 3, 8
@@ -65,11 +65,11 @@ def any_near(x, collider, desk):
         for l in range(x.shape[2]):
             desk[CORNERS + c, l] = none
             desk[SPOT + c, l] = -none
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         for c in range(3):
             for l in range(x.shape[2]):
-                desk[CORNERS + c, l] = min(desk[CORNERS + c, l], x[p, c, l])
-                desk[SPOT + c, l] = max(desk[SPOT + c, l], x[p, c, l])
+                desk[CORNERS + c, l] = min(desk[CORNERS + c, l], x[c, p, l])
+                desk[SPOT + c, l] = max(desk[SPOT + c, l], x[c, p, l])
     near = False
     for l in range(x.shape[2]):
         beyond = zero
@@ -316,12 +316,12 @@ def _push_out(h, carried, desk):
 
 
 @inlined
-def _move_corner(x, v, w, weight, desk):
+def _move_corner(x, v, w, p, weight, desk):
     for c in range(3):
         for l in range(desk.shape[1]):
-            x[c, l] += w[l] * weight[l] * desk[SPOT + c, l]
+            x[c, p, l] += w[p, l] * weight[l] * desk[SPOT + c, l]
         for l in range(desk.shape[1]):
-            v[c, l] += w[l] * weight[l] * desk[MOTION + c, l]
+            v[c, p, l] += w[p, l] * weight[l] * desk[MOTION + c, l]
 
 
 @inlined
@@ -361,7 +361,7 @@ def room_for_touches(x, triangles, shapes):
     for k in range(shapes.kinds.shape[0]):
         solids += shapes.kinds[k] != PLANE
     most = triangles.shape[0] * solids
-    rows, scratch = np.empty((most, TOUCH, x.shape[2]), x.dtype), np.empty(x.shape, x.dtype)
+    rows, scratch = np.empty((most, TOUCH, x.shape[2]), x.dtype), np.empty((x.shape[1], 3, x.shape[2]), x.dtype)
     return rows, np.empty((most, 2), np.int64), np.zeros(1, np.int64), scratch
 
 
@@ -369,13 +369,13 @@ def room_for_touches(x, triangles, shapes):
 def find_touches(x, triangles, shapes, k, touches, desk):
     """Find where one block's triangles touch the solid on the desk, which is no plane, or soon may.
 
-    x [m]: (particles, 3, lanes); touches: as ``room_for_touches`` made them; desk: (DESK, lanes).
+    x [m]: (3, particles, lanes); touches: as ``room_for_touches`` made them; desk: (DESK, lanes).
     """
     rows, which, count, local = touches
     for l in range(desk.shape[1]):
         half = min(desk[HALF, l], min(desk[HALF + 1, l], desk[HALF + 2, l])) + desk[RADIUS, l]
         desk[RADIUS, l] -= desk[THICKNESS, l] + desk.dtype.type(2 * SINKS) * half
-    for p in range(x.shape[0]):
+    for p in range(x.shape[1]):
         _place(x, p, desk, local[p])
     for t in range(triangles.shape[0]):
         for c in range(3):
@@ -391,12 +391,12 @@ def find_touches(x, triangles, shapes, k, touches, desk):
                 desk[CONTACT, l] -= nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
             normal_to_world(desk)
             touch = rows[count[0]]
-            for c in range(9):
+            for c in range(3):
                 for l in range(desk.shape[1]):
-                    touch[c, l] = desk[WEIGHTS + c // 3, l]
+                    touch[c, l] = desk[WEIGHTS + c, l]
             for c in range(4):
                 for l in range(desk.shape[1]):
-                    touch[9 + c, l] = desk[CONTACT + c, l]
+                    touch[3 + c, l] = desk[CONTACT + c, l]
             which[count[0], 0] = t
             which[count[0], 1] = k
             count[0] += 1
@@ -406,14 +406,10 @@ def find_touches(x, triangles, shapes, k, touches, desk):
 def press(x, v, w, triangles, colliders, touches, h, carried, desk):
     """Resolve the touches of one block.
 
-    x [m], v [m/s]: (particles, 3, lanes); w [1/kg]: (particles, lanes); h: the substep [s]; carried: how long the
+    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes); h: the substep [s]; carried: how long the
     velocity that friction takes has moved the positions already [s]; desk: (DESK, lanes).
     """
     rows, which, count, _ = touches
-    size = 3 * desk.shape[1]
-    spot, motion = desk[SPOT : SPOT + 3].reshape(size), desk[MOTION : MOTION + 3].reshape(size)
-    point = desk[POINT : POINT + 3].reshape(size)
-    flat_x, flat_v = x.reshape((x.shape[0], size)), v.reshape((x.shape[0], size))
     solid = -1
     for n in range(count[0]):
         if which[n, 1] != solid:
@@ -421,11 +417,11 @@ def press(x, v, w, triangles, colliders, touches, h, carried, desk):
             lay_out(colliders[solid], desk)
         i, j, m = triangles[which[n, 0], 0], triangles[which[n, 0], 1], triangles[which[n, 0], 2]
         touch = rows[n]
-        _fetch(touch[9:TOUCH], desk, CONTACT)
-        a, b, c = touch[0:3].reshape(size), touch[3:6].reshape(size), touch[6:9].reshape(size)
-        xi, xj, xm = flat_x[i], flat_x[j], flat_x[m]
-        for e in range(size):
-            spot[e] = a[e] * xi[e] + b[e] * xj[e] + c[e] * xm[e] - point[e]
+        _fetch(touch[3:TOUCH], desk, CONTACT)
+        a, b, c = touch[0], touch[1], touch[2]
+        for e in range(3):
+            for l in range(desk.shape[1]):
+                desk[SPOT + e, l] = a[l] * x[e, i, l] + b[l] * x[e, j, l] + c[l] * x[e, m, l] - desk[POINT + e, l]
         for l in range(desk.shape[1]):
             nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
             desk[CONTACT, l] += nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
@@ -433,12 +429,13 @@ def press(x, v, w, triangles, colliders, touches, h, carried, desk):
         for l in range(desk.shape[1]):
             touching |= desk[CONTACT, l] < 0
         if touching:
-            vi, vj, vm, wi, wj, wm = flat_v[i], flat_v[j], flat_v[m], w[i], w[j], w[m]
-            for e in range(size):
-                motion[e] = a[e] * vi[e] + b[e] * vj[e] + c[e] * vm[e]
+            wi, wj, wm = w[i], w[j], w[m]
+            for e in range(3):
+                for l in range(desk.shape[1]):
+                    desk[MOTION + e, l] = a[l] * v[e, i, l] + b[l] * v[e, j, l] + c[l] * v[e, m, l]
             for l in range(desk.shape[1]):
                 desk[YIELDING, l] = wi[l] * a[l] * a[l] + wj[l] * b[l] * b[l] + wm[l] * c[l] * c[l]
             _push_out(h, carried, desk)
             for corner in range(3):
                 p = triangles[which[n, 0], corner]
-                _move_corner(x[p], v[p], w[p], touch[3 * corner], desk)
+                _move_corner(x, v, w, p, touch[corner], desk)

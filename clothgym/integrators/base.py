@@ -5,15 +5,16 @@ To add one: write a file whose last function is its whole substep, a kernel with
     substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work)
 
 on one block of lanes, and describe it by an ``Integrator``.  The substep advances positions ``x`` [m] and velocities ``v``
-[m/s], (particles, 3, lanes), by ``h`` [s].
+[m/s], (3, particles, lanes), by ``h`` [s].
 
 * ``w``: inverse masses [1/kg], (particles, lanes); a particle with ``w = 0`` is held: it keeps its velocity, and moves with it.
-* ``elements``, ``elastic``: a ``state.Elements`` and a block's part of ``state.Elastic``.  Springs are at hand in ``forces``;
-  ``add_bend_forces``, ``add_bend_products`` and ``project_bends``, imported from ``bending``, become the chosen model's.
-* ``drag_rate`` [1/s], (lanes,), and ``gravity`` [m/s^2], (3, lanes).  ``push``: forces from outside [N], (particles, 3, lanes), of
+* ``elements``, ``elastic``: an ``elements.Elements`` and a block's part of ``elements.Elastic``.  ``add_spring_forces`` and
+  ``add_spring_products``, imported from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends``, imported from
+  ``bending``, become those of the chosen model, for lanes or for particles that lie side by side (``specialized``).
+* ``drag_rate`` [1/s], (lanes,), and ``gravity`` [m/s^2], (3, lanes).  ``push``: forces from outside [N], (3, particles, lanes), of
   the air for instance: slow against the springs, and not to be written to.
 * ``options``: the values of ``Integrator.options``, in that order.  ``plan``: what ``Integrator.prepare`` made.
-* ``work``: scratch, ``Integrator.work_rows`` times (3, lanes), whose content does not outlive the substep.
+* ``work``: a ``Work``, whose content does not outlive the substep.
 
 Contact is resolved after each substep, by the simulation, on the positions and velocities that the substep leaves.
 """
@@ -28,12 +29,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
-from clothgym.bending import BEND_SCRATCH
+from clothgym._jit import disjoint, kernel
+from clothgym.elements import Scratch, room_for_forces
 from clothgym.forces import Oscillators
 
 Figures = frozenset[str]
-SCRATCH = BEND_SCRATCH  # rows at the end of ``work``
+
+
+class Work(NamedTuple):
+    """What a substep may write to.
+
+    fields: arrays like positions, (fields, 3, particles, lanes).  of_springs, of_bends: multipliers, (springs, lanes) and (hinges, 3,
+    lanes), of methods that keep some.  scratch: for the forces of elements.
+    """
+
+    fields: NDArray
+    of_springs: NDArray
+    of_bends: NDArray
+    scratch: Scratch
 
 
 class Preparation(NamedTuple):
@@ -57,7 +70,7 @@ class Integrator:
             if there is none.
         surely_allowed: a substep [s] that is certainly no larger than that, found quickly.
         carried: share of the substep for which what is new in the velocity has already moved the positions, at a substep's end.
-        springs_by_particle: whether the result does not depend on the springs' order, so that the fastest one may be used.
+        any_order: whether the result does not depend on the springs' order, so that a grid's particles may lie side by side.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
         options: numbers that the kernel takes, by name, with the values they have now.
         fields: arrays of the particles' size that a substep needs as scratch.
@@ -75,7 +88,7 @@ class Integrator:
     substep: Any
     largest_substep: Callable[[Oscillators], tuple[float, str]]
     surely_allowed: Callable[[Oscillators], float]
-    springs_by_particle: bool
+    any_order: bool
     safety: float = 1.0
     carried: float = 1.0
     options: Mapping[str, int | float] = field(default_factory=lambda: MappingProxyType({}))
@@ -90,10 +103,10 @@ class Integrator:
         """Substeps of a control step [s] so that each is at most ``safety`` times the largest substep [s]."""
         return max(1, int(np.ceil(time_step / (self.safety * largest) - 1e-9)))
 
-    def work_rows(self, particles: int, springs: int, bends: int) -> int:
-        """Rows of (3, lanes) that ``work`` must have."""
-        remembered = -(-springs // 3) + bends if self.multipliers and self.options["iterations"] > 1 else 0
-        return self.fields * particles + remembered + SCRATCH
+    def room(self, springs: int, bends: int) -> tuple[int, int, int]:
+        """Fields, and multipliers of springs and of bends, that ``Work`` must have room for."""
+        remembers = self.multipliers and self.options["iterations"] > 1
+        return (self.fields, springs, bends) if remembers else (self.fields, 0, 0)
 
     def with_options(self, **options: float) -> Integrator:
         """The same method with other options.
@@ -118,81 +131,134 @@ class Integrator:
 
 
 @kernel
-def advance_velocities(v, w, f, gravity, drag_rate, h, row):
-    """Add ``h (f w + gravity)``, then linear drag, implicitly: ``v <- v/(1 + h drag_rate)``.
+def room_for_work(x, offset, room):
+    """What a substep may write to, for one block; see ``elements.room_for_forces``, and ``Integrator.room``."""
+    _, particles, lanes = x.shape
+    fields, springs, bends = room
+    return Work(
+        np.empty((fields, 3, particles, lanes), x.dtype),
+        np.empty((springs, lanes), x.dtype),
+        np.empty((bends, 3, lanes), x.dtype),
+        room_for_forces(x, offset),
+    )
 
-    Held particles keep their velocity.  f [N], (particles, 3, lanes).  row: scratch, (1, lanes).
-    """
-    one = v.dtype.type(1)
-    keep = row[0]
-    for l in range(v.shape[2]):
-        keep[l] = one / (one + h * drag_rate[l])
+
+@disjoint
+def _gain(v, w, f, g, keep, h):
+    """``v <- (v + h (f w + g)) keep`` of what is free."""
+    zero, one = v.dtype.type(0), v.dtype.type(1)
     for p in range(v.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            vc, fc, gc = v[p, c], f[p, c], gravity[c]
-            for l in range(v.shape[2]):
-                free = (vc[l] + h * (fc[l] * wp[l] + gc[l])) * keep[l]
-                vc[l] = free if wp[l] > 0 else vc[l]
+        # a choice between new and old would be stored under a mask, which is slow on many processors
+        gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
+        v[p] = (v[p] + gain) * share
 
 
 @kernel
-def predict_velocities(v, w, push, gravity, drag_rate, h, row):
+def advance_velocities(v, w, f, gravity, drag_rate, h):
+    """Add ``h (f w + gravity)``, then linear drag, implicitly: ``v <- v/(1 + h drag_rate)``.
+
+    Held particles keep their velocity.  f [N], (3, particles, lanes).
+    """
+    one, zero = v.dtype.type(1), v.dtype.type(0)
+    particles, lanes = v.shape[1], v.shape[2]
+    for c in range(3):
+        vc, fc = v[c].reshape(particles * lanes), f[c].reshape(particles * lanes)
+        if lanes == 1:
+            _gain(vc, w.reshape(particles), fc, gravity[c, 0], one / (one + h * drag_rate[0]), h)
+            continue
+        for p in range(particles):
+            for l in range(lanes):
+                free = (v[c, p, l] + h * (f[c, p, l] * w[p, l] + gravity[c, l])) * (one / (one + h * drag_rate[l]))
+                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
+
+
+@disjoint
+def _fall(v, w, f, g, keep, h):
+    """``v <- v keep + h (f w + g)`` of what is free."""
+    zero, one = v.dtype.type(0), v.dtype.type(1)
+    for p in range(v.shape[0]):
+        gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
+        v[p] = v[p] * share + gain
+
+
+@kernel
+def predict_velocities(v, w, push, gravity, drag_rate, h):
     """What free particles' velocity would be without the elements: ``v <- v/(1 + h drag_rate) + h (push w + gravity)``.
 
     Only what was there is dragged, so that implicit methods come to rest where forces balance, whatever the substep is.
-    push [N], (particles, 3, lanes).  row: scratch, (1, lanes).
+    push [N], (3, particles, lanes).
     """
-    one = v.dtype.type(1)
-    keep = row[0]
-    for l in range(v.shape[2]):
-        keep[l] = one / (one + h * drag_rate[l])
-    for p in range(v.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            vc, fc, gc = v[p, c], push[p, c], gravity[c]
-            for l in range(v.shape[2]):
-                free = vc[l] * keep[l] + h * (fc[l] * wp[l] + gc[l])
-                vc[l] = free if wp[l] > 0 else vc[l]
+    one, zero = v.dtype.type(1), v.dtype.type(0)
+    particles, lanes = v.shape[1], v.shape[2]
+    for c in range(3):
+        vc, fc = v[c].reshape(particles * lanes), push[c].reshape(particles * lanes)
+        if lanes == 1:
+            _fall(vc, w.reshape(particles), fc, gravity[c, 0], one / (one + h * drag_rate[0]), h)
+            continue
+        for p in range(particles):
+            for l in range(lanes):
+                free = v[c, p, l] * (one / (one + h * drag_rate[l])) + h * (push[c, p, l] * w[p, l] + gravity[c, l])
+                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
 
 
 @kernel
 def advance_positions(x, v, h):
     """``x <- x + h v``, held particles too."""
-    for p in range(x.shape[0]):
-        for c in range(3):
-            xc, vc = x[p, c], v[p, c]
-            for l in range(x.shape[2]):
-                xc[l] += h * vc[l]
+    _advance(x.reshape(x.size), v.reshape(v.size), h)
+
+
+@disjoint
+def _advance(x, v, h):
+    for e in range(x.shape[0]):
+        x[e] += h * v[e]
 
 
 @kernel
 def move_on(x, v, start, h):
     """``x <- start + h v``, held particles too."""
-    for p in range(x.shape[0]):
-        for c in range(3):
-            xc, vc, sc = x[p, c], v[p, c], start[p, c]
-            for l in range(x.shape[2]):
-                xc[l] = sc[l] + h * vc[l]
+    _move_on(x.reshape(x.size), v.reshape(v.size), start.reshape(start.size), h)
+
+
+@disjoint
+def _move_on(x, v, start, h):
+    for e in range(x.shape[0]):
+        x[e] = start[e] + h * v[e]
 
 
 @kernel
 def weigh(w, total, r, h):
     """``r <- h r - M total`` for free particles and zero for held ones: what is left of the backward Euler equations [N s]."""
-    zero = r.dtype.type(0)
-    for p in range(r.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            rc, tc = r[p, c], total[p, c]
-            for l in range(r.shape[2]):
-                rc[l] = h * rc[l] - tc[l] / wp[l] if wp[l] > zero else zero
+    for c in range(3):
+        _weigh(w.reshape(w.size), total[c].reshape(w.size), r[c].reshape(w.size), h)
+
+
+@disjoint
+def _weigh(w, total, r, h):
+    zero, one = r.dtype.type(0), r.dtype.type(1)
+    for e in range(r.shape[0]):
+        left = h * r[e] - total[e] / (w[e] if w[e] > zero else one)
+        r[e] = left if w[e] > zero else zero
 
 
 @kernel
 def add_to(a, b):
     """``a <- a + b``."""
-    for p in range(a.shape[0]):
-        for c in range(3):
-            ac, bc = a[p, c], b[p, c]
-            for l in range(a.shape[2]):
-                ac[l] += bc[l]
+    _add_to(a.reshape(a.size), b.reshape(b.size))
+
+
+@disjoint
+def _add_to(a, b):
+    for e in range(a.shape[0]):
+        a[e] += b[e]
+
+
+@kernel
+def copy_to(a, b):
+    """``a <- b``."""
+    _copy_to(a.reshape(a.size), b.reshape(b.size))
+
+
+@disjoint
+def _copy_to(a, b):
+    for e in range(a.shape[0]):
+        a[e] = b[e]

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import SCRATCH, Integrator, advance_positions, advance_velocities
+from clothgym.integrators.base import Integrator, advance_positions, advance_velocities, copy_to
 
 
 def _stable_substep(w: float, damping_time: float) -> float:
@@ -33,15 +33,14 @@ def surely_allowed(o: Oscillators) -> float:
     return float(_stable_substep(frequency_bound(o), o.damping_time))
 
 
-@kernel
+@uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    stiffness, rigidity, damping_time = elastic
-    f = work[: x.shape[0]]
-    f[:] = push
-    add_spring_forces(x, v, f, elements.springs, stiffness, damping_time, work[-1])
-    add_bend_forces(x, v, f, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+    f = work.fields[0]
+    copy_to(f, push)
+    add_spring_forces(x, v, f, elements, elastic, work.scratch)
+    add_bend_forces(x, v, f, elements, elastic, work.scratch)
     advance_positions(x, v, h)
-    advance_velocities(v, w, f, gravity, drag_rate, h, work[-1])
+    advance_velocities(v, w, f, gravity, drag_rate, h)
 
 
 EXPLICIT_EULER = Integrator(
@@ -52,7 +51,7 @@ EXPLICIT_EULER = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=True,
+    any_order=True,
     safety=0.8,
     carried=0.0,
 )

@@ -22,13 +22,14 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import disjoint, kernel
 from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
-from clothgym.integrators.base import SCRATCH, Integrator, add_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import Integrator, add_to, copy_to, move_on, predict_velocities, weigh
 
 GRAVITY = 9.81
 LOST = 0.02
+PARTS = 16  # sums that one sheet's products are added up in, side by side
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
@@ -45,59 +46,97 @@ def surely_allowed(o: Oscillators) -> float:
     return float("inf")
 
 
-@kernel
-def _turn(w, r, p, q, share, mass):
-    """The next search direction, ``p = M^-1 r + share p``, and its product with the masses, ``q = M p``, in one pass.
-
-    A held particle has neither.  share: (lanes,); mass: scratch, (lanes,).
-    """
+@disjoint
+def _turn_all(w, r, p, q, share):
+    """One component of ``_turn``, of one sheet."""
     one, zero = p.dtype.type(1), p.dtype.type(0)
     for i in range(p.shape[0]):
-        wi = w[i]
-        for l in range(p.shape[2]):
-            mass[l] = one / (wi[l] if wi[l] > zero else one)
-        for c in range(3):
-            rc, pc, qc = r[i, c], p[i, c], q[i, c]
-            for l in range(p.shape[2]):
+        p[i] = w[i] * r[i] + share * p[i]
+        q[i] = one / (w[i] if w[i] > zero else one) * p[i]
+
+
+@kernel
+def _turn(w, r, p, q, share):
+    """The next search direction, ``p = M^-1 r + share p``, and its product with the masses, ``q = M p``, in one pass.
+
+    A held particle has neither.  share: (lanes,).
+    """
+    one, zero = p.dtype.type(1), p.dtype.type(0)
+    particles, lanes = w.shape
+    for c in range(3):
+        if lanes == 1:
+            _turn_all(w.reshape(particles), r[c].reshape(particles), p[c].reshape(particles), q[c].reshape(particles), share[0])
+            continue
+        for i in range(particles):
+            wi, rc, pc, qc = w[i], r[c, i], p[c, i], q[c, i]
+            for l in range(lanes):
                 pc[l] = wi[l] * rc[l] + share[l] * pc[l]
-                qc[l] = mass[l] * pc[l]
+                qc[l] = one / (wi[l] if wi[l] > zero else one) * pc[l]
 
 
 @kernel
-def _product_along(p, q, out):
-    """``p . q`` of each lane, (lanes,)."""
+def _sum_of_products(a, b, out):
+    """``a . b`` of each lane, (lanes,); a, b: (3, particles, lanes).
+
+    A sum goes by ``PARTS`` sums of what lies that many places apart, and then over these, however many lanes there are.
+    """
+    lanes = out.shape[0]
+    size = a.size // lanes
+    whole = size - size % PARTS
+    one, other, parts = a.reshape((size, lanes)), b.reshape((size, lanes)), np.zeros((PARTS, lanes), a.dtype)
+    if lanes == 1:
+        _add_in_parts(one[:whole].reshape(whole), other[:whole].reshape(whole), parts.reshape(PARTS))
+    for e in range(whole if lanes == 1 else 0, size):
+        for l in range(lanes):
+            parts[e % PARTS, l] += one[e, l] * other[e, l]
     out[:] = 0
-    for i in range(p.shape[0]):
-        for c in range(3):
-            pc, qc = p[i, c], q[i, c]
-            for l in range(p.shape[2]):
-                out[l] += pc[l] * qc[l]
+    for k in range(PARTS):
+        for l in range(lanes):
+            out[l] += parts[k, l]
+
+
+@disjoint
+def _add_in_parts(a, b, parts):
+    for begin in range(0, a.shape[0], PARTS):
+        for k in range(PARTS):
+            parts[k] += a[begin + k] * b[begin + k]
 
 
 @kernel
-def _square(w, r, out):
-    """``r . M^-1 r`` of each lane, (lanes,)."""
-    out[:] = 0
-    for i in range(r.shape[0]):
-        wi = w[i]
-        for c in range(3):
-            rc = r[i, c]
-            for l in range(r.shape[2]):
-                out[l] += wi[l] * rc[l] * rc[l]
+def _square(w, r, scaled, out):
+    """``r . M^-1 r`` of each lane, (lanes,); scaled: becomes ``M^-1 r``."""
+    for c in range(3):
+        _scale(w.reshape(w.size), r[c].reshape(w.size), scaled[c].reshape(w.size))
+    _sum_of_products(scaled, r, out)
+
+
+@disjoint
+def _scale(w, r, out):
+    for e in range(r.shape[0]):
+        out[e] = w[e] * r[e]
+
+
+@disjoint
+def _go(d, p, r, q, step):
+    for e in range(d.shape[0]):
+        d[e] += step * p[e]
+        r[e] -= step * q[e]
 
 
 @kernel
-def _advance(w, d, p, q, r, step, after):
-    """``d += step p``, ``r -= step q``, and the new residual's square, (lanes,)."""
-    after[:] = 0
-    for i in range(p.shape[0]):
-        wi = w[i]
-        for c in range(3):
-            dc, pc, qc, rc = d[i, c], p[i, c], q[i, c], r[i, c]
-            for l in range(p.shape[2]):
+def _advance(d, p, q, r, step):
+    """``d += step p``, ``r -= step q``; step: (lanes,)."""
+    lanes = step.shape[0]
+    if lanes == 1:
+        _go(d.reshape(d.size), p.reshape(d.size), r.reshape(d.size), q.reshape(d.size), step[0])
+        return
+    for c in range(3):
+        for i in range(p.shape[1]):
+            dc, pc, qc, rc = d[c, i], p[c, i], q[c, i], r[c, i]
+            for l in range(lanes):
                 dc[l] += step[l] * pc[l]
+            for l in range(lanes):
                 rc[l] -= step[l] * qc[l]
-                after[l] += wi[l] * rc[l] * rc[l]
 
 
 @kernel
@@ -105,36 +144,35 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     stiffness, rigidity, damping_time = elastic
     t = x.dtype.type
     zero = t(0)
-    n, lanes = x.shape[0], x.shape[2]
+    lanes, scratch = x.shape[2], work.scratch
     newton_iterations, iterations, tolerance = options
-    start, total, d = work[:n], work[n : 2 * n], work[2 * n : 3 * n]
-    r, p, q = work[3 * n : 4 * n], work[4 * n : 5 * n], work[5 * n : 6 * n]
-    scratch = work[-SCRATCH:]
-    goal, rho, step, after, mass, bend = np.empty((6, lanes), x.dtype)
+    start, total, d = work.fields[0], work.fields[1], work.fields[2]
+    r, p, q, scaled = work.fields[3], work.fields[4], work.fields[5], work.fields[6]
+    goal, rho, step, after, bend = np.empty((5, lanes), x.dtype)
     along, across = np.empty_like(stiffness), np.empty_like(stiffness)
     for kind in range(stiffness.shape[0]):
         for l in range(lanes):
             across[kind, l] = -stiffness[kind, l] * h * h
-    predict_velocities(v, w, push, gravity, drag_rate, h, work[-1])
-    start[:] = x
+    predict_velocities(v, w, push, gravity, drag_rate, h)
+    copy_to(start, x)
     total[:] = 0
     for newton in range(newton_iterations):
         if newton > 0:
             move_on(x, v, start, h)
         r[:] = 0
-        add_spring_forces(x, v, r, elements.springs, stiffness, damping_time, work[-1])
-        add_bend_forces(x, v, r, elements.bends, rigidity, damping_time, scratch)
+        add_spring_forces(x, v, r, elements, elastic, scratch)
+        add_bend_forces(x, v, r, elements, elastic, scratch)
         weigh(w, total, r, h)
         if newton == 0:
             for l in range(lanes):
                 bend[l] = -rigidity[l] * h * h
-            add_spring_products(x, v, r, elements.springs, across, across, work[-1])
-            add_bend_products(x, v, r, elements.bends, bend, scratch)
+            add_spring_products(x, v, r, elements, across, across, bend, scratch)
+            add_bend_products(x, v, r, elements, bend, scratch)
             for kind in range(stiffness.shape[0]):
                 for l in range(lanes):
                     across[kind, l] = stiffness[kind, l] * h * h
                     along[kind, l] = stiffness[kind, l] * (h * h + h * damping_time[l])
-        _square(w, r, rho)
+        _square(w, r, scaled, rho)
         for l in range(lanes):
             bend[l] = rigidity[l] * (h * h + h * damping_time[l])
             goal[l] = rho[l] * t(tolerance) * t(tolerance)
@@ -150,13 +188,14 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
                 going |= rho[l] > goal[l]
             if not going:
                 break
-            _turn(w, r, p, q, step, mass)
-            add_spring_products(x, p, q, elements.springs, along, across, work[-1])
-            add_bend_products(x, p, q, elements.bends, bend, scratch)
-            _product_along(p, q, step)
+            _turn(w, r, p, q, step)
+            add_spring_products(x, p, q, elements, along, across, bend, scratch)
+            add_bend_products(x, p, q, elements, bend, scratch)
+            _sum_of_products(p, q, step)
             for l in range(lanes):
                 step[l] = rho[l] / step[l] if rho[l] > goal[l] and step[l] > zero else zero
-            _advance(w, d, p, q, r, step, after)
+            _advance(d, p, q, r, step)
+            _square(w, r, scaled, after)
             for l in range(lanes):
                 share = after[l] / rho[l] if rho[l] > zero else zero
                 rho[l] = after[l] if step[l] > zero else zero
@@ -174,7 +213,7 @@ IMPLICIT_EULER = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=True,
+    any_order=True,
     options=MappingProxyType({"newton_iterations": 1, "iterations": 200, "tolerance": 1e-2}),
-    fields=6,
+    fields=7,
 )

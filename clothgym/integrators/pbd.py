@@ -18,11 +18,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import disjoint, kernel
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
-from clothgym.integrators.base import SCRATCH, Integrator
-from clothgym.integrators.xpbd import predict, take_velocities
+from clothgym.integrators.base import Integrator
+from clothgym.integrators.xpbd import TINY, predict, take_velocities
 from clothgym.mesh import SHEAR
 
 USUAL = 1 / 300  # [s]
@@ -39,27 +39,32 @@ def surely_allowed(o: Oscillators) -> float:
     return float("inf")
 
 
+@disjoint
+def _project_rigid(xi, yi, zi, xj, yj, zj, mi, mj, share, r):
+    """Move both ends of one spring, in lanes."""
+    tiny = xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        d2 = dx * dx + dy * dy + dz * dz + tiny
+        lam = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + tiny))
+        xi[l] += mi[l] * lam * dx
+        yi[l] += mi[l] * lam * dy
+        zi[l] += mi[l] * lam * dz
+        xj[l] -= mj[l] * lam * dx
+        yj[l] -= mj[l] * lam * dy
+        zj[l] -= mj[l] * lam * dz
+
+
 @kernel
 def project_rigid_springs(x, w, springs, stretch, bend):
     """Move both ends of each spring by the share ``stretch``, or ``bend`` for what bends, of its error, in place."""
     ends, rest_length, kind, _ = springs
-    tiny = x.dtype.type(1e-12)
+    x0, x1, x2 = x[0], x[1], x[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, wi, wj = x[i], x[j], w[i], w[j]
-        r = rest_length[s]
         share = bend if kind[s] > SHEAR else stretch
-        for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-            d2 = dx * dx + dy * dy + dz * dz + tiny
-            lam = share * (d2 - r * np.sqrt(d2)) / (d2 * (wi[l] + wj[l] + tiny))
-            xi[0, l] += wi[l] * lam * dx
-            xi[1, l] += wi[l] * lam * dy
-            xi[2, l] += wi[l] * lam * dz
-            xj[0, l] -= wj[l] * lam * dx
-            xj[1, l] -= wj[l] * lam * dy
-            xj[2, l] -= wj[l] * lam * dz
+        _project_rigid(x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], w[i], w[j], share, rest_length[s])
 
 
 @kernel
@@ -84,17 +89,16 @@ def share_of_a_pass(k, iterations):
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
     _, rigidity, damping_time = elastic
     t = x.dtype.type
-    n = x.shape[0]
     iterations, stretch, bend = options
-    start = work[:n]
+    start = work.fields[0]
     scale, damping = np.empty_like(rigidity), np.empty_like(rigidity)
     scale[:] = RIGID
     damping[:] = 0
     along, across = t(share_of_a_pass(stretch, iterations)), t(share_of_a_pass(bend, iterations))
-    predict(x, v, w, start, gravity, push, drag_rate, h, work[-1])
+    predict(x, v, w, start, gravity, push, drag_rate, h)
     for _ in range(iterations):
         project_rigid_springs(x, w, elements.springs, along, across)
-        project_bends(x, start, w, elements.bends, scale, damping, across, work[:0], work[-SCRATCH:])
+        project_bends(x, start, w, elements.bends, scale, damping, across, work.of_bends, work.scratch)
     take_velocities(x, v, w, start, h)
 
 
@@ -106,7 +110,7 @@ PBD = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=False,
+    any_order=False,
     options=MappingProxyType({"iterations": 10, "stretch": 0.9, "bend": 0.1}),
     ignored=frozenset({"stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"}),
 )

@@ -26,7 +26,7 @@ from clothgym._jit import kernel
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
-from clothgym.integrators.base import SCRATCH, Integrator, Preparation, add_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import Integrator, Preparation, add_to, copy_to, move_on, predict_velocities, weigh
 
 # h w of the stiffest mode up to which ten iterations come near enough to the fixed point (see docs/physics.md)
 STIFFEST = 4.0
@@ -105,19 +105,24 @@ def _subtract_products(y, row, starts, columns, values):
 
 @kernel
 def solve(plan, r, y):
-    """``r <- A^-1 r`` by two triangular solves; y: scratch of the same shape, (particles, 3, lanes)."""
+    """``r <- A^-1 r`` by two triangular solves, r: (3, particles, lanes); y: scratch of the same size."""
     order, starts, columns, values, row_starts, rows, row_values, inverse_diagonal = plan[:8]
-    n = r.shape[0]
-    flat_r, flat_y = r.reshape((n, r.shape[1] * r.shape[2])), y.reshape((n, r.shape[1] * r.shape[2]))
+    n, lanes = r.shape[1], r.shape[2]
+    # a particle's components and lanes lie side by side here: each value of L is read once for all of them
+    flat_y = y.reshape((n, 3 * lanes))
     for i in range(n):
-        flat_y[i] = flat_r[order[i]]
+        for c in range(3):
+            for l in range(lanes):
+                flat_y[i, c * lanes + l] = r[c, order[i], l]
         _subtract_products(flat_y, i, starts, columns, values)
     for i in range(n - 1, -1, -1):
         own = flat_y[i]
         for l in range(own.shape[0]):
             own[l] *= inverse_diagonal[i]
         _subtract_products(flat_y, i, row_starts, rows, row_values)
-        flat_r[order[i]] = flat_y[i]
+        for c in range(3):
+            for l in range(lanes):
+                r[c, order[i], l] = flat_y[i, c * lanes + l]
 
 
 @kernel
@@ -140,13 +145,13 @@ def factorise_held(w, slot, held, members, count, lower):
 
 @kernel
 def keep_held(d, slot, held, members, count, lower, force):
-    """Take from ``d = A^-1 r`` what the held particles' own forces do, so that they stay: (particles, 3, lanes)."""
+    """Take from ``d = A^-1 r`` what the held particles' own forces do, so that they stay: (3, particles, lanes)."""
     force[:] = 0
     for l in range(d.shape[2]):
         m = count[l]
         for c in range(3):
             for a in range(m):
-                value = d[members[a, l], c, l]
+                value = d[c, members[a, l], l]
                 for b in range(a):
                     value -= lower[a, b, l] * force[slot[members[b, l]], c, l]
                 force[slot[members[a, l]], c, l] = value / lower[a, a, l]
@@ -161,24 +166,23 @@ def keep_held(d, slot, held, members, count, lower, force):
             for l in range(d.shape[2]):
                 anyone |= force[k, c, l] != 0
         if anyone:
-            for p in range(d.shape[0]):
-                share = held[k, p]
-                for c in range(3):
+            for c in range(3):
+                for p in range(d.shape[1]):
+                    share = held[k, p]
                     for l in range(d.shape[2]):
-                        d[p, c, l] -= share * force[k, c, l]
+                        d[c, p, l] -= share * force[k, c, l]
     for l in range(d.shape[2]):
         for a in range(count[l]):
             for c in range(3):
-                d[members[a, l], c, l] = 0
+                d[c, members[a, l], l] = 0
 
 
 @kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    stiffness, rigidity, damping_time = elastic
     slot, held = plan[8], plan[9]
-    n, lanes = x.shape[0], x.shape[2]
+    n, lanes = x.shape[1], x.shape[2]
     iterations = options[0]
-    start, total, r, y = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n]
+    start, total, r, y = work.fields[0], work.fields[1], work.fields[2], work.fields[3]
     most = 0
     for l in range(lanes):
         own = 0
@@ -188,14 +192,14 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     members, count = np.empty((most, lanes), np.int64), np.empty(lanes, np.int64)
     lower, force = np.empty((most, most, lanes), x.dtype), np.empty((held.shape[0], 3, lanes), x.dtype)
     factorise_held(w, slot, held, members, count, lower)
-    predict_velocities(v, w, push, gravity, drag_rate, h, work[-1])
-    start[:] = x
+    predict_velocities(v, w, push, gravity, drag_rate, h)
+    copy_to(start, x)
     total[:] = 0
     for _ in range(iterations):
         move_on(x, v, start, h)
         r[:] = 0
-        add_spring_forces(x, v, r, elements.springs, stiffness, damping_time, work[-1])
-        add_bend_forces(x, v, r, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+        add_spring_forces(x, v, r, elements, elastic, work.scratch)
+        add_bend_forces(x, v, r, elements, elastic, work.scratch)
         weigh(w, total, r, h)
         solve(plan, r, y)
         keep_held(r, slot, held, members, count, lower, force)
@@ -212,7 +216,7 @@ PROJECTIVE_DYNAMICS = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=True,
+    any_order=True,
     options=MappingProxyType({"iterations": 10}),
     fields=4,
     prepare=prepare,

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import SCRATCH, Integrator, move_on
+from clothgym.integrators.base import Integrator, copy_to, move_on
 
 
 def _amplification(h: float, w: float, damping_time: float) -> float:
@@ -44,16 +44,36 @@ def surely_allowed(o: Oscillators) -> float:
     return _stable_substep(frequency_bound(o), o.damping_time)
 
 
+@disjoint
+def _stage_of(x, v, w, f, g, drag, start_x, start_v, sum_x, sum_v, share, reach):
+    """One component of ``_stage``, of one sheet: gravity g [m/s^2] and drag [1/s] are numbers."""
+    zero = x.dtype.type(0)
+    for p in range(x.shape[0]):
+        a = f[p] * w[p] + g - drag * v[p]
+        a = a if w[p] > zero else zero
+        sum_x[p] += share * v[p]
+        sum_v[p] += share * a
+        x[p] = start_x[p] + reach * v[p]
+        v[p] = start_v[p] + reach * a
+
+
 @kernel
 def _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share, reach):
     """Add ``share`` of the derivative at (x, v) to the sums, and go ``reach`` [s] along it from the start."""
     zero = x.dtype.type(0)
-    for p in range(x.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            xc, vc, fc, gc = x[p, c], v[p, c], f[p, c], gravity[c]
-            xs, vs, dx, dv = start_x[p, c], start_v[p, c], sum_x[p, c], sum_v[p, c]
-            for l in range(x.shape[2]):
+    particles, lanes = x.shape[1], x.shape[2]
+    for c in range(3):
+        if lanes == 1:
+            _stage_of(
+                x[c].reshape(particles), v[c].reshape(particles), w.reshape(particles), f[c].reshape(particles), gravity[c, 0],
+                drag_rate[0], start_x[c].reshape(particles), start_v[c].reshape(particles), sum_x[c].reshape(particles),
+                sum_v[c].reshape(particles), share, reach,
+            )  # fmt: skip
+            continue
+        for p in range(particles):
+            wp, xc, vc, fc, gc = w[p], x[c, p], v[c, p], f[c, p], gravity[c]
+            xs, vs, dx, dv = start_x[c, p], start_v[c, p], sum_x[c, p], sum_v[c, p]
+            for l in range(lanes):
                 a = fc[l] * wp[l] + gc[l] - drag_rate[l] * vc[l]
                 a = a if wp[l] > 0 else zero
                 dx[l] += share * vc[l]
@@ -62,20 +82,18 @@ def _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share
                 vc[l] = vs[l] + reach * a
 
 
-@kernel
+@uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    stiffness, rigidity, damping_time = elastic
     t = x.dtype.type
-    n = x.shape[0]
-    start_x, start_v, sum_x, sum_v, f = work[:n], work[n : 2 * n], work[2 * n : 3 * n], work[3 * n : 4 * n], work[4 * n : 5 * n]
-    start_x[:] = x
-    start_v[:] = v
+    start_x, start_v, sum_x, sum_v, f = work.fields[0], work.fields[1], work.fields[2], work.fields[3], work.fields[4]
+    copy_to(start_x, x)
+    copy_to(start_v, v)
     sum_x[:] = 0
     sum_v[:] = 0
     for stage in range(4):
-        f[:] = push
-        add_spring_forces(x, v, f, elements.springs, stiffness, damping_time, work[-1])
-        add_bend_forces(x, v, f, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+        copy_to(f, push)
+        add_spring_forces(x, v, f, elements, elastic, work.scratch)
+        add_bend_forces(x, v, f, elements, elastic, work.scratch)
         share = t(1) if stage == 0 or stage == 3 else t(2)
         reach = h if stage == 2 else t(0.5) * h
         _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share, reach)
@@ -91,7 +109,7 @@ RK4 = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=True,
+    any_order=True,
     safety=0.8,
     carried=0.5,
     fields=5,

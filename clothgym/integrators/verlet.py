@@ -8,37 +8,47 @@ numerical integration illustrated by the Stoermer-Verlet method, 1.1 and 1.5).  
 
 from __future__ import annotations
 
-from clothgym._jit import kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import add_spring_forces
-from clothgym.integrators.base import SCRATCH, Integrator, advance_positions
+from clothgym.integrators.base import Integrator, advance_positions, copy_to
 from clothgym.integrators.semi_implicit_euler import largest_substep, surely_allowed
+
+
+@disjoint
+def _kick_one(v, w, f, g, slow, h):
+    """One component of one sheet, of whose velocity drag takes the share ``slow`` in half a substep."""
+    one, zero = v.dtype.type(1), v.dtype.type(0)
+    for p in range(v.shape[0]):
+        gain, share = (h * (f[p] * w[p] + g), slow) if w[p] > zero else (zero, zero)
+        v[p] = (v[p] * (one - share) + gain) / (one + share)
 
 
 @kernel
 def _kick(v, w, f, gravity, drag_rate, h):
     """``v <- (v (1 - h b/2) + h (f w + g)) / (1 + h b/2)`` for free particles, with b the drag's rate."""
-    one = v.dtype.type(1)
-    half = v.dtype.type(0.5)
-    for p in range(v.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            vc, fc, gc = v[p, c], f[p, c], gravity[c]
-            for l in range(v.shape[2]):
+    one, zero, half = v.dtype.type(1), v.dtype.type(0), v.dtype.type(0.5)
+    particles, lanes = v.shape[1], v.shape[2]
+    for c in range(3):
+        if lanes == 1:
+            vc, fc = v[c].reshape(particles), f[c].reshape(particles)
+            _kick_one(vc, w.reshape(particles), fc, gravity[c, 0], half * h * drag_rate[0], h)
+            continue
+        for p in range(particles):
+            for l in range(lanes):
                 slow = half * h * drag_rate[l]
-                free = (vc[l] * (one - slow) + h * (fc[l] * wp[l] + gc[l])) / (one + slow)
-                vc[l] = free if wp[l] > 0 else vc[l]
+                free = (v[c, p, l] * (one - slow) + h * (f[c, p, l] * w[p, l] + gravity[c, l])) / (one + slow)
+                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
 
 
-@kernel
+@uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    stiffness, rigidity, damping_time = elastic
-    f = work[: x.shape[0]]
+    f = work.fields[0]
     half = x.dtype.type(0.5) * h
     advance_positions(x, v, half)
-    f[:] = push
-    add_spring_forces(x, v, f, elements.springs, stiffness, damping_time, work[-1])
-    add_bend_forces(x, v, f, elements.bends, rigidity, damping_time, work[-SCRATCH:])
+    copy_to(f, push)
+    add_spring_forces(x, v, f, elements, elastic, work.scratch)
+    add_bend_forces(x, v, f, elements, elastic, work.scratch)
     _kick(v, w, f, gravity, drag_rate, h)
     advance_positions(x, v, half)
 
@@ -51,7 +61,7 @@ VERLET = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=True,
+    any_order=True,
     safety=0.8,
     carried=0.5,
 )

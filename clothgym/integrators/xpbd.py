@@ -15,11 +15,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import apart, disjoint, kernel
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
-from clothgym.integrators.base import SCRATCH, Integrator
+from clothgym.integrators.base import Integrator, advance_positions, copy_to, predict_velocities
 
+TINY = 1e-12  # [m^2]: a spring of no length
 FIVE_PERCENT = 0.229
 
 
@@ -37,115 +38,148 @@ def surely_allowed(o: Oscillators) -> float:
     return largest_substep(o)[0]
 
 
+@disjoint
+def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, flexible, r, compliance, damping):
+    """Move both ends of one spring, in lanes: components of positions, and of those at the substep's start; m: inverse masses."""
+    one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        ux, uy, uz = dx - (uj[l] - ui[l]), dy - (vj[l] - vi[l]), dz - (wj[l] - wi[l])
+        d2 = dx * dx + dy * dy + dz * dz + tiny
+        g = damping[l]
+        push = d2 - r * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
+        lam = push / (d2 * ((one + g) * (mi[l] + mj[l]) + flexible * compliance[l]))
+        fx, fy, fz = lam * dx, lam * dy, lam * dz
+        xi[l] += mi[l] * fx
+        yi[l] += mi[l] * fy
+        zi[l] += mi[l] * fz
+        xj[l] -= mj[l] * fx
+        yj[l] -= mj[l] * fy
+        zj[l] -= mj[l] * fz
+
+
 @apart
-def project_springs(x, start, w, springs, compliance, damping, row):
+def project_springs(x, start, w, springs, compliance, damping):
     """Move both ends of each spring towards its rest length, in place.
 
     compliance: ``1/(k h^2)`` [1/kg], (kinds, lanes).  damping: ``tau/h``, (lanes,).  start: positions at the beginning of
-    the substep, whose difference to ``x`` is the velocity that the damper sees.  row: scratch, (3, lanes): with as many rows to
-    read as here, simple loops are faster than one that writes where it reads.
+    the substep, whose difference to ``x`` is the velocity that the damper sees.
     """
     if x.shape[2] == 1:
-        _project_springs_of_one(x[:, :, 0], start[:, :, 0], w[:, 0], springs, compliance[:, 0], damping[0])
+        rows = (3, x.shape[1])
+        _project_springs_of_one(x.reshape(rows), start.reshape(rows), w[:, 0], springs, compliance[:, 0], damping[0])
         return
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    x0, x1, x2, s0, s1, s2 = x[0], x[1], x[2], start[0], start[1], start[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, si, sj, wi, wj = x[i], x[j], start[i], start[j], w[i], w[j]
-        a = compliance[kind[s]]
-        flexible = one / weight[s]
-        r = rest_length[s]
-        for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-            ux, uy, uz = dx - (sj[0, l] - si[0, l]), dy - (sj[1, l] - si[1, l]), dz - (sj[2, l] - si[2, l])
-            d2 = dx * dx + dy * dy + dz * dz + tiny
-            g = damping[l]
-            push = d2 - r * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
-            lam = push / (d2 * ((one + g) * (wi[l] + wj[l]) + flexible * a[l]))
-            row[0, l] = lam * dx
-            row[1, l] = lam * dy
-            row[2, l] = lam * dz
-        for c in range(3):
-            for l in range(x.shape[2]):
-                xi[c, l] += wi[l] * row[c, l]
-            for l in range(x.shape[2]):
-                xj[c, l] -= wj[l] * row[c, l]
+        _project(
+            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], s0[i], s1[i], s2[i], s0[j], s1[j], s2[j], w[i], w[j], one / weight[s],
+            rest_length[s], compliance[kind[s]], damping,
+        )  # fmt: skip
 
 
 @kernel
 def _project_springs_of_one(x, start, w, springs, compliance, damping):
-    """The same arithmetic on a single environment, (particles, 3)."""
+    """The same arithmetic on a single environment, (3, particles)."""
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    tiny = x.dtype.type(TINY)
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-        ux, uy, uz = dx - (start[j, 0] - start[i, 0]), dy - (start[j, 1] - start[i, 1]), dz - (start[j, 2] - start[i, 2])
+        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
+        ux, uy, uz = dx - (start[0, j] - start[0, i]), dy - (start[1, j] - start[1, i]), dz - (start[2, j] - start[2, i])
         d2 = dx * dx + dy * dy + dz * dz + tiny
         flexible = one / weight[s]
         push = d2 - rest_length[s] * np.sqrt(d2) + damping * (ux * dx + uy * dy + uz * dz)
         lam = push / (d2 * ((one + damping) * (w[i] + w[j]) + flexible * compliance[kind[s]]))
         fx, fy, fz = lam * dx, lam * dy, lam * dz
-        x[i, 0] += w[i] * fx
-        x[i, 1] += w[i] * fy
-        x[i, 2] += w[i] * fz
-        x[j, 0] -= w[j] * fx
-        x[j, 1] -= w[j] * fy
-        x[j, 2] -= w[j] * fz
+        x[0, i] += w[i] * fx
+        x[1, i] += w[i] * fy
+        x[2, i] += w[i] * fz
+        x[0, j] -= w[j] * fx
+        x[1, j] -= w[j] * fy
+        x[2, j] -= w[j] * fz
+
+
+@disjoint
+def _project_undamped(xi, yi, zi, xj, yj, zj, mi, mj, flexible, r, compliance):
+    """The same without a damper."""
+    tiny = xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        d2 = dx * dx + dy * dy + dz * dz + tiny
+        lam = (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + flexible * compliance[l]))
+        xi[l] += mi[l] * lam * dx
+        yi[l] += mi[l] * lam * dy
+        zi[l] += mi[l] * lam * dz
+        xj[l] -= mj[l] * lam * dx
+        yj[l] -= mj[l] * lam * dy
+        zj[l] -= mj[l] * lam * dz
 
 
 @kernel
 def project_undamped_springs(x, w, springs, compliance):
     """``project_springs`` for damping zero: the same bits at half the cost."""
     if x.shape[2] == 1:
-        _project_undamped_springs_of_one(x[:, :, 0], w[:, 0], springs, compliance[:, 0])
+        _project_undamped_springs_of_one(x.reshape((3, x.shape[1])), w[:, 0], springs, compliance[:, 0])
         return
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    x0, x1, x2 = x[0], x[1], x[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, wi, wj = x[i], x[j], w[i], w[j]
-        a = compliance[kind[s]]
-        flexible = one / weight[s]
-        r = rest_length[s]
-        for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-            d2 = dx * dx + dy * dy + dz * dz + tiny
-            lam = (d2 - r * np.sqrt(d2)) / (d2 * (wi[l] + wj[l] + flexible * a[l]))
-            xi[0, l] += wi[l] * lam * dx
-            xi[1, l] += wi[l] * lam * dy
-            xi[2, l] += wi[l] * lam * dz
-            xj[0, l] -= wj[l] * lam * dx
-            xj[1, l] -= wj[l] * lam * dy
-            xj[2, l] -= wj[l] * lam * dz
+        _project_undamped(
+            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], w[i], w[j], one / weight[s], rest_length[s], compliance[kind[s]]
+        )
 
 
 @kernel
 def _project_undamped_springs_of_one(x, w, springs, compliance):
-    """The same arithmetic on a single environment, (particles, 3)."""
+    """The same arithmetic on a single environment, (3, particles)."""
     ends, rest_length, kind, weight = springs
     one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    tiny = x.dtype.type(TINY)
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        dx, dy, dz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
+        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
         d2 = dx * dx + dy * dy + dz * dz + tiny
         flexible = one / weight[s]
         lam = (d2 - rest_length[s] * np.sqrt(d2)) / (d2 * (w[i] + w[j] + flexible * compliance[kind[s]]))
-        x[i, 0] += w[i] * lam * dx
-        x[i, 1] += w[i] * lam * dy
-        x[i, 2] += w[i] * lam * dz
-        x[j, 0] -= w[j] * lam * dx
-        x[j, 1] -= w[j] * lam * dy
-        x[j, 2] -= w[j] * lam * dz
+        x[0, i] += w[i] * lam * dx
+        x[1, i] += w[i] * lam * dy
+        x[2, i] += w[i] * lam * dz
+        x[0, j] -= w[j] * lam * dx
+        x[1, j] -= w[j] * lam * dy
+        x[2, j] -= w[j] * lam * dz
+
+
+@disjoint
+def _project_with_memory(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, share, r, scale, damping, known):
+    """The same with a multiplier, (lanes,) [kg m]."""
+    one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
+    for l in range(xi.shape[0]):
+        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        ux, uy, uz = dx - (uj[l] - ui[l]), dy - (vj[l] - vi[l]), dz - (wj[l] - wi[l])
+        inverse = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        length = (dx * dx + dy * dy + dz * dz) * inverse
+        g = damping[l]
+        k = share * scale[l]
+        force = k * (length - r + g * (ux * dx + uy * dy + uz * dz) * inverse)
+        change = (force - known[l]) / (k * (one + g) * (mi[l] + mj[l]) + one)
+        known[l] += change
+        lam = change * inverse
+        xi[l] += mi[l] * lam * dx
+        yi[l] += mi[l] * lam * dy
+        zi[l] += mi[l] * lam * dz
+        xj[l] -= mj[l] * lam * dx
+        yj[l] -= mj[l] * lam * dy
+        zj[l] -= mj[l] * lam * dz
 
 
 @kernel
@@ -155,54 +189,30 @@ def project_springs_with_memory(x, start, w, springs, pull, damping, multipliers
     pull: ``k h^2`` [kg], (kinds, lanes): eq. 18 and 26 of the paper times it, so that no stiffness of zero is divided by.
     """
     ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    x0, x1, x2, s0, s1, s2 = x[0], x[1], x[2], start[0], start[1], start[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        xi, xj, si, sj, wi, wj = x[i], x[j], start[i], start[j], w[i], w[j]
-        scale = pull[kind[s]]
-        share = weight[s]
-        r = rest_length[s]
-        known = multipliers[s]
-        for l in range(x.shape[2]):
-            dx, dy, dz = xj[0, l] - xi[0, l], xj[1, l] - xi[1, l], xj[2, l] - xi[2, l]
-            ux, uy, uz = dx - (sj[0, l] - si[0, l]), dy - (sj[1, l] - si[1, l]), dz - (sj[2, l] - si[2, l])
-            inverse = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-            length = (dx * dx + dy * dy + dz * dz) * inverse
-            g = damping[l]
-            k = share * scale[l]
-            force = k * (length - r + g * (ux * dx + uy * dy + uz * dz) * inverse)
-            change = (force - known[l]) / (k * (one + g) * (wi[l] + wj[l]) + one)
-            known[l] += change
-            lam = change * inverse
-            xi[0, l] += wi[l] * lam * dx
-            xi[1, l] += wi[l] * lam * dy
-            xi[2, l] += wi[l] * lam * dz
-            xj[0, l] -= wj[l] * lam * dx
-            xj[1, l] -= wj[l] * lam * dy
-            xj[2, l] -= wj[l] * lam * dz
+        _project_with_memory(
+            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], s0[i], s1[i], s2[i], s0[j], s1[j], s2[j], w[i], w[j], weight[s],
+            rest_length[s], pull[kind[s]], damping, multipliers[s],
+        )  # fmt: skip
 
 
 @kernel
-def predict(x, v, w, start, gravity, push, drag_rate, h, row):
-    """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity.
+def predict(x, v, w, start, gravity, push, drag_rate, h):
+    """Keep the positions in ``start``, then fall freely but for ``push`` [N]; held particles move by their own velocity."""
+    predict_velocities(v, w, push, gravity, drag_rate, h)
+    copy_to(start, x)
+    advance_positions(x, v, h)
 
-    The velocity is that of ``base.predict_velocities``, in the same pass.
-    """
-    one = x.dtype.type(1)
-    keep = row[0]
-    for l in range(x.shape[2]):
-        keep[l] = one / (one + h * drag_rate[l])
-    for p in range(x.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            xc, vc, sc, fc, gc = x[p, c], v[p, c], start[p, c], push[p, c], gravity[c]
-            for l in range(x.shape[2]):
-                free = vc[l] * keep[l] + h * (fc[l] * wp[l] + gc[l])
-                vc[l] = free if wp[l] > 0 else vc[l]
-                sc[l] = xc[l]
-                xc[l] += h * vc[l]
+
+@disjoint
+def _take(x, v, w, start, h, per_step):
+    zero = x.dtype.type(0)
+    for e in range(x.shape[0]):
+        projected = x[e] - (start[e] + h * v[e])
+        v[e] += projected * per_step if w[e] > zero else zero
 
 
 @kernel
@@ -212,25 +222,19 @@ def take_velocities(x, v, w, start, h):
     Written as the predicted velocity and the projections' share: in float32 the plain quotient would round gravity's
     ``g h^2`` to whole units in the last place of the position, and grow worse with smaller substeps.
     """
-    per_step = x.dtype.type(1) / h
-    for p in range(x.shape[0]):
-        wp = w[p]
-        for c in range(3):
-            vc, xc, sc = v[p, c], x[p, c], start[p, c]
-            for l in range(x.shape[2]):
-                projected = xc[l] - (sc[l] + h * vc[l])
-                vc[l] = vc[l] + projected * per_step if wp[l] > 0 else vc[l]
+    for c in range(3):
+        _take(x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), start[c].reshape(w.size), h, x.dtype.type(1) / h)
 
 
 @kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
     stiffness, rigidity, damping_time = elastic
-    springs, bends = elements
+    springs, bends = elements.springs, elements.bends
     one = x.dtype.type(1)
-    n, lanes = x.shape[0], x.shape[2]
+    lanes = x.shape[2]
     iterations = options[0]
-    start = work[:n]
-    predict(x, v, w, start, gravity, push, drag_rate, h, work[-1])
+    start = work.fields[0]
+    predict(x, v, w, start, gravity, push, drag_rate, h)
     pull, compliance, damping, bend = (
         np.empty_like(stiffness), np.empty_like(stiffness), np.empty_like(damping_time), np.empty_like(rigidity)
     )  # fmt: skip
@@ -245,18 +249,16 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         damped |= damping[l] > 0
     if iterations == 1:
         if damped:
-            project_springs(x, start, w, springs, compliance, damping, work[-1])
+            project_springs(x, start, w, springs, compliance, damping)
         else:
             project_undamped_springs(x, w, springs, compliance)
-        project_bends(x, start, w, bends, bend, damping, one, work[:0], work[-SCRATCH:])
+        project_bends(x, start, w, bends, bend, damping, one, work.of_bends, work.scratch)
     else:
-        rows = (springs.kind.shape[0] + 2) // 3
-        of_springs = work[n : n + rows].reshape((3 * rows, lanes))
-        of_bends = work[n + rows : n + rows + bends.weight.shape[0]]
-        work[n : n + rows + bends.weight.shape[0]] = 0
+        work.of_springs[:] = 0
+        work.of_bends[:] = 0
         for _ in range(iterations):
-            project_springs_with_memory(x, start, w, springs, pull, damping, of_springs)
-            project_bends(x, start, w, bends, bend, damping, one, of_bends, work[-SCRATCH:])
+            project_springs_with_memory(x, start, w, springs, pull, damping, work.of_springs)
+            project_bends(x, start, w, bends, bend, damping, one, work.of_bends, work.scratch)
     take_velocities(x, v, w, start, h)
 
 
@@ -268,7 +270,7 @@ XPBD = Integrator(
     substep=substep,
     largest_substep=largest_substep,
     surely_allowed=surely_allowed,
-    springs_by_particle=False,
+    any_order=False,
     options=MappingProxyType({"iterations": 1}),
     multipliers=True,
 )

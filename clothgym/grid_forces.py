@@ -1,0 +1,373 @@
+"""Floor 3: forces on one sheet that is a grid, with its particles side by side.
+
+The springs of one kind join particles p and p + o, with the same o for all of them: their forces are one loop over p without an
+index array.  What a particle gets is one sum over the kinds, in a fixed order,
+
+    f[p] <- ((f[p] - F_0[p - o_0] + F_0[p]) - F_1[p - o_1] + F_1[p]) - ...,
+
+which is the order in which a plain loop over the springs, by kind and then by particle, would add them.  Springs that would wrap
+around the end of a row have no weight.
+
+The quadratic bending model is a constant matrix K.  Its rows sum to zero, so the force on p is ``B sum_q -K_pq (x_q - x_p)``: springs
+without rest length along the same six offsets, for a grid's hinges reach no farther.
+
+Arrays are as in ``forces``, with one lane: positions x [m] and velocities v [m/s] are (3, particles, 1).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from clothgym._jit import disjoint, inlined, uncounted
+from clothgym.bending import Bending, add_bend_forces, add_bend_products, hinge_angles, hinge_rates, hinge_rows
+from clothgym.elements import ROWS
+from clothgym.forces import add_air_forces, add_spring_forces, add_spring_products
+
+TINY = 1e-30  # [m^2], see ``forces``
+
+
+@inlined
+def rows_of(a):
+    """Components of one lane's vectors, (3, particles), of (3, particles, 1)."""
+    return a.reshape((a.shape[0], a.shape[1]))
+
+
+# --- springs, and what bends linearly -----------------------------------------------------------------------------------
+
+
+@disjoint
+def _spring_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, tau, fx, fy, fz):
+    """Hooke's force and the damper's of one kind of springs on their first ends [N], see ``forces.add_spring_forces``."""
+    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
+    x1, y1, z1, vx1, vy1, vz1 = x[o:], y[o:], z[o:], vx[o:], vy[o:], vz[o:]
+    for p in range(count):
+        dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
+        ux, uy, uz = vx1[p] - vx[p], vy1[p] - vy[p], vz1[p] - vz[p]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        g = weight[p] * stiffness * ((one - rest_length * q) + tau * (ux * dx + uy * dy + uz * dz) * q * q)
+        fx[p], fy[p], fz[p] = g * dx, g * dy, g * dz
+
+
+@disjoint
+def _spring_and_curve_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, curve, rigidity, tau, fx, fy, fz):
+    """The same with what bends along the same offset: ``rigidity curve (d + tau u)``."""
+    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
+    x1, y1, z1, vx1, vy1, vz1 = x[o:], y[o:], z[o:], vx[o:], vy[o:], vz[o:]
+    for p in range(count):
+        dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
+        ux, uy, uz = vx1[p] - vx[p], vy1[p] - vy[p], vz1[p] - vz[p]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        g = weight[p] * stiffness * ((one - rest_length * q) + tau * (ux * dx + uy * dy + uz * dz) * q * q)
+        b = curve[p] * rigidity
+        fx[p], fy[p], fz[p] = g * dx + b * (dx + tau * ux), g * dy + b * (dy + tau * uy), g * dz + b * (dz + tau * uz)
+
+
+@disjoint
+def _curve_kind(x, v, o, count, curve, rigidity, tau, f):
+    """One component of what bends where there are no springs: no root, no quotient."""
+    x1, v1 = x[o:], v[o:]
+    for p in range(count):
+        f[p] = curve[p] * rigidity * ((x1[p] - x[p]) + tau * (v1[p] - v[p]))
+
+
+@disjoint
+def _gather(f, before, g0, g1, g2, g3, g4, g5, o0, o1, o2, o3, o4, o5):
+    """One component of what each particle gets from six kinds, in their order; see the module.
+
+    g: forces of a kind on first ends from ``before`` on, (before + particles,).
+    """
+    a0, a1, a2, a3, a4, a5 = g0[before:], g1[before:], g2[before:], g3[before:], g4[before:], g5[before:]
+    b0, b1, b2, b3, b4, b5 = (
+        g0[before - o0 :], g1[before - o1 :], g2[before - o2 :], g3[before - o3 :], g4[before - o4 :], g5[before - o5 :]
+    )  # fmt: skip
+    for p in range(f.shape[0]):
+        f[p] = (
+            f[p] - b0[p] + a0[p] - b1[p] + a1[p] - b2[p] + a2[p] - b3[p] + a3[p] - b4[p] + a4[p] - b5[p] + a5[p]
+        )  # fmt: skip
+
+
+@inlined
+def _gather_kinds(f, offset, kinds):
+    """Add what the kinds' forces, (3, kinds, before + particles), come to at each particle to ``f``, (3, particles)."""
+    before = kinds.shape[2] - f.shape[1]
+    for c in range(3):
+        g = kinds[c]
+        _gather(
+            f[c], before, g[0], g[1], g[2], g[3], g[4], g[5],
+            offset[0], offset[1], offset[2], offset[3], offset[4], offset[5],
+        )  # fmt: skip
+
+
+# drivers take plain arrays and have no branches: else the references to each row are counted, for as long as a row of forces takes
+
+
+@inlined
+def _spring_kinds(x, v, offset, weight, kind, stiffness, rest_length, tau, out, before):
+    """Forces of all kinds that are springs; out: (3, kinds, before + particles)."""
+    for a in range(weight.shape[0]):
+        _spring_kind(
+            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
+            tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
+        )  # fmt: skip
+
+
+@inlined
+def _spring_and_curve_kinds(x, v, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, out, before):
+    """The same with what bends."""
+    for a in range(weight.shape[0]):
+        _spring_and_curve_kind(
+            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
+            curve[a], rigidity, tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
+        )  # fmt: skip
+
+
+@inlined
+def _curve_kinds(x, v, offset, begin, curve, rigidity, tau, out, before):
+    """What bends along the kinds from ``begin`` on, which are no springs."""
+    for a in range(begin, curve.shape[0]):
+        for c in range(3):
+            _curve_kind(x[c], v[c], offset[a], x.shape[1] - offset[a], curve[a], rigidity, tau, out[c, a, before:])
+
+
+@uncounted
+def add_grid_forces(x, v, f, elements, elastic, scratch):
+    """Add the springs' forces, and those of the quadratic bending model if there is one, to ``f`` [N]."""
+    offset, kind, rest_length, weight, curve, _, _ = elements
+    kinds, stiffness = scratch.kinds, elastic.stiffness
+    tau, rigidity = elastic.damping_time[0], elastic.rigidity[0]
+    r, s, total = rows_of(x), rows_of(v), rows_of(f)
+    before = kinds.shape[2] - r.shape[1]
+    if curve.shape[0] > 0:
+        _spring_and_curve_kinds(r, s, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, kinds, before)
+        _curve_kinds(r, s, offset, weight.shape[0], curve, rigidity, tau, kinds, before)
+    else:
+        _spring_kinds(r, s, offset, weight, kind, stiffness, rest_length, tau, kinds, before)
+    _gather_kinds(total, offset, kinds)
+
+
+@disjoint
+def _product_kind(x, y, z, px, py, pz, o, count, weight, along, across, rest_length, bend, curve, fx, fy, fz):
+    """Minus the stiffness of one kind of springs times p, on their first ends; see ``forces.add_spring_products``.
+
+    With what bends along the same offset, ``bend curve u``.
+    """
+    one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
+    x1, y1, z1, px1, py1, pz1 = x[o:], y[o:], z[o:], px[o:], py[o:], pz[o:]
+    for p in range(count):
+        dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
+        ux, uy, uz = px1[p] - px[p], py1[p] - py[p], pz1[p] - pz[p]
+        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
+        stretched = one - rest_length * q
+        aside = weight[p] * across * (stretched if stretched > zero else zero)
+        g = (weight[p] * along - aside) * (ux * dx + uy * dy + uz * dz) * q * q
+        aside += bend * curve[p]
+        fx[p], fy[p], fz[p] = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
+
+
+@disjoint
+def _curve_product_kind(p, o, count, curve, bend, f):
+    """One component of the same where there are no springs."""
+    p1 = p[o:]
+    for i in range(count):
+        f[i] = bend * curve[i] * (p1[i] - p[i])
+
+
+@uncounted
+def add_grid_products(x, p, y, elements, along, across, bend, scratch):
+    """Add the stiffness matrix of springs, and of the quadratic model if there is one, times ``p`` to ``y``, (3, particles, 1).
+
+    along, across: see ``forces.add_spring_products``; bend: of the quadratic model, (1,).
+    """
+    offset, kind, rest_length, weight, curve, _, _ = elements
+    kinds = scratch.kinds
+    r, s, total = rows_of(x), rows_of(p), rows_of(y)
+    zero = x.dtype.type(0)
+    before = kinds.shape[2] - r.shape[1]
+    for a in range(offset.shape[0]):
+        o = offset[a]
+        count = r.shape[1] - o
+        fx, fy, fz = kinds[0, a, before:], kinds[1, a, before:], kinds[2, a, before:]
+        if a < weight.shape[0]:
+            n, t, rest = along[kind[a], 0], across[kind[a], 0], rest_length[a]
+            b, own = (bend[0], curve[a]) if curve.shape[0] > 0 else (zero, weight[a])
+            _product_kind(
+                r[0], r[1], r[2], s[0], s[1], s[2], o, count, weight[a], -n, -t, rest, -b, own, fx, fy, fz
+            )  # fmt: skip
+        elif curve.shape[0] > 0:
+            _curve_product_kind(s[0], o, count, curve[a], -bend[0], fx)
+            _curve_product_kind(s[1], o, count, curve[a], -bend[0], fy)
+            _curve_product_kind(s[2], o, count, curve[a], -bend[0], fz)
+    _gather_kinds(total, offset, kinds)
+
+
+# --- hinges -------------------------------------------------------------------------------------------------------------
+
+
+@disjoint
+def _moments(angle, rate, weight, rigidity, tau):
+    """Turn angles [rad] into moments [N m]: ``weight rigidity (angle + tau rate)``; a grid is flat at rest."""
+    for p in range(angle.shape[0]):
+        angle[p] = weight[p] * rigidity * (angle[p] + tau * rate[p])
+
+
+@disjoint
+def _turn(f, slope, moment):
+    """One component of what a moment does to one of its corners."""
+    for p in range(moment.shape[0]):
+        f[p] -= slope[p] * moment[p]
+
+
+@inlined
+def _slices(rows, begin, count):
+    """Components of vectors, (3, particles), of ``count`` particles from ``begin`` on, one by one."""
+    return rows[0, begin : begin + count], rows[1, begin : begin + count], rows[2, begin : begin + count]
+
+
+@uncounted
+def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
+    """The same forces as ``bending.add_hinge_forces``, family by family, and corner by corner within it."""
+    grid, tau, rigidity = elements, elastic.damping_time[0], elastic.rigidity[0]
+    r, s, total = rows_of(x), rows_of(v), rows_of(f)
+    for family in range(grid.hinge.shape[0]):
+        j, k, l = grid.hinge[family, 0], grid.hinge[family, 1], grid.hinge[family, 2]
+        # hinges whose corners are all there, and some that wrap around the end of a row, which have no weight
+        low = max(0, -min(j, min(k, l)))
+        count = r.shape[1] - max(0, max(j, max(k, l))) - low
+        if count <= 0:
+            continue
+        angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, count)
+        hinge_angles(
+            _slices(r, low, count), _slices(r, low + j, count), _slices(r, low + k, count), _slices(r, low + l, count), angle,
+            slopes, geometry,
+        )  # fmt: skip
+        hinge_rates(
+            _slices(s, low, count), _slices(s, low + j, count), _slices(s, low + k, count), _slices(s, low + l, count), slopes,
+            rate,
+        )  # fmt: skip
+        _moments(angle, rate, grid.hinge_weight[family, low : low + count], rigidity, tau)
+        for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
+            for c in range(3):
+                _turn(total[c, at : at + count], slopes[3 * m + c], angle)
+
+
+@uncounted
+def add_grid_hinge_products(x, p, y, elements, bend, scratch):
+    """The same products as ``bending.add_hinge_products``."""
+    grid, zero = elements, x.dtype.type(0)
+    r, s, total = rows_of(x), rows_of(p), rows_of(y)
+    for family in range(grid.hinge.shape[0]):
+        j, k, l = grid.hinge[family, 0], grid.hinge[family, 1], grid.hinge[family, 2]
+        low = max(0, -min(j, min(k, l)))
+        count = r.shape[1] - max(0, max(j, max(k, l))) - low
+        if count <= 0:
+            continue
+        angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, count)
+        hinge_angles(
+            _slices(r, low, count), _slices(r, low + j, count), _slices(r, low + k, count), _slices(r, low + l, count), angle,
+            slopes, geometry,
+        )  # fmt: skip
+        hinge_rates(
+            _slices(s, low, count), _slices(s, low + j, count), _slices(s, low + k, count), _slices(s, low + l, count), slopes,
+            angle,
+        )  # fmt: skip
+        rate[:] = zero
+        _moments(angle, rate, grid.hinge_weight[family, low : low + count], -bend[0], zero)
+        for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
+            for c in range(3):
+                _turn(total[c, at : at + count], slopes[3 * m + c], angle)
+
+
+# --- air ----------------------------------------------------------------------------------------------------------------
+
+
+@disjoint
+def _spread_of(a, b, far, even, other, out_first, out_second):
+    """One component of a triangle's sides from the corner a to b and to the third corner, ``far`` where even, else ``other``."""
+    zero = a.dtype.type(0)
+    for p in range(out_first.shape[0]):
+        third = far[p] if even[p] > zero else other[p]
+        out_first[p] = b[p] - a[p]
+        out_second[p] = third - a[p]
+
+
+@disjoint
+def _relative_wind(wind, a, b, c, d, sa, sb, sc, sd, out):
+    """One component of the wind relative to triangles [m/s], whose velocities are the shares' means of their corners'."""
+    for p in range(out.shape[0]):
+        out[p] = wind - (sa[p] * a[p] + sb[p] * b[p] + sc[p] * c[p] + sd[p] * d[p])
+
+
+@disjoint
+def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, fx, fy, fz):
+    """Forces on triangles with sides p and q in a relative wind u [N], see ``forces.add_air_forces``."""
+    half, one, tiny = px.dtype.type(0.5), px.dtype.type(1), px.dtype.type(1e-18)
+    for p in range(fx.shape[0]):
+        # normal times twice the area
+        nx, ny, nz = py[p] * qz[p] - pz[p] * qy[p], pz[p] * qx[p] - px[p] * qz[p], px[p] * qy[p] - py[p] * qx[p]
+        twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
+        speed = np.sqrt(ux[p] * ux[p] + uy[p] * uy[p] + uz[p] * uz[p])
+        skin = half * speed * along * twice
+        face = half * speed * (across - along) * (ux[p] * nx + uy[p] * ny + uz[p] * nz) * (one / twice)
+        fx[p], fy[p], fz[p] = face * nx + skin * ux[p], face * ny + skin * uy[p], face * nz + skin * uz[p]
+
+
+@disjoint
+def _share_out(f, own, others, first, second):
+    """One component of the forces of both triangles of cells on one of their corners."""
+    for p in range(first.shape[0]):
+        f[p] += own[p] * first[p] + others[p] * second[p]
+
+
+@uncounted
+def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
+    """The same forces as ``forces.add_air_forces``, for both triangles of all cells at once, and corner by corner.
+
+    A cell's corners are a, b, and c, d in the next row; its triangles are abd and adc where it is even, abc and bdc elsewhere.
+    """
+    cell, even, share = surface
+    across, along = resistance[0, 0], resistance[1, 0]
+    r, s, total = rows_of(x), rows_of(v), rows_of(f)
+    columns = cell[2]
+    count = r.shape[1] - columns - 1
+    rows = scratch.rows.reshape(scratch.rows.size)[: ROWS * count].reshape((ROWS, count))
+    for c in range(3):
+        a, b, at_c, at_d = r[c], r[c, 1:], r[c, columns:], r[c, columns + 1 :]
+        _spread_of(a, b, at_d, even, at_c, rows[c], rows[3 + c])
+        # seen from d, its triangle goes to c and to a or b
+        _spread_of(at_d, at_c, a, even, b, rows[6 + c], rows[9 + c])
+        va, vb, vc, vd = s[c], s[c, 1:], s[c, columns:], s[c, columns + 1 :]
+        for t in range(2):
+            k = 4 * t
+            _relative_wind(wind[c, 0], va, vb, vc, vd, share[k], share[k + 1], share[k + 2], share[k + 3], rows[12 + 3 * t + c])
+    for t in range(2):
+        p, u, out = 6 * t, 12 + 3 * t, 18 + 3 * t
+        _press(
+            rows[p], rows[p + 1], rows[p + 2], rows[p + 3], rows[p + 4], rows[p + 5], rows[u], rows[u + 1], rows[u + 2], across, along,
+            rows[out], rows[out + 1], rows[out + 2],
+        )  # fmt: skip
+    for corner in range(4):
+        at = cell[corner]
+        for c in range(3):
+            _share_out(total[c, at : at + count], share[corner], share[4 + corner], rows[18 + c], rows[21 + c])
+
+
+# --- the table ----------------------------------------------------------------------------------------------------------
+
+
+def kernels_of(model: Bending, by_particle: bool) -> dict[str, Any]:
+    """Forces by the names that integrators and the main loop call them by, for a model of bending.
+
+    by_particle: whether one sheet's particles lie side by side; else lanes do.
+    """
+    if not by_particle:
+        return model.kernels | {
+            "add_spring_forces": add_spring_forces, "add_spring_products": add_spring_products, "add_air_forces": add_air_forces,
+        }  # fmt: skip
+    # what bends linearly is added with the springs
+    hinges = (add_grid_hinge_forces, add_grid_hinge_products) if model.name == "hinge" else (add_bend_forces, add_bend_products)
+    return {
+        "add_spring_forces": add_grid_forces, "add_spring_products": add_grid_products, "add_air_forces": add_grid_air_forces,
+        "add_bend_forces": hinges[0], "add_bend_products": hinges[1],
+    }  # fmt: skip
