@@ -140,44 +140,45 @@ def project_quadratic(x, start, w, bends, scale, damping, relaxation, multiplier
 
 
 @disjoint
-def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
-    """The angle between two triangles [rad] into ``angle``, (lanes,), and its derivatives [1/m] into ``slopes``, (12, lanes).
+def _first_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, length, inverse, foot):
+    """The normal ``N = e x a`` of the triangle over edge e with the corner a, ``|e|``, ``1/|e|^2``, and where a's foot is on the edge."""
+    one, tiny = inverse.dtype.type(1), inverse.dtype.type(1e-30)
+    for l in range(inverse.shape[0]):
+        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
+        ax, ay, az = kx[l] - ix[l], ky[l] - iy[l], kz[l] - iz[l]
+        nx[l], ny[l], nz[l] = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
+        square = ex * ex + ey * ey + ez * ez + tiny
+        length[l], inverse[l] = np.sqrt(square), one / square
+        foot[l] = (ax * ex + ay * ey + az * ez) * inverse[l]
 
-    With e the edge, a and b the opposite corners seen from its first end, and the normals ``N = e x a`` and ``M = b x e``:
-    ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  Two more halvings bring it where a short polynomial is the arctangent.
-    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  Corners: three components each, (lanes,), or
-    (hinges,) where these lie side by side.  rows: scratch, (11, lanes).  Loops that write few rows vectorise: one loop for all this
-    would take four times as long.
+
+@disjoint
+def _second_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, inverse, mx, my, mz, foot, lift):
+    """The same of the other triangle, ``M = b x e``, and how far its corner b rises over the first one, ``N . b``."""
+    for l in range(foot.shape[0]):
+        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
+        bx, by, bz = kx[l] - ix[l], ky[l] - iy[l], kz[l] - iz[l]
+        mx[l], my[l], mz[l] = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
+        foot[l] = (bx * ex + by * ey + bz * ez) * inverse[l]
+        lift[l] = bx * nx[l] + by * ny[l] + bz * nz[l]
+
+
+@disjoint
+def _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l):
+    """Turn ``N . b`` into the angle, and find what a corner's rise tilts its triangle by, over the normal.
+
+    tilt_k: comes with the edge's length [m].
     """
-    lanes = angle.shape[0]
     t = angle.dtype.type
     one, tiny, least = t(1), t(1e-30), t(1e-9)
     c0, c1, c2, c3 = t(ARCTAN[0]), t(ARCTAN[1]), t(ARCTAN[2]), t(ARCTAN[3])
     c4, c5, c6, c7 = t(ARCTAN[4]), t(ARCTAN[5]), t(ARCTAN[6]), t(ARCTAN[7])
-    ix, iy, iz = xi
-    jx, jy, jz = xj
-    kx, ky, kz = xk
-    lx, ly, lz = xm
-    n0, n1, n2, m0, m1, m2 = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
-    inverse, foot_k, foot_l, tilt_k, tilt_l = rows[6], rows[7], rows[8], rows[9], rows[10]
-    for l in range(lanes):
-        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
-        ax, ay, az = kx[l] - ix[l], ky[l] - iy[l], kz[l] - iz[l]
-        n0[l], n1[l], n2[l] = ey * az - ez * ay, ez * ax - ex * az, ex * ay - ey * ax
-        inverse[l] = one / (ex * ex + ey * ey + ez * ez + tiny)
-        foot_k[l] = (ax * ex + ay * ey + az * ez) * inverse[l]
-    for l in range(lanes):
-        ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
-        bx, by, bz = lx[l] - ix[l], ly[l] - iy[l], lz[l] - iz[l]
-        m0[l], m1[l], m2[l] = by * ez - bz * ey, bz * ex - bx * ez, bx * ey - by * ex
-        foot_l[l] = (bx * ex + by * ey + bz * ez) * inverse[l]
-        angle[l] = bx * n0[l] + by * n1[l] + bz * n2[l]
-    for l in range(lanes):
-        nx, ny, nz, mx, my, mz = n0[l], n1[l], n2[l], m0[l], m1[l], m2[l]
-        nn, mm = nx * nx + ny * ny + nz * nz + tiny, mx * mx + my * my + mz * mz + tiny
-        length = one / np.sqrt(inverse[l])
+    for l in range(angle.shape[0]):
+        nn = nx[l] * nx[l] + ny[l] * ny[l] + nz[l] * nz[l] + tiny
+        mm = mx[l] * mx[l] + my[l] * my[l] + mz[l] * mz[l] + tiny
+        length = tilt_k[l]
         product = np.sqrt(nn) * np.sqrt(mm)
-        below, lowest = product + (nx * mx + ny * my + nz * mz), least * product
+        below, lowest = product + (nx[l] * mx[l] + ny[l] * my[l] + nz[l] * mz[l]), least * product
         half = -length * angle[l] / (below if below > lowest else lowest)
         quarter = half / (one + np.sqrt(one + half * half))
         z = quarter / (one + np.sqrt(one + quarter * quarter))
@@ -185,32 +186,53 @@ def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
         series = c0 + u * (c1 + u * (c2 + u * (c3 + u * (c4 + u * (c5 + u * (c6 + u * c7))))))
         angle[l] = t(8) * z * series
         tilt_k[l], tilt_l[l] = -length / nn, -length / mm
-    for c in range(3):
-        near, far, of_k, of_l, nc, mc = slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c], rows[c], rows[3 + c]
-        for l in range(lanes):
-            of_k[l] = tilt_k[l] * nc[l]
-        for l in range(lanes):
-            of_l[l] = tilt_l[l] * mc[l]
-        for l in range(lanes):
-            near[l] = (foot_k[l] - one) * of_k[l] + (foot_l[l] - one) * of_l[l]
-        for l in range(lanes):
-            far[l] = -foot_k[l] * of_k[l] - foot_l[l] * of_l[l]
 
 
 @disjoint
-def _rate_at(px, py, pz, sx, sy, sz, out):
-    for l in range(out.shape[0]):
-        out[l] += sx[l] * px[l] + sy[l] * py[l] + sz[l] * pz[l]
+def _slopes(n, m, foot_k, foot_l, tilt_k, tilt_l, near, far, of_k, of_l):
+    """One component of the angle's derivatives with respect to both ends of the edge and to both corners."""
+    one = near.dtype.type(1)
+    for l in range(near.shape[0]):
+        k, o = tilt_k[l] * n[l], tilt_l[l] * m[l]
+        of_k[l], of_l[l] = k, o
+        near[l] = (foot_k[l] - one) * k + (foot_l[l] - one) * o
+        far[l] = -foot_k[l] * k - foot_l[l] * o
 
 
 @inlined
-def hinge_rates(pi, pj, pk, pm, slopes, out):
-    """Derivative of the angle along ``p``, (lanes,); corners as for ``hinge_angles``."""
-    out[:] = 0
-    _rate_at(pi[0], pi[1], pi[2], slopes[0], slopes[1], slopes[2], out)
-    _rate_at(pj[0], pj[1], pj[2], slopes[3], slopes[4], slopes[5], out)
-    _rate_at(pk[0], pk[1], pk[2], slopes[6], slopes[7], slopes[8], out)
-    _rate_at(pm[0], pm[1], pm[2], slopes[9], slopes[10], slopes[11], out)
+def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
+    """The angle between two triangles [rad] into ``angle``, (lanes,), and its derivatives [1/m] into ``slopes``, (12, lanes).
+
+    With e the edge, a and b the opposite corners seen from its first end, and the normals ``N = e x a`` and ``M = b x e``:
+    ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  Two more halvings bring it where a short polynomial is the arctangent.
+    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  Corners: three components each, (lanes,), or
+    (hinges,) where these lie side by side.  rows: scratch, (11, lanes).
+    """
+    nx, ny, nz, mx, my, mz = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    inverse, foot_k, foot_l, tilt_k, tilt_l = rows[6], rows[7], rows[8], rows[9], rows[10]
+    _first_normal(xi[0], xi[1], xi[2], xj[0], xj[1], xj[2], xk[0], xk[1], xk[2], nx, ny, nz, tilt_k, inverse, foot_k)
+    _second_normal(
+        xi[0], xi[1], xi[2], xj[0], xj[1], xj[2], xm[0], xm[1], xm[2], nx, ny, nz, inverse, mx, my, mz, foot_l, angle
+    )  # fmt: skip
+    _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l)
+    for c in range(3):
+        _slopes(rows[c], rows[3 + c], foot_k, foot_l, tilt_k, tilt_l, slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c])
+
+
+@disjoint
+def _rates(ix, iy, iz, jx, jy, jz, kx, ky, kz, mx, my, mz, s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, out):
+    for l in range(out.shape[0]):
+        ends = (s0[l] * ix[l] + s1[l] * iy[l] + s2[l] * iz[l]) + (s3[l] * jx[l] + s4[l] * jy[l] + s5[l] * jz[l])
+        out[l] = (ends + (s6[l] * kx[l] + s7[l] * ky[l] + s8[l] * kz[l])) + (s9[l] * mx[l] + s10[l] * my[l] + s11[l] * mz[l])
+
+
+@inlined
+def hinge_rates(pi, pj, pk, pm, s, out):
+    """Derivative of the angle along ``p``, (lanes,), with the slopes s; corners as for ``hinge_angles``."""
+    _rates(
+        pi[0], pi[1], pi[2], pj[0], pj[1], pj[2], pk[0], pk[1], pk[2], pm[0], pm[1], pm[2], s[0], s[1], s[2], s[3], s[4], s[5],
+        s[6], s[7], s[8], s[9], s[10], s[11], out,
+    )  # fmt: skip
 
 
 @inlined

@@ -22,7 +22,6 @@ import numpy as np
 
 from clothgym._jit import disjoint, inlined, uncounted
 from clothgym.bending import Bending, add_bend_forces, add_bend_products, hinge_angles, hinge_rates, hinge_rows
-from clothgym.elements import ROWS
 from clothgym.forces import add_air_forces, add_spring_forces, add_spring_products
 
 TINY = 1e-30  # [m^2], see ``forces``
@@ -213,10 +212,12 @@ def _moments(angle, rate, weight, rigidity, tau):
 
 
 @disjoint
-def _turn(f, slope, moment):
-    """One component of what a moment does to one of its corners."""
+def _turn(fx, fy, fz, sx, sy, sz, moment):
+    """What a moment does to one of its corners, with slopes s."""
     for p in range(moment.shape[0]):
-        f[p] -= slope[p] * moment[p]
+        fx[p] -= sx[p] * moment[p]
+        fy[p] -= sy[p] * moment[p]
+        fz[p] -= sz[p] * moment[p]
 
 
 @inlined
@@ -248,8 +249,8 @@ def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
         )  # fmt: skip
         _moments(angle, rate, grid.hinge_weight[family, low : low + count], rigidity, tau)
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
-            for c in range(3):
-                _turn(total[c, at : at + count], slopes[3 * m + c], angle)
+            fx, fy, fz = _slices(total, at, count)
+            _turn(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
 
 
 @uncounted
@@ -275,49 +276,68 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
         rate[:] = zero
         _moments(angle, rate, grid.hinge_weight[family, low : low + count], -bend[0], zero)
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
-            for c in range(3):
-                _turn(total[c, at : at + count], slopes[3 * m + c], angle)
+            fx, fy, fz = _slices(total, at, count)
+            _turn(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
 
 
 # --- air ----------------------------------------------------------------------------------------------------------------
 
 
-@disjoint
-def _spread_of(a, b, far, even, other, out_first, out_second):
-    """One component of a triangle's sides from the corner a to b and to the third corner, ``far`` where even, else ``other``."""
-    zero = a.dtype.type(0)
-    for p in range(out_first.shape[0]):
-        third = far[p] if even[p] > zero else other[p]
-        out_first[p] = b[p] - a[p]
-        out_second[p] = third - a[p]
+@inlined
+def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
+    """Force on a triangle with sides p and q in a relative wind u [N], see ``forces.add_air_forces``."""
+    # normal times twice the area
+    nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+    twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
+    speed = np.sqrt(ux * ux + uy * uy + uz * uz)
+    skin = half * speed * along * twice
+    face = half * speed * (across - along) * (ux * nx + uy * ny + uz * nz) * (one / twice)
+    return face * nx + skin * ux, face * ny + skin * uy, face * nz + skin * uz
 
 
 @disjoint
-def _relative_wind(wind, a, b, c, d, sa, sb, sc, sd, out):
-    """One component of the wind relative to triangles [m/s], whose velocities are the shares' means of their corners'."""
-    for p in range(out.shape[0]):
-        out[p] = wind - (sa[p] * a[p] + sb[p] * b[p] + sc[p] * c[p] + sd[p] * d[p])
-
-
-@disjoint
-def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, fx, fy, fz):
-    """Forces on triangles with sides p and q in a relative wind u [N], see ``forces.add_air_forces``."""
-    half, one, tiny = px.dtype.type(0.5), px.dtype.type(1), px.dtype.type(1e-18)
+def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
+    """Forces on the first triangles of cells: a, b, and d where they are even, else c.  s: shares; w: the wind [m/s]."""
+    half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
+    xb, yb, zb, ub, vb, wb = x[1:], y[1:], z[1:], vx[1:], vy[1:], vz[1:]
+    xc, yc, zc, uc, vc, wc = x[c:], y[c:], z[c:], vx[c:], vy[c:], vz[c:]
+    xd, yd, zd, ud, vd, wd = x[c + 1 :], y[c + 1 :], z[c + 1 :], vx[c + 1 :], vy[c + 1 :], vz[c + 1 :]
     for p in range(fx.shape[0]):
-        # normal times twice the area
-        nx, ny, nz = py[p] * qz[p] - pz[p] * qy[p], pz[p] * qx[p] - px[p] * qz[p], px[p] * qy[p] - py[p] * qx[p]
-        twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
-        speed = np.sqrt(ux[p] * ux[p] + uy[p] * uy[p] + uz[p] * uz[p])
-        skin = half * speed * along * twice
-        face = half * speed * (across - along) * (ux[p] * nx + uy[p] * ny + uz[p] * nz) * (one / twice)
-        fx[p], fy[p], fz[p] = face * nx + skin * ux[p], face * ny + skin * uy[p], face * nz + skin * uz[p]
+        whole = even[p] > zero
+        qx, qy, qz = (xd[p] if whole else xc[p]) - x[p], (yd[p] if whole else yc[p]) - y[p], (zd[p] if whole else zc[p]) - z[p]
+        ux = wx - (sa[p] * vx[p] + sb[p] * ub[p] + sc[p] * uc[p] + sd[p] * ud[p])
+        uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
+        uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
+        fx[p], fy[p], fz[p] = _press(
+            xb[p] - x[p], yb[p] - y[p], zb[p] - z[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
+        )  # fmt: skip
 
 
 @disjoint
-def _share_out(f, own, others, first, second):
-    """One component of the forces of both triangles of cells on one of their corners."""
-    for p in range(first.shape[0]):
-        f[p] += own[p] * first[p] + others[p] * second[p]
+def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
+    """The same for their second triangles: d, c, and a where they are even, else b."""
+    half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
+    xb, yb, zb, ub, vb, wb = x[1:], y[1:], z[1:], vx[1:], vy[1:], vz[1:]
+    xc, yc, zc, uc, vc, wc = x[c:], y[c:], z[c:], vx[c:], vy[c:], vz[c:]
+    xd, yd, zd, ud, vd, wd = x[c + 1 :], y[c + 1 :], z[c + 1 :], vx[c + 1 :], vy[c + 1 :], vz[c + 1 :]
+    for p in range(fx.shape[0]):
+        whole = even[p] > zero
+        qx, qy, qz = (x[p] if whole else xb[p]) - xd[p], (y[p] if whole else yb[p]) - yd[p], (z[p] if whole else zb[p]) - zd[p]
+        ux = wx - (sa[p] * vx[p] + sb[p] * ub[p] + sc[p] * uc[p] + sd[p] * ud[p])
+        uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
+        uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
+        fx[p], fy[p], fz[p] = _press(
+            xc[p] - xd[p], yc[p] - yd[p], zc[p] - zd[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
+        )  # fmt: skip
+
+
+@disjoint
+def _share_out(fx, fy, fz, own, others, ax, ay, az, bx, by, bz):
+    """Add the forces of both triangles of cells, a and b, to one of their corners."""
+    for p in range(ax.shape[0]):
+        fx[p] += own[p] * ax[p] + others[p] * bx[p]
+        fy[p] += own[p] * ay[p] + others[p] * by[p]
+        fz[p] += own[p] * az[p] + others[p] * bz[p]
 
 
 @uncounted
@@ -326,31 +346,22 @@ def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
 
     A cell's corners are a, b, and c, d in the next row; its triangles are abd and adc where it is even, abc and bdc elsewhere.
     """
-    cell, even, share = surface
+    cell, even, s = surface
     across, along = resistance[0, 0], resistance[1, 0]
-    r, s, total = rows_of(x), rows_of(v), rows_of(f)
-    columns = cell[2]
+    r, u, total, columns = rows_of(x), rows_of(v), rows_of(f), cell[2]
     count = r.shape[1] - columns - 1
-    rows = scratch.rows.reshape(scratch.rows.size)[: ROWS * count].reshape((ROWS, count))
-    for c in range(3):
-        a, b, at_c, at_d = r[c], r[c, 1:], r[c, columns:], r[c, columns + 1 :]
-        _spread_of(a, b, at_d, even, at_c, rows[c], rows[3 + c])
-        # seen from d, its triangle goes to c and to a or b
-        _spread_of(at_d, at_c, a, even, b, rows[6 + c], rows[9 + c])
-        va, vb, vc, vd = s[c], s[c, 1:], s[c, columns:], s[c, columns + 1 :]
-        for t in range(2):
-            k = 4 * t
-            _relative_wind(wind[c, 0], va, vb, vc, vd, share[k], share[k + 1], share[k + 2], share[k + 3], rows[12 + 3 * t + c])
-    for t in range(2):
-        p, u, out = 6 * t, 12 + 3 * t, 18 + 3 * t
-        _press(
-            rows[p], rows[p + 1], rows[p + 2], rows[p + 3], rows[p + 4], rows[p + 5], rows[u], rows[u + 1], rows[u + 2], across, along,
-            rows[out], rows[out + 1], rows[out + 2],
-        )  # fmt: skip
+    ax, ay, az = scratch.rows[0, :count], scratch.rows[1, :count], scratch.rows[2, :count]
+    bx, by, bz = scratch.rows[3, :count], scratch.rows[4, :count], scratch.rows[5, :count]
+    wx, wy, wz = wind[0, 0], wind[1, 0], wind[2, 0]
+    _first_triangles(
+        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[0], s[1], s[2], s[3], wx, wy, wz, across, along, ax, ay, az
+    )  # fmt: skip
+    _second_triangles(
+        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[4], s[5], s[6], s[7], wx, wy, wz, across, along, bx, by, bz
+    )  # fmt: skip
     for corner in range(4):
-        at = cell[corner]
-        for c in range(3):
-            _share_out(total[c, at : at + count], share[corner], share[4 + corner], rows[18 + c], rows[21 + c])
+        fx, fy, fz = _slices(total, cell[corner], count)
+        _share_out(fx, fy, fz, s[corner], s[4 + corner], ax, ay, az, bx, by, bz)
 
 
 # --- the table ----------------------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from clothgym import _jit, guards, integrators, limiting
 from clothgym._jit import specialize, uncounted
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
-from clothgym.collisions import DESK, Collider, SelfCollision, Solids, room_for_touches
-from clothgym.collisions.response import KERNELS as CONTACT
+from clothgym.collisions import Collider, SelfCollision, Solids
+from clothgym.collisions.response import kernels_of as contact_kernels
 from clothgym.collisions.response import needed
 from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
 from clothgym.elements import Elastic, digest_of, element_arrays, is_regular, surface_arrays, weave_of
@@ -41,7 +41,7 @@ AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked
 
 def advance_one(
     x, v, w, weave, elastic, drag_rate, resistance, gravity, wind, shapes, colliders, sheet, block, h, carried, substeps, air_every,
-    look_every, options, plan, push, work, touches, desk, limit, limited,
+    look_every, options, plan, push, work, room, limit, limited,
 ):  # fmt: skip
     """All substeps of one block."""
     for step in range(substeps):
@@ -52,7 +52,7 @@ def advance_one(
         restrain(x, v, w, weave.springs, limit, limited)  # noqa: F821
         press(x, v, w, sheet, block, step, h, carried)  # noqa: F821
         look = step % look_every == 0
-        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, touches, desk)  # noqa: F821
+        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, room)  # noqa: F821
         keep_apart(x, v, w, sheet, block, h, carried)  # noqa: F821
     remeasure(x, weave.springs, limited)  # noqa: F821
 
@@ -64,15 +64,14 @@ def advance(
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
     work, push = room_for_work(x[first], weave.offset, room), np.zeros(x.shape[1:], x.dtype)
-    touches = room_for_touches(x[first], weave.triangles, shapes)
-    desk = np.empty((DESK, x.shape[3]), x.dtype)
+    contact_room = room_for_contact(x[first], weave.triangles, shapes)  # noqa: F821
     for b in range(first, last):
         push[:] = 0
         limited[b] = 0
         elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
         advance_block(  # noqa: F821
             x[b], v[b], w[b], weave, elastic, drag_rate[b], resistance[b], gravity[b], wind[b], shapes, colliders[b], sheet, b, h,
-            carried, substeps, air_every, look_every, options, plan, push, work, touches, desk, limit, limited[b],
+            carried, substeps, air_every, look_every, options, plan, push, work, contact_room, limit, limited[b],
         )  # fmt: skip
         mark_diverged(x[b], v[b], diverged[b])
 
@@ -82,11 +81,12 @@ def _compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits
     """The main loop around an integrator's substep, in which the forces are those of the model and of the layout."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     bound = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **forces)
-    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | CONTACT[contact]
+    touching = contact_kernels(contact, by_particle)
+    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | touching
     parts |= {"add_air_forces": forces["add_air_forces"], "substep": bound}
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
     block = specialize(uncounted(advance_one), f"advance_one_{which}", apart=True, **parts)
-    return specialize(advance, f"advance_{which}", advance_block=block)
+    return specialize(advance, f"advance_{which}", advance_block=block, **touching)
 
 
 class Simulation(Observed):
@@ -212,13 +212,8 @@ class Simulation(Observed):
     def step(self, n: int = 1) -> None:
         """Advance all environments by ``n`` control steps; hands move towards their targets at a bounded speed."""
         count("n", n)
-        h = self.dtype.type(self.time_step / self.substeps)
-        carried = self.dtype.type(h * self.integrator.carried)
         self._prepare()
-        room = self.integrator.room(len(self._elements.springs.weight), len(self._elements.bends.weight))
-        options, limit = tuple(self.integrator.options.values()), float(self.strain_limit or 0)
-        look_every = max(1, int(SURFACE_INTERVAL / h))
-        air_every = max(1, int(AIR_INTERVAL / h)) if self._fabric.resistance.any() else 0
+        schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
 
         def work(first: int, last: int) -> None:
             held, blocks = None, slice(first, last)
@@ -230,31 +225,41 @@ class Simulation(Observed):
             if held is not None:
                 self._contact.forgive(self._hands.holder[blocks] != held, blocks)
             self._advance(
-                first, last, self._x, self._v, self._w, self._weave, self._fabric,
-                self._solids.shapes, self._solids.rows, self._contact.sheet, h, carried, self.substeps, air_every, look_every,
-                options, self._plan, room, limit, self._limited, self._diverged,
+                first, last, self._x, self._v, self._w, self._weave, self._fabric, self._solids.shapes, self._solids.rows, sheet,
+                *schedule, self._limited, self._diverged,
             )  # fmt: skip
 
         for _ in range(n):
             _jit.run_spans(work, self.layout.blocks, self.threads)
-            self._solids.end_step()
+            if self.colliders:
+                self._solids.end_step()
             if self._hands.can_slip:
                 self._hands.slip(self._pulls(), self._w, self._free_w)
                 self._forgive_lag()
             self._steps += 1
             self._contact.warn(self._steps)
-            if self._diverged.any() and self.on_divergence != "ignore":
+            if self.on_divergence != "ignore" and self._diverged.any():
                 new = self.diverged & ~self._reported
                 self._reported |= new
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
 
     def _prepare(self) -> None:
-        """Make the integrator's plan anew if the figures or the substeps have changed."""
-        if self.integrator.prepare is not None and self._planned_substeps != self.substeps:
+        """Make the integrator's plan, and what else the main loop is told, anew if the figures or the substeps have changed."""
+        if self._planned_substeps == self.substeps:
+            return
+        self._planned_substeps = self.substeps
+        method, h = self.integrator, self.time_step / self.substeps
+        if method.prepare is not None:
             holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._hands.members
-            plan = self.integrator.prepare(Preparation(self._oscillators(0), self.time_step / self.substeps, holdable))
+            plan = method.prepare(Preparation(self._oscillators(0), h, holdable))
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
-            self._planned_substeps = self.substeps
+        # a share of a substep more, or rounding would make three of them two
+        look_every, air_every = (max(1, int(interval / h + 1e-3)) for interval in (SURFACE_INTERVAL, AIR_INTERVAL))
+        self._schedule = (
+            self.dtype.type(h), self.dtype.type(h * method.carried), self.substeps,
+            air_every if self._fabric.resistance.any() else 0, look_every, tuple(method.options.values()), self._plan,
+            method.room(len(self._elements.springs.weight), len(self._elements.bends.weight)), float(self.strain_limit or 0),
+        )  # fmt: skip
 
     def largest_substep(self, env: int = 0) -> tuple[float, str]:
         """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""

@@ -71,10 +71,11 @@ def may_touch_solid(x, p, collider):
 
 @kernel
 def lay_out(collider, desk):
-    """Copy a solid's rows to the desk, which is clear of nothing."""
+    """Copy a solid's rows to the desk, the same to all columns if it is one environment's; the desk is clear of nothing."""
+    last = collider.shape[1] - 1
     for r in range(collider.shape[0]):
         for l in range(desk.shape[1]):
-            desk[r, l] = collider[r, l]
+            desk[r, l] = collider[r, min(l, last)]
     for l in range(desk.shape[1]):
         desk[CLEAR, l] = 0
 
@@ -135,26 +136,36 @@ def measure_mesh(desk, at, shapes, k, within):
 
 
 @inlined
+def rounded_box(qx, qy, qz, hx, hy, hz, radius, zero, one):
+    """Signed distance and normal of a point q, with a = |q| - h: outside the inner box the distance is ``|max(a, 0)| - r``, inside
+    it ``max(a) - r``."""
+    ax, ay, az = abs(qx) - hx, abs(qy) - hy, abs(qz) - hz
+    ox, oy, oz = max(ax, zero), max(ay, zero), max(az, zero)
+    outside = np.sqrt(ox * ox + oy * oy + oz * oz)
+    deepest = max(ax, max(ay, az))
+    beyond = outside > zero
+    scale = one / outside if beyond else one
+    # inside, the normal is that of the nearest face
+    fx = one if ax >= deepest else zero
+    fy = one if (ay >= deepest and ax < deepest) else zero
+    fz = one - fx - fy
+    nx = (ox * scale if beyond else fx) * (one if qx >= zero else -one)
+    ny = (oy * scale if beyond else fy) * (one if qy >= zero else -one)
+    nz = (oz * scale if beyond else fz) * (one if qz >= zero else -one)
+    return (outside if beyond else deepest) - radius, nx, ny, nz
+
+
+@inlined
 def measure_rounded_box(desk, at, shapes, k, within):
-    """With a = |q| - b: outside the inner box the distance is ``|max(a, 0)| - r``, inside it ``max(a) - r``."""
-    zero = desk.dtype.type(0)
-    one = desk.dtype.type(1)
+    """See ``rounded_box``."""
+    zero, one = desk.dtype.type(0), desk.dtype.type(1)
     for l in range(desk.shape[1]):
-        qx, qy, qz = desk[at, l], desk[at + 1, l], desk[at + 2, l]
-        ax, ay, az = abs(qx) - desk[HALF, l], abs(qy) - desk[HALF + 1, l], abs(qz) - desk[HALF + 2, l]
-        ox, oy, oz = max(ax, zero), max(ay, zero), max(az, zero)
-        outside = np.sqrt(ox * ox + oy * oy + oz * oz)
-        deepest = max(ax, max(ay, az))
-        beyond = outside > zero
-        scale = one / outside if beyond else one
-        # inside, the normal is that of the nearest face
-        fx = one if ax >= deepest else zero
-        fy = one if (ay >= deepest and ax < deepest) else zero
-        fz = one - fx - fy
-        desk[CONTACT, l] = (outside if beyond else deepest) - desk[RADIUS, l]
-        desk[CONTACT + 1, l] = (ox * scale if beyond else fx) * (one if qx >= zero else -one)
-        desk[CONTACT + 2, l] = (oy * scale if beyond else fy) * (one if qy >= zero else -one)
-        desk[CONTACT + 3, l] = (oz * scale if beyond else fz) * (one if qz >= zero else -one)
+        hx, hy, hz, radius = desk[HALF, l], desk[HALF + 1, l], desk[HALF + 2, l], desk[RADIUS, l]
+        distance, nx, ny, nz = rounded_box(desk[at, l], desk[at + 1, l], desk[at + 2, l], hx, hy, hz, radius, zero, one)
+        desk[CONTACT, l] = distance
+        desk[CONTACT + 1, l] = nx
+        desk[CONTACT + 2, l] = ny
+        desk[CONTACT + 3, l] = nz
 
 
 @kernel

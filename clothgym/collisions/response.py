@@ -1,20 +1,18 @@
-"""Contact of a sheet with solids: no penetration, no inward velocity, Coulomb friction.
+"""Contact of sheets with solids: no penetration, no inward velocity, Coulomb friction (see ``contact_law``).
 
 Applied after each substep to the positions and velocities that the integrator left, of the particles and of the sheet between them
-(``surface``).  The normal impulse is the inward velocity that is taken away; friction takes at most ``mu`` times
-as much from the tangential velocity (Bridson, Fedkiw and Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction
-takes from the velocity is taken from the displacement too, as far as the integrator has moved by it, or a sheet at rest on a slope
-would creep by ``h^2 g sin`` a substep.
+(``surface``).  For one sheet whose particles lie side by side the same is in ``sheet_response``.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel, specialize
+from clothgym.collisions.contact_law import TINY, contact_change
 from clothgym.collisions.distance import (
     CONTACT,
     DESK,
@@ -33,7 +31,8 @@ from clothgym.collisions.distance import (
     to_axes,
 )
 from clothgym.collisions.shapes import FRICTION, PLANE, POINT, ROUNDED_BOX, VELOCITY
-from clothgym.collisions.surface import any_near, find_touches, press
+from clothgym.collisions.sheet_response import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
+from clothgym.collisions.surface import any_near, find_touches, press, room_for_touches
 from clothgym.state import Layout
 
 
@@ -42,33 +41,26 @@ def _push_out(x, v, w, p, carried, desk):
     """Correct the position and velocity of particle ``p``, for the contact on the desk."""
     zero = x.dtype.type(0)
     one = x.dtype.type(1)
-    tiny = x.dtype.type(1e-12)
+    tiny = x.dtype.type(TINY)
     for c in range(3):
         for l in range(x.shape[2]):
             desk[MOTION + c, l] = v[c, p, l]
     for l in range(x.shape[2]):
         desk[YIELDING, l] = w[p, l]
     for l in range(x.shape[2]):
-        distance, nx, ny, nz = desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
-        touching = distance < zero and desk[YIELDING, l] > zero
-        # velocity relative to the solid, split along the normal
+        nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         ux = desk[MOTION, l] - desk[VELOCITY, l]
         uy = desk[MOTION + 1, l] - desk[VELOCITY + 1, l]
         uz = desk[MOTION + 2, l] - desk[VELOCITY + 2, l]
-        un = ux * nx + uy * ny + uz * nz
-        tx, ty, tz = ux - un * nx, uy - un * ny, uz - un * nz
-        stopped = max(-un, zero)
-        speed = np.sqrt(tx * tx + ty * ty + tz * tz) + tiny
-        lost = min(desk[FRICTION, l] * stopped / speed, one)
-        lost = lost if touching else zero
-        stopped = stopped if touching else zero
-        depth = -distance if touching else zero
-        desk[SPOT, l] = depth * nx - carried * lost * tx
-        desk[SPOT + 1, l] = depth * ny - carried * lost * ty
-        desk[SPOT + 2, l] = depth * nz - carried * lost * tz
-        desk[MOTION, l] = stopped * nx - lost * tx
-        desk[MOTION + 1, l] = stopped * ny - lost * ty
-        desk[MOTION + 2, l] = stopped * nz - lost * tz
+        mx, my, mz, cx, cy, cz = contact_change(
+            desk[CONTACT, l], nx, ny, nz, ux, uy, uz, desk[YIELDING, l], desk[FRICTION, l], carried, zero, one, tiny
+        )
+        desk[SPOT, l] = mx
+        desk[SPOT + 1, l] = my
+        desk[SPOT + 2, l] = mz
+        desk[MOTION, l] = cx
+        desk[MOTION + 1, l] = cy
+        desk[MOTION + 2, l] = cz
     for c in range(3):
         for l in range(x.shape[2]):
             x[c, p, l] += desk[SPOT + c, l]
@@ -95,14 +87,14 @@ _resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_s
 
 
 @apart
-def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room):
     """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
     x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
     ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the positions already [s];
-    desk: scratch, (DESK, lanes).  The others are for ``resolve``.
+    room: of ``room_in_lanes``.  The others are for ``resolve``.
     """
-    kinds = shapes.kinds
+    kinds, desk = shapes.kinds, room[1]
     for k in range(kinds.shape[0]):
         collider = colliders[k]
         for c in range(3):
@@ -118,12 +110,13 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, t
 
 
 @apart
-def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, room):
     """The same for the whole sheet.
 
-    triangles: of the sheet; look: whether to look anew where it touches between its particles, to ``touches``.
+    triangles: of the sheet; look: whether to look anew where it touches between its particles.
     """
-    resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk)
+    resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room)
+    touches, desk = room
     kinds = shapes.kinds
     if look:
         touches[2][0] = 0
@@ -135,12 +128,28 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, touches, de
 
 
 @kernel
-def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, touches, desk):
+def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, room):
     """The same where there are no solids."""
 
 
-# the name that the main loop calls, for contact with the sheet, with its particles alone, and with nothing
-KERNELS = {"sheet": {"resolve": resolve}, "particles": {"resolve": resolve_particles}, "nothing": {"resolve": resolve_nothing}}
+@kernel
+def room_in_lanes(x, triangles, shapes):
+    """Room for contact of one block, in lanes: touches, and a desk."""
+    return room_for_touches(x, triangles, shapes), np.empty((DESK, x.shape[2]), x.dtype)
+
+
+# the names that the main loop calls, for contact with the sheet, with its particles alone, and with nothing: in lanes, and for one
+# sheet whose particles lie side by side
+KERNELS = {
+    False: {"sheet": resolve, "particles": resolve_particles, "nothing": resolve_nothing},
+    True: {"sheet": resolve_on_sheet, "particles": resolve_particles_on_sheet, "nothing": resolve_nothing},
+}
+ROOM = {False: room_in_lanes, True: room_on_sheet}
+
+
+def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
+    """Kernels of contact by the names that the main loop calls them by."""
+    return {"resolve": KERNELS[by_particle][contact], "room_for_contact": ROOM[by_particle]}
 
 
 def needed(contact: str, kinds: NDArray) -> str:

@@ -24,7 +24,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import apart, inlined, kernel, uncounted
+from clothgym.collisions.contact_law import RELAXED, TINY, touch_change
 from clothgym.collisions.distance import (
     BEFORE,
     BETWEEN,
@@ -45,7 +46,6 @@ from clothgym.collisions.distance import (
 from clothgym.collisions.shapes import FRICTION, HALF, MESH, PLANE, POINT, RADIUS, REACH2, THICKNESS, VELOCITY
 
 TOUCH = 7  # rows of a touch: weights; gap, from the solid's point along the normal; normal
-RELAXED = 0.05  # of the depth that the last substep's inward motion does not explain is taken back in a substep
 NONE = 1e9  # [m], the gap of a lane that does not touch
 MESH_ROUNDS, BOX_STEPS = 3, 8
 MOST = 0.98  # of the distance is left after a round, where a leap trusts the rounds
@@ -82,7 +82,7 @@ def any_near(x, collider, desk):
 
 
 @inlined
-def _may_touch_triangle(desk):
+def may_touch_triangle(desk):
     """Whether any lane's triangle comes near the solid; its centre goes to SPOT, its radius to RHO, and to CLEAR whether it surely
     does not touch: its corners lie beyond one face of the box of half sides b + r, as those of cloth that lies on a box do.
 
@@ -221,7 +221,7 @@ def _leap(desk):
         desk[CORE + 2, l] = desk[SPOT + 2, l] + leap * fz
 
 
-@apart
+@uncounted
 def find_deepest(desk, shapes, k):
     """Find the deepest point of the triangle in CORNERS, from SPOT on, all in the solid's axes; return whether any lane may touch.
 
@@ -262,7 +262,7 @@ def find_deepest(desk, shapes, k):
 
 
 @kernel
-def _turn_normal(desk):
+def turn_normal(desk):
     """Turn CONTACT's normal into that of contact, and its distance into the gap along it; return whether any lane needs it.
 
     A lane whose gap is wider than a part of the thickness, or which surely does not touch, has none.
@@ -292,27 +292,22 @@ def _turn_normal(desk):
 @inlined
 def _push_out(h, carried, desk):
     """What the contact changes, per inverse mass and weight of a corner: of positions to SPOT, of velocities to MOTION."""
-    zero, one, tiny, relaxed = desk.dtype.type(0), desk.dtype.type(1), desk.dtype.type(1e-12), desk.dtype.type(RELAXED)
+    zero, one = desk.dtype.type(0), desk.dtype.type(1)
+    tiny, relaxed = desk.dtype.type(TINY), desk.dtype.type(RELAXED)
     for l in range(desk.shape[1]):
-        depth, nx, ny, nz = -desk[CONTACT, l], desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
-        yielding = desk[YIELDING, l]
-        share = one / yielding if (depth > zero) & (yielding > zero) else zero
+        nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
         ux = desk[MOTION, l] - desk[VELOCITY, l]
         uy = desk[MOTION + 1, l] - desk[VELOCITY + 1, l]
         uz = desk[MOTION + 2, l] - desk[VELOCITY + 2, l]
-        un = ux * nx + uy * ny + uz * nz
-        tx, ty, tz = ux - un * nx, uy - un * ny, uz - un * nz
-        stopped = max(-un, zero)
-        moved = min(depth, stopped * h)
-        depth = moved + relaxed * (depth - moved)
-        speed = np.sqrt(tx * tx + ty * ty + tz * tz) + tiny
-        lost = min(desk[FRICTION, l] * stopped / speed, one)
-        desk[SPOT, l] = share * (depth * nx - carried * lost * tx)
-        desk[SPOT + 1, l] = share * (depth * ny - carried * lost * ty)
-        desk[SPOT + 2, l] = share * (depth * nz - carried * lost * tz)
-        desk[MOTION, l] = share * (stopped * nx - lost * tx)
-        desk[MOTION + 1, l] = share * (stopped * ny - lost * ty)
-        desk[MOTION + 2, l] = share * (stopped * nz - lost * tz)
+        mx, my, mz, cx, cy, cz = touch_change(
+            desk[CONTACT, l], nx, ny, nz, ux, uy, uz, desk[YIELDING, l], desk[FRICTION, l], h, carried, zero, one, tiny, relaxed
+        )
+        desk[SPOT, l] = mx
+        desk[SPOT + 1, l] = my
+        desk[SPOT + 2, l] = mz
+        desk[MOTION, l] = cx
+        desk[MOTION + 1, l] = cy
+        desk[MOTION + 2, l] = cz
 
 
 @inlined
@@ -343,7 +338,7 @@ def _fetch(rows, desk, at):
 
 
 @kernel
-def _near_in_grid(desk, shapes, k):
+def near_in_grid(desk, shapes, k):
     """Whether any lane's triangle can reach a mesh, judged at its centre; CLEAR learns whose cannot."""
     measure(desk, SPOT, shapes, k, desk.dtype.type(0))
     near = False
@@ -380,11 +375,11 @@ def find_touches(x, triangles, shapes, k, touches, desk):
     for t in range(triangles.shape[0]):
         for c in range(3):
             _fetch(local[triangles[t, c]], desk, CORNERS + 3 * c)
-        if not _may_touch_triangle(desk):
+        if not may_touch_triangle(desk):
             continue
-        if shapes.kinds[k] == MESH and not _near_in_grid(desk, shapes, k):
+        if shapes.kinds[k] == MESH and not near_in_grid(desk, shapes, k):
             continue
-        if find_deepest(desk, shapes, k) and _turn_normal(desk):
+        if find_deepest(desk, shapes, k) and turn_normal(desk):
             # the plane, as how far it is from the solid's point along the normal
             for l in range(desk.shape[1]):
                 nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]

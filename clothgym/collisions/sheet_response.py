@@ -1,0 +1,389 @@
+"""Contact of one sheet with solids, where its particles lie side by side: the same as ``response`` and ``surface`` in lanes.
+
+Particles are measured all at once, from the first that a solid may touch to the last.  Triangles are chosen by the cells of the grid:
+those that may touch are put on desks of ``COLUMNS`` triangles, where lanes have one triangle each (see ``distance``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import disjoint, inlined, kernel, uncounted
+from clothgym.collisions.contact_law import RELAXED, TINY, contact_change, touch_change
+from clothgym.collisions.distance import (
+    CLEAR,
+    CONTACT,
+    CORNERS,
+    DESK,
+    SPOT,
+    WEIGHTS,
+    lay_out,
+    measure_mesh,
+    normal_to_world,
+    rounded_box,
+)
+from clothgym.collisions.shapes import (
+    AXES,
+    FRICTION,
+    HALF,
+    MESH,
+    PLANE,
+    POINT,
+    RADIUS,
+    REACH2,
+    ROUNDED_BOX,
+    THICKNESS,
+    VELOCITY,
+)
+from clothgym.collisions.surface import (
+    NONE,
+    SINKS,
+    TOUCH,
+    find_deepest,
+    may_touch_triangle,
+    near_in_grid,
+    turn_normal,
+)
+
+COLUMNS = 32  # triangles on a desk
+ROWS = 9  # of scratch: places in the solid's axes, its distance and normal, how near cells are
+LOCAL, GAP, NORMAL, NEAR = 0, 3, 4, 7
+NEAREST = 0.58  # of its longest side: no point of a triangle is farther from all its corners (1/sqrt(3) where that is equilateral)
+
+
+@kernel
+def room_on_sheet(x, triangles, shapes):
+    """Room for contact of one sheet: touches, (most, TOUCH), their triangles and solids, (most, 2), how many, (1,); scratch, (ROWS,
+    particles) and (triangles,); and a desk, (DESK, COLUMNS)."""
+    solids = 0
+    for k in range(shapes.kinds.shape[0]):
+        solids += shapes.kinds[k] != PLANE
+    most = triangles.shape[0] * solids
+    return (
+        np.empty((most, TOUCH), x.dtype), np.empty((most, 2), np.int64), np.zeros(1, np.int64),
+        np.empty((ROWS, x.shape[1]), x.dtype), np.empty(triangles.shape[0], np.int64), np.empty((DESK, COLUMNS), x.dtype),
+    )  # fmt: skip
+
+
+# --- particles ----------------------------------------------------------------------------------------------------------
+
+
+@disjoint
+def _heights(x, y, z, px, py, pz, nx, ny, nz, radius, gap):
+    """Signed distance of particles to a plane [m]; returns how many are in it."""
+    count, zero = 0, x.dtype.type(0)
+    for p in range(x.shape[0]):
+        gap[p] = (x[p] - px) * nx + (y[p] - py) * ny + (z[p] - pz) * nz - radius
+        count += gap[p] < zero
+    return count
+
+
+@disjoint
+def _squares(x, y, z, px, py, pz, reach2, gap):
+    """How far the square of particles' distance to a solid's point is beyond its reach's; returns how many are not."""
+    count, zero = 0, x.dtype.type(0)
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p] - px, y[p] - py, z[p] - pz
+        gap[p] = dx * dx + dy * dy + dz * dz - reach2
+        count += gap[p] < zero
+    return count
+
+
+@inlined
+def _span(gap):
+    """From the first to the last of what is below zero."""
+    first, last = 0, gap.shape[0]
+    while first < last and gap[first] >= 0:
+        first += 1
+    while last > first and gap[last - 1] >= 0:
+        last -= 1
+    return first, last
+
+
+@disjoint
+def _to_axis(x, y, z, px, py, pz, ax, ay, az, out):
+    """Particles' places along one axis of a solid [m]."""
+    for p in range(out.shape[0]):
+        out[p] = (x[p] - px) * ax + (y[p] - py) * ay + (z[p] - pz) * az
+
+
+@disjoint
+def _measure_boxes(x, y, z, hx, hy, hz, radius, gap, nx, ny, nz):
+    """Signed distance [m] and normal, in the solid's axes, at places in these."""
+    zero, one = x.dtype.type(0), x.dtype.type(1)
+    for p in range(gap.shape[0]):
+        gap[p], nx[p], ny[p], nz[p] = rounded_box(x[p], y[p], z[p], hx, hy, hz, radius, zero, one)
+
+
+@disjoint
+def _to_world(nx, ny, nz, xx, xy, xz, yx, yy, yz, zx, zy, zz):
+    """Turn normals from a solid's axes, x, y and z, to the world's."""
+    for p in range(nx.shape[0]):
+        ax, ay, az = nx[p], ny[p], nz[p]
+        nx[p] = ax * xx + ay * yx + az * zx
+        ny[p] = ax * xy + ay * yy + az * zy
+        nz[p] = ax * xz + ay * yz + az * zz
+
+
+@disjoint
+def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+    """Correct positions and velocities of particles that touch a solid which moves by s [m/s]."""
+    zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
+    for p in range(gap.shape[0]):
+        mx, my, mz, cx, cy, cz = contact_change(
+            gap[p], nx[p], ny[p], nz[p], vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+        )
+        x[p] += mx
+        y[p] += my
+        z[p] += mz
+        vx[p] += cx
+        vy[p] += cy
+        vz[p] += cz
+
+
+@disjoint
+def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+    """The same with one normal for all."""
+    zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
+    for p in range(gap.shape[0]):
+        mx, my, mz, cx, cy, cz = contact_change(
+            gap[p], nx, ny, nz, vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+        )
+        x[p] += mx
+        y[p] += my
+        z[p] += mz
+        vx[p] += cx
+        vy[p] += cy
+        vz[p] += cz
+
+
+@uncounted
+def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
+    """Resolve the contacts of one sheet's particles after a substep of ``h`` [s], and move the solids on by their velocity.
+
+    x [m], v [m/s]: (3, particles, 1); w [1/kg]: (particles, 1); colliders: rows of ``shapes``, (colliders, ROWS, 1); room: of
+    ``room_on_sheet``.  See ``response.resolve_particles``.
+    """
+    _, _, _, rows, _, desk = room
+    kinds, n = shapes.kinds, x.shape[1]
+    r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
+    for k in range(kinds.shape[0]):
+        c = colliders[k].reshape(colliders.shape[1])
+        for e in range(3):
+            c[POINT + e] += h * c[VELOCITY + e]
+        px, py, pz = c[POINT], c[POINT + 1], c[POINT + 2]
+        sx, sy, sz, friction = c[VELOCITY], c[VELOCITY + 1], c[VELOCITY + 2], c[FRICTION]
+        if kinds[k] == PLANE:
+            nx, ny, nz = c[AXES + 6], c[AXES + 7], c[AXES + 8]
+            if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[RADIUS], rows[GAP]) > 0:
+                a, b = _span(rows[GAP])
+                _respond_to_plane(
+                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[GAP, a:b], nx, ny, nz, sx, sy, sz,
+                    friction, carried,
+                )  # fmt: skip
+            continue
+        if _squares(r[0], r[1], r[2], px, py, pz, c[REACH2], rows[GAP]) == 0:
+            continue
+        a, b = _span(rows[GAP])
+        for e in range(3):
+            q = AXES + 3 * e
+            _to_axis(r[0, a:b], r[1, a:b], r[2, a:b], px, py, pz, c[q], c[q + 1], c[q + 2], rows[LOCAL + e, a:b])
+        gap, nx, ny, nz = rows[GAP, a:b], rows[NORMAL, a:b], rows[NORMAL + 1, a:b], rows[NORMAL + 2, a:b]
+        if kinds[k] == ROUNDED_BOX:
+            _measure_boxes(
+                rows[LOCAL, a:b], rows[LOCAL + 1, a:b], rows[LOCAL + 2, a:b], c[HALF], c[HALF + 1], c[HALF + 2], c[RADIUS], gap, nx,
+                ny, nz,
+            )  # fmt: skip
+        else:
+            _measure_on_desk(rows, a, b, colliders[k], shapes, k, desk)
+        _to_world(
+            nx, ny, nz, c[AXES], c[AXES + 1], c[AXES + 2], c[AXES + 3], c[AXES + 4], c[AXES + 5], c[AXES + 6], c[AXES + 7],
+            c[AXES + 8],
+        )  # fmt: skip
+        _respond(
+            r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried
+        )  # fmt: skip
+
+
+@uncounted
+def _measure_on_desk(rows, first, last, collider, shapes, k, desk):
+    """Distance and normal of particles, whose places are in rows LOCAL, to a mesh, ``COLUMNS`` at a time."""
+    lay_out(collider, desk)
+    for begin in range(first, last, desk.shape[1]):
+        count = min(desk.shape[1], last - begin)
+        for e in range(3):
+            for l in range(desk.shape[1]):
+                desk[SPOT + e, l] = rows[LOCAL + e, begin + min(l, count - 1)]
+        measure_mesh(desk, SPOT, shapes, k, desk.dtype.type(0))
+        for e in range(4):
+            for l in range(count):
+                rows[GAP + e, begin + l] = desk[CONTACT + e, l]
+
+
+# --- triangles ----------------------------------------------------------------------------------------------------------
+
+
+@disjoint
+def _distances(x, y, z, hx, hy, hz, out):
+    """Distance of places in a solid's axes from the box of half sides h [m]."""
+    zero = x.dtype.type(0)
+    for p in range(out.shape[0]):
+        ox, oy, oz = max(abs(x[p]) - hx, zero), max(abs(y[p]) - hy, zero), max(abs(z[p]) - hz, zero)
+        out[p] = np.sqrt(ox * ox + oy * oy + oz * oz)
+
+
+@disjoint
+def _near_cells(x, y, z, out, columns, radius, near):
+    """How far the corners of each cell are from the box of ``_distances`` beyond where one of its points may touch [m], at least.
+
+    No point of a triangle is farther from its nearest corner than ``NEAREST`` of its longest side.  Returns how many may touch.
+    """
+    count, zero, share = 0, x.dtype.type(0), x.dtype.type(NEAREST)
+    xb, xc, xd = x[1:], x[columns:], x[columns + 1 :]
+    yb, yc, yd = y[1:], y[columns:], y[columns + 1 :]
+    zb, zc, zd = z[1:], z[columns:], z[columns + 1 :]
+    ob, oc, od = out[1:], out[columns:], out[columns + 1 :]
+    for p in range(near.shape[0]):
+        one = (xd[p] - x[p]) * (xd[p] - x[p]) + (yd[p] - y[p]) * (yd[p] - y[p]) + (zd[p] - z[p]) * (zd[p] - z[p])
+        two = (xc[p] - xb[p]) * (xc[p] - xb[p]) + (yc[p] - yb[p]) * (yc[p] - yb[p]) + (zc[p] - zb[p]) * (zc[p] - zb[p])
+        ab = (xb[p] - x[p]) * (xb[p] - x[p]) + (yb[p] - y[p]) * (yb[p] - y[p]) + (zb[p] - z[p]) * (zb[p] - z[p])
+        ac = (xc[p] - x[p]) * (xc[p] - x[p]) + (yc[p] - y[p]) * (yc[p] - y[p]) + (zc[p] - z[p]) * (zc[p] - z[p])
+        bd = (xd[p] - xb[p]) * (xd[p] - xb[p]) + (yd[p] - yb[p]) * (yd[p] - yb[p]) + (zd[p] - zb[p]) * (zd[p] - zb[p])
+        cd = (xd[p] - xc[p]) * (xd[p] - xc[p]) + (yd[p] - yc[p]) * (yd[p] - yc[p]) + (zd[p] - zc[p]) * (zd[p] - zc[p])
+        longest = max(max(max(one, two), max(ab, ac)), max(bd, cd))
+        nearest = min(min(out[p], ob[p]), min(oc[p], od[p]))
+        near[p] = nearest - share * np.sqrt(longest) - radius
+        count += near[p] < zero
+    return count
+
+
+@inlined
+def _put_on_desk(rows, triangles, chosen, begin, count, desk):
+    """Copy the corners of chosen triangles to the desk; the last fills what is left of it."""
+    for l in range(desk.shape[1]):
+        t = chosen[begin + min(l, count - 1)]
+        for c in range(3):
+            p = triangles[t, c]
+            desk[CORNERS + 3 * c, l] = rows[LOCAL, p]
+            desk[CORNERS + 3 * c + 1, l] = rows[LOCAL + 1, p]
+            desk[CORNERS + 3 * c + 2, l] = rows[LOCAL + 2, p]
+
+
+@inlined
+def _choose_triangles(rows, triangles, columns, radius, chosen, desk):
+    """List the triangles that may touch the solid on the desk, by their cells, and of these by themselves; returns how many."""
+    number, last = 0, rows.shape[1] - columns - 1
+    near = rows[NEAR, :last]
+    out = rows[GAP]
+    if _near_cells(rows[LOCAL], rows[LOCAL + 1], rows[LOCAL + 2], out, columns, radius, near) == 0:
+        return 0
+    for p in range(last):
+        # a cell at the end of a row is none
+        if near[p] < 0 and p % columns < columns - 1:
+            t = 2 * (p - p // columns)
+            chosen[number], chosen[number + 1] = t, t + 1
+            number += 2
+    kept = 0
+    for begin in range(0, number, desk.shape[1]):
+        count = min(desk.shape[1], number - begin)
+        _put_on_desk(rows, triangles, chosen, begin, count, desk)
+        may_touch_triangle(desk)
+        for l in range(count):
+            chosen[kept] = chosen[begin + l]
+            kept += desk[CLEAR, l] == 0
+    return kept
+
+
+@uncounted
+def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
+    """Find where one sheet's triangles touch a solid, which is no plane, or soon may; see ``surface.find_touches``.
+
+    A grid's triangles come two a cell, row by row.
+    """
+    touches, which, count, rows, chosen, desk = room
+    n, c = x.shape[1], collider.reshape(collider.shape[0])
+    r = x.reshape((3, n))
+    lay_out(collider, desk)
+    least = min(c[HALF], min(c[HALF + 1], c[HALF + 2])) + c[RADIUS]
+    radius = c[RADIUS] - (c[THICKNESS] + x.dtype.type(2 * SINKS) * least)
+    desk[RADIUS] = radius
+    for e in range(3):
+        q = AXES + 3 * e
+        _to_axis(r[0], r[1], r[2], c[POINT], c[POINT + 1], c[POINT + 2], c[q], c[q + 1], c[q + 2], rows[LOCAL + e])
+    _distances(rows[LOCAL], rows[LOCAL + 1], rows[LOCAL + 2], c[HALF], c[HALF + 1], c[HALF + 2], rows[GAP])
+    # the first triangle of the second row of cells begins at the second row of particles
+    columns = triangles[0, 2] - 1
+    number = _choose_triangles(rows, triangles, columns, radius, chosen, desk)
+    for begin in range(0, number, desk.shape[1]):
+        some = min(desk.shape[1], number - begin)
+        _put_on_desk(rows, triangles, chosen, begin, some, desk)
+        if not may_touch_triangle(desk) or (shapes.kinds[k] == MESH and not near_in_grid(desk, shapes, k)):
+            continue
+        if not find_deepest(desk, shapes, k) or not turn_normal(desk):
+            continue
+        # the plane, as how far it is from the solid's point along the normal
+        for l in range(desk.shape[1]):
+            nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
+            if desk[CONTACT, l] < desk.dtype.type(NONE):
+                desk[CONTACT, l] -= nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
+        normal_to_world(desk)
+        for l in range(some):
+            if desk[CONTACT, l] >= desk.dtype.type(NONE):
+                continue
+            for e in range(3):
+                touches[count[0], e] = desk[WEIGHTS + e, l]
+            for e in range(4):
+                touches[count[0], 3 + e] = desk[CONTACT + e, l]
+            which[count[0], 0], which[count[0], 1] = chosen[begin + l], k
+            count[0] += 1
+
+
+@uncounted
+def press_on_sheet(x, v, w, triangles, colliders, room, h, carried):
+    """Resolve the touches of one sheet, one after the other; see ``surface.press``."""
+    touches, which, count, _, _, _ = room
+    n = x.shape[1]
+    r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
+    zero, one = x.dtype.type(0), x.dtype.type(1)
+    tiny, relaxed = x.dtype.type(TINY), x.dtype.type(RELAXED)
+    for t in range(count[0]):
+        c = colliders[which[t, 1]]
+        i, j, k = triangles[which[t, 0], 0], triangles[which[t, 0], 1], triangles[which[t, 0], 2]
+        a, b, d = touches[t, 0], touches[t, 1], touches[t, 2]
+        gap, nx, ny, nz = touches[t, 3], touches[t, 4], touches[t, 5], touches[t, 6]
+        gap += nx * (a * r[0, i] + b * r[0, j] + d * r[0, k] - c[POINT, 0])
+        gap += ny * (a * r[1, i] + b * r[1, j] + d * r[1, k] - c[POINT + 1, 0])
+        gap += nz * (a * r[2, i] + b * r[2, j] + d * r[2, k] - c[POINT + 2, 0])
+        if not gap < zero:
+            continue
+        ux = a * s[0, i] + b * s[0, j] + d * s[0, k] - c[VELOCITY, 0]
+        uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[VELOCITY + 1, 0]
+        uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[VELOCITY + 2, 0]
+        yielding = m[i] * a * a + m[j] * b * b + m[k] * d * d
+        mx, my, mz, cx, cy, cz = touch_change(
+            gap, nx, ny, nz, ux, uy, uz, yielding, c[FRICTION, 0], h, carried, zero, one, tiny, relaxed
+        )
+        for p, weight in ((i, a), (j, b), (k, d)):
+            share = m[p] * weight
+            r[0, p] += share * mx
+            r[1, p] += share * my
+            r[2, p] += share * mz
+            s[0, p] += share * cx
+            s[1, p] += share * cy
+            s[2, p] += share * cz
+
+
+@uncounted
+def resolve_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
+    """The same for the whole sheet.
+
+    triangles: of the sheet; look: whether to look anew where it touches between its particles.
+    """
+    resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room)
+    count, kinds = room[2], shapes.kinds
+    if look:
+        count[0] = 0
+        for k in range(kinds.shape[0]):
+            if kinds[k] != PLANE:
+                find_touches_on_sheet(x, triangles, shapes, k, colliders[k], room)
+    press_on_sheet(x, v, w, triangles, colliders, room, h, carried)
