@@ -12,12 +12,13 @@ rule, not a law of mechanics.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import disjoint, kernel, specialize
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
@@ -48,18 +49,17 @@ class Limiting(NamedTuple):
     sweeps: NDArray
 
 
-@apart
-def limit_strain(x, v, w, springs, limit, report):
+def _limit_strain(x, v, w, weave, limit, report):
     """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
 
-    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes).  report: rows BEFORE, AFTER and USED, (3, lanes): the first
+    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes); weave: see ``elements.Weave``.  report: rows BEFORE, AFTER and USED, (3, lanes): the first
     and the last keep the largest of the control step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
     enough = x.dtype.type(limit + TOLERANCE)
     for sweep in range(SWEEPS + 1):
-        _largest_strain(x, springs, largest)
+        largest_strain(x, weave, largest)  # noqa: F821
         going = False
         for l in range(lanes):
             going |= largest[l] > enough
@@ -71,19 +71,43 @@ def limit_strain(x, v, w, springs, limit, report):
         for l in range(lanes):
             if largest[l] > enough:
                 report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
-        _sweep(x, v, w, springs, x.dtype.type(limit), enough, largest)
+        _sweep(x, v, w, weave.springs, x.dtype.type(limit), enough, largest)
 
 
-@apart
-def measure_strain(x, springs, report):
+def _measure_strain(x, weave, report):
     """What is left at the end of a control step, after contact, which knows nothing of the limit."""
-    _largest_strain(x, springs, report[AFTER])
+    largest_strain(x, weave, report[AFTER])  # noqa: F821
+
+
+@disjoint
+def _raise_to_stretch(x, y, z, o, weight, inverse, out):
+    """Raise ``out``, (particles,), to the squared stretch of a grid's springs of one kind; inverse: one over their length's square."""
+    x1, y1, z1, zero = x[o:], y[o:], z[o:], x.dtype.type(0)
+    for p in range(x1.shape[0]):
+        dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
+        square = (dx * dx + dy * dy + dz * dz) * inverse if weight[p] > zero else zero
+        out[p] = max(out[p], square)
 
 
 @kernel
-def _largest_strain(x, springs, largest):
+def _largest_on_grid(x, weave, largest):
+    """Of a grid's springs that do not bend, (1,)."""
+    offset, kind, rest_length, weight, _, _, _ = weave.elements
+    one, n = x.dtype.type(1), x.shape[1]
+    r, out = x.reshape((3, n)), np.zeros(n, x.dtype)
+    for a in range(weight.shape[0]):
+        if kind[a] <= SHEAR:
+            _raise_to_stretch(r[0], r[1], r[2], offset[a], weight[a], one / (rest_length[a] * rest_length[a]), out)
+    largest[0] = 0
+    for p in range(n):
+        largest[0] = max(largest[0], out[p])
+    largest[0] = np.sqrt(largest[0]) - one
+
+
+@kernel
+def _largest_in_lanes(x, weave, largest):
     """Of the springs that do not bend, (lanes,)."""
-    ends, rest_length, kind, _ = springs
+    ends, rest_length, kind, _ = weave.springs
     one = x.dtype.type(1)
     largest[:] = 0
     for s in range(ends.shape[0]):
@@ -135,17 +159,22 @@ def _sweep(x, v, w, springs, limit, enough, largest):
 
 
 @kernel
-def no_limit(x, v, w, springs, limit, report):
+def no_limit(x, v, w, weave, limit, report):
     """Leave the springs as they are."""
 
 
 @kernel
-def no_measure(x, springs, report):
+def no_measure(x, weave, report):
     """Nothing to measure."""
 
 
-# the names that the main loop calls, without a limit and with one
-KERNELS = {
-    False: {"restrain": no_limit, "remeasure": no_measure},
-    True: {"restrain": limit_strain, "remeasure": measure_strain},
-}
+@cache
+def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
+    """The names that the main loop calls, without a limit or with one; by_particle: whether one grid's particles lie side by side."""
+    if not limits:
+        return {"restrain": no_limit, "remeasure": no_measure}
+    largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")
+    return {
+        "restrain": specialize(_limit_strain, f"limit_strain_{which}", apart=True, largest_strain=largest),
+        "remeasure": specialize(_measure_strain, f"measure_strain_{which}", apart=True, largest_strain=largest),
+    }

@@ -49,12 +49,12 @@ def advance_one(
             push[:] = 0
             add_air_forces(x, v, push, weave.air, resistance, wind, work.scratch)  # noqa: F821
         substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)  # noqa: F821
-        restrain(x, v, w, weave.springs, limit, limited)  # noqa: F821
+        restrain(x, v, w, weave, limit, limited)  # noqa: F821
         press(x, v, w, sheet, block, step, h, carried)  # noqa: F821
         look = step % look_every == 0
         resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, room)  # noqa: F821
         keep_apart(x, v, w, sheet, block, h, carried)  # noqa: F821
-    remeasure(x, weave.springs, limited)  # noqa: F821
+    remeasure(x, weave, limited)  # noqa: F821
 
 
 def advance(
@@ -82,7 +82,7 @@ def _compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     bound = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **forces)
     touching = contact_kernels(contact, by_particle)
-    parts = limiting.KERNELS[limits] | SELF_COLLISION[collides] | touching
+    parts = limiting.kernels_of(limits, by_particle) | SELF_COLLISION[collides] | touching
     parts |= {"add_air_forces": forces["add_air_forces"], "substep": bound}
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
     block = specialize(uncounted(advance_one), f"advance_one_{which}", apart=True, **parts)
@@ -251,7 +251,7 @@ class Simulation(Observed):
         method, h = self.integrator, self.time_step / self.substeps
         if method.prepare is not None:
             holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._hands.members
-            plan = method.prepare(Preparation(self._oscillators(0), h, holdable))
+            plan = method.prepare(Preparation(self._oscillators(0), h, holdable, self.layout.by_particle))
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
         # a share of a substep more, or rounding would make three of them two
         look_every, air_every = (max(1, int(interval / h + 1e-3)) for interval in (SURFACE_INTERVAL, AIR_INTERVAL))

@@ -6,39 +6,46 @@ from equilibria import G, heavy_elastica
 from scipy.optimize import brentq
 
 from clothgym import Material, Simulation, disc, grid, triangle_mesh
-from clothgym.bending import BEND_SCRATCH, BENDING
+from clothgym.bending import BENDING
+from clothgym.elements import Elastic, element_arrays, room_for_forces
 from clothgym.forces import add_spring_forces
 from clothgym.mesh import BEND_X, NUM_KINDS, STRUCTURAL_X
-from clothgym.state import element_arrays
 
 HINGED = ["hinge", "quadratic"]
 B = 3e-4
 
 
 def lanes_of(x, lanes):
-    """(particles, 3), the same in each lane."""
-    return np.repeat(x[:, :, None], lanes, axis=2)
+    """(particles, 3) as (3, particles, lanes), the same in each lane."""
+    return np.repeat(x.T[:, :, None], lanes, axis=2)
+
+
+def no_springs(lanes, damping_time=0.0):
+    """What forces scale with where hinges alone hold."""
+    return Elastic(np.zeros((NUM_KINDS, lanes)), np.full(lanes, B), np.full(lanes, damping_time))
+
+
+def room(x):
+    return room_for_forces(x, np.zeros(0, np.int64))
 
 
 def bend_forces(model, mesh, x, lanes=1, v=None, damping_time=0.0):
     """Of all hinges [N], (particles, 3, lanes); v [m/s]."""
-    bends = element_arrays(mesh, np.dtype(np.float64), hinged=True, by_particle=False).bends
-    f, rest = np.zeros((len(x), 3, lanes)), np.zeros_like(x)
-    BENDING[model].kernels["add_bend_forces"](
-        lanes_of(x, lanes), lanes_of(rest if v is None else v, lanes), f, bends, np.full(lanes, B), np.full(lanes, damping_time),
-        np.empty((BEND_SCRATCH, 3, lanes)),
-    )  # fmt: skip
-    return f
+    elements = element_arrays(mesh, np.dtype(np.float64), hinged=True, any_order=False)
+    at, rate = lanes_of(x, lanes), lanes_of(np.zeros_like(x) if v is None else v, lanes)
+    f = np.zeros_like(at)
+    BENDING[model].kernels["add_bend_forces"](at, rate, f, elements, no_springs(lanes, damping_time), room(at))
+    return np.swapaxes(f, 0, 1)
 
 
 def bend_matrix(model, mesh, x):
     """What ``add_bend_products`` multiplies with [N/m], column by column, (3 particles, 3 particles)."""
-    bends = element_arrays(mesh, np.dtype(np.float64), hinged=True, by_particle=False).bends
+    elements = element_arrays(mesh, np.dtype(np.float64), hinged=True, any_order=False)
     lanes = x.size  # a unit vector in each lane
-    p, y = np.eye(lanes).reshape(len(x), 3, lanes).copy(), np.zeros((len(x), 3, lanes))
-    scratch = np.empty((BEND_SCRATCH, 3, lanes))
-    BENDING[model].kernels["add_bend_products"](lanes_of(x, lanes), p, y, bends, np.full(lanes, B), scratch)
-    return y.reshape(lanes, lanes)
+    at, p = lanes_of(x, lanes), np.swapaxes(np.eye(lanes).reshape(len(x), 3, lanes), 0, 1).copy()
+    y = np.zeros_like(p)
+    BENDING[model].kernels["add_bend_products"](at, p, y, elements, np.full(lanes, B), room(at))
+    return np.swapaxes(y, 0, 1).reshape(lanes, lanes)
 
 
 def angles(mesh, x):
@@ -265,7 +272,7 @@ def test_a_pinned_strip_buckles_under_euler_s_load(model, rows, width):
     by central differences of the kernels' forces; narrow or wide, of square or oblong cells."""
     columns, length, young = 41, 1.0, 1e3
     mesh = grid(rows, columns, length, width)
-    elements = element_arrays(mesh, np.dtype(np.float64), hinged=True, by_particle=False)
+    elements = element_arrays(mesh, np.dtype(np.float64), hinged=True, any_order=False)
     # threads along the strip only: their tension is all the load
     stiffness = np.zeros(NUM_KINDS)
     stiffness[STRUCTURAL_X] = young * mesh.spacing[1] / mesh.spacing[0]
@@ -275,12 +282,12 @@ def test_a_pinned_strip_buckles_under_euler_s_load(model, rows, width):
 
     def forces(x):
         """In one lane for each shift, (particles, 3, lanes)."""
-        lanes = x.shape[2]
-        f, zero, none = np.zeros_like(x), np.zeros_like(x), np.zeros(lanes)
-        add_spring_forces(x, zero, f, elements.springs, np.repeat(stiffness[:, None], lanes, axis=1), none, np.empty((3, lanes)))
-        scratch = np.empty((BEND_SCRATCH, 3, lanes))
-        BENDING[model].kernels["add_bend_forces"](x, zero, f, elements.bends, np.full(lanes, B), none, scratch)
-        return f
+        x, lanes = np.swapaxes(x, 0, 1).copy(), x.shape[2]
+        f, zero = np.zeros_like(x), np.zeros_like(x)
+        elastic = no_springs(lanes)._replace(stiffness=np.repeat(stiffness[:, None], lanes, axis=1))
+        add_spring_forces(x, zero, f, elements, elastic, room(x))
+        BENDING[model].kernels["add_bend_forces"](x, zero, f, elements, elastic, room(x))
+        return np.swapaxes(f, 0, 1)
 
     def compressed(strain):
         return mesh.rest_positions * (1 - strain, 1, 1)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from clothgym import Material, Simulation, grid
+from clothgym.elements import element_arrays
 from clothgym.forces import Oscillators, frequency_bound, largest_frequency
-from clothgym.state import element_arrays
 from clothgym.triangles import triangle_mesh
 
 EXPLICIT = ["explicit_euler", "semi_implicit_euler", "verlet", "rk4"]
@@ -261,7 +261,7 @@ def test_frequencies_against_a_dense_eigenvalue(mesh, bending, rigidity):
     rng = np.random.default_rng(0)
     stiffness, mass = rng.uniform(50, 300, 7), rng.uniform(1e-4, 1e-3, mesh.num_particles)
     stiffness[6] = 1e-4  # of springs between opposite corners, in N m
-    elements = element_arrays(mesh, np.dtype(np.float64), bending != "springs", by_particle=False)
+    elements = element_arrays(mesh, np.dtype(np.float64), bending != "springs", any_order=False)
     slopes = flat_slopes(mesh)
     exact = dense_frequency(
         lambda x: elastic_energy(x, mesh, elements.springs, stiffness, rigidity, bending, slopes), mesh.rest_positions, mass

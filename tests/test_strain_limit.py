@@ -8,20 +8,22 @@ from conftest import line_mesh
 from equilibria import G, sheet_network, strains
 
 from clothgym import Material, Simulation, Sphere, grid
-from clothgym.limiting import AFTER, BEFORE, TOLERANCE, USED, limit_strain
+from clothgym.elements import element_arrays, surface_arrays, weave_of
+from clothgym.limiting import AFTER, BEFORE, TOLERANCE, USED, kernels_of
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y
-from clothgym.state import element_arrays
 
 LIMIT = 0.1
 
 
 def limited(mesh, x, v, w, limit=LIMIT):
     """What the kernel makes of one lane: positions, velocities and its report."""
-    x, v, w = x[:, :, None].copy(), v[:, :, None].copy(), np.asarray(w, float)[:, None]
-    springs = element_arrays(mesh, np.dtype(np.float64), hinged=False, by_particle=False).springs
+    x, v, w = x.T[:, :, None].copy(), v.T[:, :, None].copy(), np.asarray(w, float)[:, None]
+    real = np.dtype(np.float64)
+    elements = element_arrays(mesh, real, hinged=False, any_order=False)
+    weave = weave_of(mesh, elements, surface_arrays(mesh, real), "springs", by_particle=False)
     report = np.zeros((3, 1))
-    limit_strain(x, v, w, springs, limit, report)
-    return x[:, :, 0], v[:, :, 0], report[:, 0]
+    kernels_of(True, False)["restrain"](x, v, w, weave, limit, report)
+    return x[:, :, 0].T, v[:, :, 0].T, report[:, 0]
 
 
 @pytest.mark.parametrize(

@@ -50,11 +50,13 @@ class Work(NamedTuple):
 
 
 class Preparation(NamedTuple):
-    """What a method that factorises in advance is told: one environment's figures, the substep [s], and who may be held."""
+    """What a method that factorises in advance is told: one environment's figures, the substep [s], who may be held, and whether one
+    sheet's particles lie side by side."""
 
     oscillators: Oscillators
     h: float
     holdable: NDArray
+    by_particle: bool
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ enters implicitly.
 from __future__ import annotations
 
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
@@ -47,9 +48,13 @@ def surely_allowed(o: Oscillators) -> float:
 
 
 def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
-    """Factors ``P A P^T = L D L^T``, and the columns of A^-1 of those that can be held.
+    """Factors of A, and the columns of A^-1 of those that can be held.
+
+    Where one sheet's particles lie side by side, ``A = L D L^T`` in their order, as bands: their rows are few enough.  Elsewhere
+    ``P A P^T = L D L^T``, sparse, with an order that leaves few entries.
 
     Returns:
+        below: entries of L below each diagonal, (particles, band), or none; and before: those left of it.
         order: particle of each row, (particles,).
         starts, columns, values: L without its diagonal by rows; and rows_starts, rows, rows_values: by columns.
         inverse_diagonal: of D, (particles,).
@@ -59,7 +64,7 @@ def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
     from scipy.sparse import coo_matrix, csc_matrix, diags  # imported here: they would double the time of a warm start
     from scipy.sparse.linalg import splu
 
-    o, h, holdable = preparation
+    o, h, holdable, by_particle = preparation
     springs, bends = o.elements
     n = len(o.positions)
     scale = h * h + h * o.damping_time
@@ -75,11 +80,15 @@ def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
     matrix = csc_matrix(coo_matrix(entries, shape=(n, n)) + diags(1 / o.inverse_mass))
     # no pivoting: the matrix is positive definite, and U = D L^T
     factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    order = np.argsort(factors.perm_c)
     unit = np.zeros((n, len(holdable)))
     unit[holdable, np.arange(len(holdable))] = 1
     slot = np.full(n, -1, np.int64)
     slot[holdable] = np.arange(len(holdable))
+    held = factors.solve(unit).T.copy()
+    if by_particle:
+        none = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+        below, before, diagonal = _bands(matrix)
+        return below, before, none[0], *none, *none, 1 / diagonal, slot, held
     by_column = csc_matrix(factors.L)
     by_column.setdiag(0)
     by_column.eliminate_zeros()
@@ -87,9 +96,27 @@ def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
     by_row.sort_indices()
     by_column.sort_indices()
     return (
-        order, by_row.indptr, by_row.indices, by_row.data, by_column.indptr, by_column.indices, by_column.data,
-        1 / factors.U.diagonal(), slot, factors.solve(unit).T.copy(),
+        np.zeros((0, 0)), np.zeros((0, 0)), np.argsort(factors.perm_c), by_row.indptr, by_row.indices, by_row.data,
+        by_column.indptr, by_column.indices, by_column.data, 1 / factors.U.diagonal(), slot, held,
     )  # fmt: skip
+
+
+def _bands(matrix: Any) -> tuple[NDArray, NDArray, NDArray]:
+    """L of ``L D L^T`` below and left of its diagonal, (particles, band) each, and D, (particles,); matrix: sparse."""
+    from scipy.linalg import cholesky_banded
+
+    entries = matrix.tocoo()
+    n, band = matrix.shape[0], int(np.abs(entries.row - entries.col).max())
+    lower = entries.row >= entries.col
+    packed = np.zeros((band + 1, n))
+    packed[(entries.row - entries.col)[lower], entries.col[lower]] = entries.data[lower]
+    packed = cholesky_banded(packed, lower=True)
+    below = (packed[1:] / packed[0]).T.copy()
+    # row i has the entry (i, i - band + k) at k: from column i - band + k, band - k below its diagonal
+    before = np.zeros((n, band))
+    for k in range(band):
+        before[band - k :, k] = below[: n - (band - k), band - k - 1]
+    return below, before, packed[0] ** 2
 
 
 @kernel
@@ -103,11 +130,44 @@ def _subtract_products(y, row, starts, columns, values):
             own[l] -= value * other[l]
 
 
+@disjoint
+def _subtract(x, y, z, entries, a, b, c):
+    """Take a row or column of entries times a, b and c from the components x, y and z."""
+    for k in range(entries.shape[0]):
+        x[k] -= entries[k] * a
+        y[k] -= entries[k] * b
+        z[k] -= entries[k] * c
+
+
+@disjoint
+def _scale(x, by):
+    for p in range(x.shape[0]):
+        x[p] *= by[p]
+
+
+@uncounted
+def solve_bands(below, before, inverse_diagonal, r):
+    """``r <- A^-1 r`` in place, (3, particles): as soon as a particle is solved it is taken from those that depend on it."""
+    n, band = below.shape
+    for i in range(n):
+        m = min(band, n - 1 - i)
+        a, b, c = r[0, i], r[1, i], r[2, i]
+        _subtract(r[0, i + 1 : i + 1 + m], r[1, i + 1 : i + 1 + m], r[2, i + 1 : i + 1 + m], below[i, :m], a, b, c)
+    for c in range(3):
+        _scale(r[c], inverse_diagonal)
+    for i in range(n - 1, -1, -1):
+        m = min(band, i)
+        _subtract(r[0, i - m : i], r[1, i - m : i], r[2, i - m : i], before[i, band - m :], r[0, i], r[1, i], r[2, i])
+
+
 @kernel
 def solve(plan, r, y):
     """``r <- A^-1 r`` by two triangular solves, r: (3, particles, lanes); y: scratch of the same size."""
-    order, starts, columns, values, row_starts, rows, row_values, inverse_diagonal = plan[:8]
+    below, before, order, starts, columns, values, row_starts, rows, row_values, inverse_diagonal, _, _ = plan
     n, lanes = r.shape[1], r.shape[2]
+    if below.shape[0] > 0:
+        solve_bands(below, before, inverse_diagonal, r.reshape((3, n)))
+        return
     # a particle's components and lanes lie side by side here: each value of L is read once for all of them
     flat_y = y.reshape((n, 3 * lanes))
     for i in range(n):
@@ -179,7 +239,7 @@ def keep_held(d, slot, held, members, count, lower, force):
 
 @kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    slot, held = plan[8], plan[9]
+    slot, held = plan[10], plan[11]
     n, lanes = x.shape[1], x.shape[2]
     iterations = options[0]
     start, total, r, y = work.fields[0], work.fields[1], work.fields[2], work.fields[3]
