@@ -44,7 +44,8 @@ def coverage(solids: list[Target]) -> list[float]:
     speed = np.sqrt(np.mean(np.sum(simulation.velocities**2, axis=2), axis=1))
     print(f"  largest rms speed at the end: {speed.max() * 1000:.1f} mm/s")
     points = [solid.upper_surface(JUDGED_POINTS) for solid in solids]
-    return [covered_share(sheet, mesh.triangles, p, COVERED_WITHIN) for sheet, p in zip(simulation.positions.astype(float), points)]
+    sheets = simulation.positions.astype(float).transpose(0, 2, 1).copy()
+    return [covered_share(sheet, mesh.triangles, p, COVERED_WITHIN * SIDE) for sheet, p in zip(sheets, points)]
 
 
 def main() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from clothgym.bending import Bending
 from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids, count_intersections
@@ -12,11 +12,11 @@ from clothgym.forces import Energy, energy, structural_strain
 from clothgym.hands import Hands
 from clothgym.limiting import Limiting
 from clothgym.mesh import ClothMesh
-from clothgym.state import Fabric, Layout, State, View
+from clothgym.state import Fabric, Layout, Orders, State, View
 
 
 class Observed:
-    """The properties and measurements of a ``Simulation``: fresh copies, but for ``view``."""
+    """The properties and measurements of a ``Simulation``: fresh copies, but for ``view`` and ``orders``."""
 
     mesh: ClothMesh
     layout: Layout
@@ -54,8 +54,15 @@ class Observed:
 
     @property
     def view(self) -> View:
-        """Positions, velocities and springs as the kernels see them; not a copy, and not to be written to."""
-        return View(self._x, self._v, self._elements.springs)
+        """Positions, velocities, springs and hands as the kernels see them; not a copy, and not to be written to."""
+        hands = self._hands
+        return View(self._x, self._v, self._elements.springs, hands.x, hands.opening, hands.holder)
+
+    @property
+    def orders(self) -> Orders:
+        """Where hands and fingers are to be, and the wind, as the kernels see them: what ``move_anchors``, ``grippers.move`` and
+        ``set_wind`` write once they have checked it."""
+        return Orders(self._hands.targets, self._hands.wanted, self._fabric.wind)
 
     @property
     def parameters(self) -> NDArray:
@@ -87,10 +94,11 @@ class Observed:
         """Which hands, anchors and then grippers, solids stopped or turned aside in the last control step, (num_envs, hands)."""
         return self.layout.to_public(self._hands.blocked)
 
-    def pulls(self) -> NDArray:
-        """Force with which the cloth pulls at each anchor and then each gripper [N], (num_envs, hands, 3): the springs',
+    def pulls(self, envs: ArrayLike | None = None) -> NDArray:
+        """Force with which the cloth pulls at each anchor and then each gripper [N], (len(envs), hands, 3): the springs',
         the weight's and the air's on the particles that it holds; not what accelerates these."""
-        return self.layout.to_public(self._pulls())
+        pulls = self.layout.to_public(self._pulls())
+        return pulls if envs is None else pulls[self.layout.chosen(envs)]
 
     def _pulls(self) -> NDArray:
         return self._hands.pulls(self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads)

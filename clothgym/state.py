@@ -48,11 +48,31 @@ class Fabric(NamedTuple):
 
 
 class View(NamedTuple):
-    """The live memory of a simulation, for kernels that read it, (block, 3, particles, lane): see the module."""
+    """The live memory of a simulation, for kernels that read it: see the module.
+
+    x, v: [m], [m/s], (block, 3, particles, lane).
+    hands: where anchors and then grippers are [m], (block, hands, 3, lane).  openings: of their fingers, (block, hands, lane).
+    holder: which of them holds each particle, or -1, (block, particles, lane).
+    """
 
     x: NDArray
     v: NDArray
     springs: SpringArrays
+    hands: NDArray
+    openings: NDArray
+    holder: NDArray
+
+
+class Orders(NamedTuple):
+    """What a simulation is told for the next step, live: written by those who have checked what they write, at a kernel's price.
+
+    targets: where hands are to be [m], (block, hands, 3, lane).  openings: how far their fingers are to open, from 0 to 1,
+    (block, hands, lane).  wind: velocity of the air [m/s], (block, 3, lane).
+    """
+
+    targets: NDArray
+    openings: NDArray
+    wind: NDArray
 
 
 class Layout(NamedTuple):

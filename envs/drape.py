@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import _jit
+from clothgym._jit import inlined
 from clothgym.collisions import Plane
+from clothgym.envs.episode import Fields
 from clothgym.envs.measures import CENTROID, SPEED2, covered_share, key_particles, soft_coverage
 from clothgym.envs.physics import Physics
 from clothgym.envs.single import ClothEnv
-from clothgym.envs.targets import SHAPES, Target, reference_coverage
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.targets import SHAPES, Target, place_points, reference_coverage, unit_surface
 from clothgym.envs.task import POSITION_BOUND, Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
@@ -30,7 +32,7 @@ FRICTION = 0.5
 THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its flat triangles stay outside of a round one
 JUDGED_POINTS = 256
 GUIDE_POINTS = 32
-COVERED_WITHIN = 0.02 * SIDE
+COVERED_WITHIN = 0.02  # in sides
 GUIDE_REACH = 0.15 * SIDE
 CENTRING_SCALE = 0.2  # in sides: performance is halved at this distance
 CALM_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
@@ -41,6 +43,88 @@ EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.25, 0.55, 0.25
 EXPERT_SPEED = 0.8  # share of the anchors' speed limit
 
 LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
+
+
+BOX = SHAPES.index("box")
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _let_go(own, rules, sheet, move, free):
+    """Open the anchors that the action opens, or all when time is up."""
+    for k in range(free.shape[0]):
+        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
+            free[k], sheet.holds[k] = 1, 0
+
+
+@inlined
+def _holds_nothing(own, rules, sheet):
+    for k in range(sheet.holds.shape[0]):
+        if sheet.holds[k] > 0:
+            return False
+    return True
+
+
+@inlined
+def _upper_surface(own, units):
+    """Points of the target's upper surface [m], (points, 3); units: those of a round one's and of a box's, for a radius of 1."""
+    points = units[1 if own.solid == BOX else 0].copy()
+    place_points(points, own.top, own.radius, own.turn)
+    return points
+
+
+@inlined
+def _off_center(own, rules, sheet):
+    """Horizontal distance of the sheet's centre of area from the target's axis, in sides."""
+    x, y = sheet.summary[CENTROID] - own.top[0], sheet.summary[CENTROID + 1] - own.top[1]
+    return np.sqrt(x * x + y * y) / rules.side
+
+
+@inlined
+def _centring(off_center):
+    """1 in the centre, 1/2 at CENTRING_SCALE sides: smooth, and with a gradient from afar."""
+    return 1 / (1 + (off_center / CENTRING_SCALE) ** 2)
+
+
+@inlined
+def covering(own, rules, sheet):
+    """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
+    near = soft_coverage(sheet.x, _upper_surface(own, rules.guides), rules.guide_reach)
+    return (near + _centring(_off_center(own, rules, sheet))) / 2
+
+
+@inlined
+def _judge(own, rules, sheet, info):
+    points = _upper_surface(own, rules.judged)
+    info.coverage = covered_share(sheet.x, sheet.mesh.triangles, points, COVERED_WITHIN * rules.side)
+    info.off_center = _off_center(own, rules, sheet)
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    share = info.coverage / own.reference
+    central, calm = info.off_center <= ENOUGH_CENTRING, info.rms_speed < ENOUGH_REST
+    info.is_success = share >= ENOUGH_COVERAGE and central and calm
+    return min(share, 1.0) * _centring(info.off_center) / (1 + (info.rms_speed / CALM_SCALE) ** 2)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    info.coverage_reference = own.reference
+    return 0.0
+
+
+@inlined
+def observe_target(own, rules, sheet, seen):
+    for c in range(3):
+        seen.center[c] = (sheet.summary[CENTROID + c] - own.top[c]) / rules.side
+    for k in range(sheet.holds.shape[0]):
+        seen.holds[k] = sheet.holds[k] > 0
+    for k in range(len(SHAPES)):
+        seen.solid[k] = own.solid == k
+    seen.radius, seen.height, seen.yaw = own.radius / rules.side, own.top[2] / rules.side, own.yaw * (4 / np.pi)
+    seen.settling = own.settling_since >= 0
+    seen.episode_left = 1 - own.step / (rules.acting_steps + rules.settling_steps)
+    seen.acting_left = max(rules.acting_steps - own.step, 0) / rules.acting_steps
 
 
 class DrapeTask(Task):
@@ -56,23 +140,18 @@ class DrapeTask(Task):
         anchors=(SHEET.corners[2], SHEET.corners[3]),
         air_density=0.0,
     )
+    kernels = Kernels(covering, _judge, observe_target, act=_let_go, done=_holds_nothing, account=_account)
     acting_steps = 60
     settling_steps = 40
     hand_actions = 4
     guide_reach: ClassVar[float] = GUIDE_REACH
     key_particles = key_particles(SHEET)
+    judgement = (("coverage", float), ("coverage_reference", float), ("off_center", float), ("rms_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
         self.targets: list[Target] = [Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0))] * num_envs
-        layout = self.simulation.layout
-        self.episode |= {
-            "target": np.zeros((num_envs, 6)),  # shape, radius, height, center, yaw
-            "reference": np.ones(num_envs),
-        }
-        self._guide = np.zeros((layout.blocks, GUIDE_POINTS, 3, layout.lanes), np.float32)
-        self._guided = np.zeros((layout.blocks, layout.lanes), np.float32)
 
     def _colliders(self) -> list:
         floor = Plane(friction=FRICTION, thickness=THICKNESS)
@@ -80,6 +159,22 @@ class DrapeTask(Task):
 
     def _arena(self) -> tuple[NDArray, NDArray]:
         return np.array([-1.2, -1.2, 0.01]), np.array([1.2, 1.2, 1.2])
+
+    def _remembers(self) -> Fields:
+        # of the target: its place in SHAPES, its size, its highest point [m], how it is turned, and the most that can be covered
+        target = [("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2)]
+        return [*target, ("reference", float)]
+
+    def _figures(self) -> dict[str, Any]:
+        guides, judged = (
+            np.stack([np.resize(unit_surface(shape, count), (count, 3)) for shape in ("sphere", "box")])
+            for count in (GUIDE_POINTS, JUDGED_POINTS)
+        )
+        return {"guide_reach": np.float32(self.guide_reach), "guides": guides, "judged": judged}
+
+    def _observes(self) -> Fields:
+        what = [("center", POSITION_BOUND, 3), ("holds", 1.0, self.num_hands), ("solid", 1.0, len(SHAPES))]
+        return what + [(name, 1.0) for name in ("radius", "height", "yaw", "settling", "episode_left", "acting_left")]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -113,102 +208,19 @@ class DrapeTask(Task):
 
     def _place_target(self, env: int, target: Target) -> None:
         self.targets[env] = target
-        self.episode["target"][env] = (SHAPES.index(target.shape), target.radius, target.height, *target.center, target.yaw)
-        self.episode["reference"][env] = reference_coverage(target, SIDE)
+        own = self.episode[env]
+        own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
+        own["top"] = own["origin"] = target.top
+        own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
+        own["reference"] = reference_coverage(target, SIDE)
         self.simulation.set_collider(1, [target.collider(FRICTION, THICKNESS)], np.array([env]))
-        block, lane = divmod(env, self.simulation.layout.lanes)
-        self._set_origin(env, target.top)
-        points = target.upper_surface(GUIDE_POINTS)
-        self._guide[block, :, :, lane] = points[np.arange(GUIDE_POINTS) % len(points)]
 
     def set_state(self, state: Any) -> None:
         super().set_state(state)
-        for env, (shape, radius, height, x, y, yaw) in enumerate(self.episode["target"].tolist()):
-            self._place_target(env, Target(SHAPES[int(shape)], radius, height, (x, y), yaw))
-
-    # --- what the agent sees --------------------------------------------------------------------------------------------
-
-    def _more_bounds(self) -> list[float]:
-        return [POSITION_BOUND] * 3 + [1.0] * (self.num_hands + len(SHAPES) + 6)
-
-    def _observe_more(self) -> list[NDArray]:
-        episode = self.episode
-        shape, radius, height, *_, yaw = episode["target"].T
-        settling = episode["settling_since"] >= 0
-        center = (self.simulation.layout.to_public(self._summary)[:, :3] - self._tops()) / SIDE
-        return [
-            center,
-            self._holds(),
-            shape[:, None] == np.arange(len(SHAPES)),
-            (radius / SIDE)[:, None],
-            (height / SIDE)[:, None],
-            (yaw * (4 / np.pi))[:, None],
-            settling[:, None],
-            (1 - episode["step"] / (self.acting_steps + self.settling_steps))[:, None],
-            (np.maximum(self.acting_steps - episode["step"], 0) / self.acting_steps)[:, None],
-        ]
-
-    def _holds(self) -> NDArray:
-        """Whether each hand holds the sheet, (num_envs, hands)."""
-        return self.simulation.attached
-
-    def _tops(self) -> NDArray:
-        return self.episode["target"][:, [3, 4, 2]]
-
-    # --- letting go ---------------------------------------------------------------------------------------------------------
-
-    def _grip(self, moves: NDArray, acting: NDArray) -> None:
-        """Open the anchors that the action opens, or all when time is up."""
-        late = self.episode["step"] >= self.acting_steps
-        opens = self.simulation.attached & acting[:, None] & ((moves[:, :, 3] > LETS_GO) | late[:, None])
-        if opens.any():
-            self.simulation.release(*np.nonzero(opens))
-
-    def _done(self) -> NDArray:
-        return np.logical_not(self.simulation.attached.any(axis=1))
-
-    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
-
-    def _off_center(self, summary: NDArray) -> NDArray:
-        """Horizontal distance of the sheet's centre of area from the target's axis, in sides, (num_envs,)."""
-        off = summary[CENTROID : CENTROID + 2].T - self.episode["target"][:, 3:5]
-        return np.sqrt(off[:, 0] ** 2 + off[:, 1] ** 2) / SIDE
-
-    def _potential(self, summary: NDArray) -> NDArray:
-        view = self.simulation.view
-
-        def work(first: int, last: int) -> None:
-            soft_coverage(first, last, view.x, self._guide, np.float32(self.guide_reach), self._guided)
-
-        _jit.run_spans(work, len(self._guided), self.threads)
-        near = self.simulation.layout.to_public(self._guided)
-        return (near + _centring(self._off_center(summary))) / 2
-
-    def _judgement(self) -> dict[str, NDArray]:
-        names = ("normalized_performance", "coverage", "off_center", "rms_speed")
-        return {name: np.zeros(self.num_envs) for name in names} | {
-            "is_success": np.zeros(self.num_envs, bool),
-            "coverage_reference": self.episode["reference"].copy(),
-        }
-
-    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
-        reference = self.episode["reference"][envs]
-        coverage = np.array([self._coverage(env) for env in envs])
-        off_center = self._off_center(summary)[envs]
-        rms_speed = np.sqrt(summary[SPEED2][envs]).astype(np.float64)
-        share = coverage / reference
-        return {
-            "normalized_performance": np.minimum(share, 1.0) * _centring(off_center) / (1 + (rms_speed / CALM_SCALE) ** 2),
-            "coverage": coverage,
-            "off_center": off_center,
-            "rms_speed": rms_speed,
-            "is_success": (share >= ENOUGH_COVERAGE) & (off_center <= ENOUGH_CENTRING) & (rms_speed < ENOUGH_REST),
-        }
-
-    def _coverage(self, env: int) -> float:
-        block, lane = divmod(int(env), self.simulation.layout.lanes)
-        sheet = self.simulation.view.x[block, :, :, lane].T.astype(np.float64)
-        return covered_share(sheet, SHEET.triangles, self.targets[env].upper_surface(JUDGED_POINTS), COVERED_WITHIN)
+        for env, own in enumerate(self.episode):
+            *center, height = own["top"].tolist()
+            target = Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
+            self._place_target(env, target)
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
@@ -217,7 +229,7 @@ class DrapeTask(Task):
 
         Without memory: where the anchors are says which of the two ways they are on.
         """
-        tops = self._tops()
+        tops = self.episode["top"]
         middle = self.episode["targets"].mean(axis=1)
         beyond = tops[:, 1] + EXPERT_BEYOND * SIDE
         arrived = np.abs(middle[:, 1] - beyond) < 0.02
@@ -240,11 +252,6 @@ class DrapeTask(Task):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.19, 0.27), vertical_fov=33.0)
-
-
-def _centring(off_center: NDArray) -> NDArray:
-    """1 in the centre, 1/2 at CENTRING_SCALE sides: smooth, and with a gradient from afar."""
-    return 1 / (1 + (off_center / CENTRING_SCALE) ** 2)
 
 
 class ClothDrapeEnv(ClothEnv):

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.envs.drape import EXPERT_SPEED, SHEET, SIDE, THICKNESS, DrapeTask
-from clothgym.envs.episode import length
+from clothgym._jit import inlined
+from clothgym.envs.drape import EXPERT_SPEED, SHEET, SIDE, THICKNESS, DrapeTask, covering, observe_target
+from clothgym.envs.episode import Fields, length
+from clothgym.envs.measures import distance
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.task import POSITION_BOUND
 from clothgym.envs.vector import ClothVectorEnv
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 REACH = 0.03  # of the fingers [m]
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these give the fingers an order; between them they go on with the last
 PICKING = 0.3  # share of the potential that is for taking hold
-PICK_SCALE = 0.15 * SIDE  # how the potential rises as a gripper nears its place [m]
+PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
 # the particles that each gripper is to take: both corners of the edge at the target, or its middle
 PLACES = {1: (SHEET.corners[2] + SHEET.grid_shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
@@ -34,9 +36,57 @@ FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
 
 
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _fingers(move, wanted, acting):
+    """Fingers do what the action says last, and open when time is up."""
+    if not acting or move[3] > OPENS:
+        return 1.0
+    return 0.0 if move[3] < CLOSES else wanted
+
+
+@inlined
+def _take(own, rules, sheet, move, free):
+    """Remember what has been taken; one gripper may have taken two corners that lay together."""
+    for k in range(rules.places.shape[0]):
+        if sheet.holder[rules.places[k]] >= 0:
+            own.picked[k] = 1
+
+
+@inlined
+def _never_done(own, rules, sheet):
+    """It may take hold anew until its time is up."""
+    return False
+
+
+@inlined
+def _potential(own, rules, sheet):
+    taken = 0.0
+    for k in range(rules.places.shape[0]):
+        place = rules.places[k]
+        away = distance(sheet.x[:, place], sheet.hands[k]) / (PICK_SCALE * rules.side)
+        taken += 1.0 if sheet.holder[place] >= 0 else 0.5 / (1 + away**2)
+    return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * covering(own, rules, sheet)
+
+
+@inlined
+def _observe(own, rules, sheet, seen):
+    observe_target(own, rules, sheet, seen)
+    for k in range(rules.places.shape[0]):
+        hand, place = sheet.hands[k], rules.places[k]
+        for c in range(3):
+            seen.hands[k, c] = (hand[c] - own.top[c]) / rules.side
+            seen.hands[k, 3 + c] = (sheet.x[c, place] - hand[c]) * (10 / rules.side)
+        seen.hands[k, 6] = sheet.openings[k]
+
+
 class DrapeGripperTask(DrapeTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
+    kernels = DrapeTask.kernels._replace(potential=_potential, observe=_observe, act=_take, done=_never_done, fingers=_fingers)
     acting_steps = 100
     guide_reach = 0.4 * SIDE  # the sheet begins farther away than in ClothDrape-v0
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
@@ -48,8 +98,17 @@ class DrapeGripperTask(DrapeTask):
         self.physics = replace(DrapeTask.physics, anchors=(), grippers=(hand,) * grippers)  # type: ignore[misc]
         self.places = np.array(PLACES[grippers])
         super().__init__(num_envs, **kwargs)
-        self.episode["picked"] = np.zeros((num_envs, grippers), bool)  # whether each place has ever been held
         self._homes = np.zeros((num_envs, grippers, 3))  # where the grippers begin, between _begin and _place_hands
+
+    def _remembers(self) -> Fields:
+        return [*super()._remembers(), ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
+
+    def _figures(self) -> dict[str, Any]:
+        return super()._figures() | {"places": self.places}
+
+    def _observes(self) -> Fields:
+        bounds = [POSITION_BOUND] * 3 + [10 * POSITION_BOUND] * 3 + [1.0]
+        return [*super()._observes(), ("hands", bounds, (len(self.places), 7))]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -79,55 +138,6 @@ class DrapeGripperTask(DrapeTask):
     def _place_hands(self, envs: NDArray) -> None:
         self.simulation.grippers.place(self._homes[envs], envs)
 
-    # --- gripping -------------------------------------------------------------------------------------------------------
-
-    def _order(self, targets: NDArray, moves: NDArray, acting: NDArray) -> None:
-        """Fingers do what the action says last, and open when time is up."""
-        order = moves[:, :, 3]
-        told = np.where(order < CLOSES, 0.0, np.where(order > OPENS, 1.0, self.simulation.grippers.wanted))
-        self.simulation.grippers.move(targets, np.where(acting[:, None], told, 1.0))
-
-    def _grip(self, moves: NDArray, acting: NDArray) -> None:
-        """Remember what has been taken."""
-        self.episode["picked"] |= self._taken()
-
-    def _done(self) -> NDArray:
-        """Never before its time is up: it may take hold anew."""
-        return np.zeros(self.num_envs, bool)
-
-    # --- what the agent sees --------------------------------------------------------------------------------------------
-
-    def _holds(self) -> NDArray:
-        return self.simulation.grippers.held > 0
-
-    def _more_bounds(self) -> list[float]:
-        return [*super()._more_bounds(), *([POSITION_BOUND] * 3 + [10 * POSITION_BOUND] * 3 + [1.0]) * self.num_hands]
-
-    def _observe_more(self) -> list[NDArray]:
-        hands = self.simulation.grippers.positions
-        from_top = (hands - self._tops()[:, None]) / SIDE
-        to_place = self._to_places(hands) * (10 / SIDE)
-        openings = self.simulation.grippers.openings[:, :, None]
-        mine = np.concatenate([from_top, to_place, openings], axis=2).reshape(self.num_envs, 7 * self.num_hands)
-        return [*super()._observe_more(), mine]
-
-    def _to_places(self, hands: NDArray) -> NDArray:
-        """From each gripper to the particle that it is to take [m], (num_envs, grippers, 3)."""
-        return self.simulation.layout.vectors_to_public(self.simulation.view.x[:, :, self.places]) - hands
-
-    # --- how it is rewarded ---------------------------------------------------------------------------------------------
-
-    def _potential(self, summary: NDArray) -> NDArray:
-        away = length(self._to_places(self.simulation.grippers.positions).astype(np.float64))
-        near = 1 / (1 + (away / PICK_SCALE) ** 2)
-        taken = np.where(self._taken(), 1.0, near / 2)
-        share = taken[:, 0] if self.num_hands == 1 else (taken[:, 0] + taken[:, 1]) / 2
-        return PICKING * share + (1 - PICKING) * super()._potential(summary)
-
-    def _taken(self) -> NDArray:
-        """Whether each place is held; one gripper may have taken two corners that lay together, (num_envs, places)."""
-        return self.simulation.grippers.holder[:, self.places] >= 0
-
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
@@ -135,10 +145,10 @@ class DrapeGripperTask(DrapeTask):
 
         Without memory: where the hands are, and what they hold, says which part of the way they are on.
         """
-        episode, hands = self.episode, self.simulation.grippers.positions.astype(np.float64)
-        tops = self._tops()[:, None]
-        to_place = self._to_places(hands).astype(np.float64)
-        own = self._taken()
+        episode, grippers = self.episode, self.simulation.grippers
+        hands, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
+        to_place = self.simulation.positions[:, self.places] - hands
+        own = grippers.holder[:, self.places] >= 0
         ready = np.logical_and.reduce(own, axis=1, keepdims=True)
         begun = np.logical_and.reduce(episode["picked"], axis=1, keepdims=True)
 
@@ -175,7 +185,7 @@ class DrapeGripperTask(DrapeTask):
         solids = []
         for hand in range(self.num_hands):
             x, y, z = self.simulation.grippers.positions[env, hand].tolist()
-            opening = 0.0 if self._holds()[env, hand] else float(self.simulation.grippers.openings[env, hand])
+            opening = 0.0 if self.simulation.grippers.held[env, hand] else float(self.simulation.grippers.openings[env, hand])
             half = 0.006 + opening * self.physics.grippers[hand].span / 2
             for finger in (x - half, x + half):
                 solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))

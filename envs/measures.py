@@ -1,7 +1,7 @@
-"""What tasks measure on a batch of sheets: reductions as kernels, so that no figure depends on who else is in the batch.
+"""What tasks measure on one sheet, as kernels: no figure depends on who else is in the batch.
 
-Kernels that begin with ``first, last`` work on blocks ``(block, component, particle, lane)``; loops over particles are outer,
-loops over lanes inner, and nothing is summed across lanes.
+Sheets are (3, particles), contiguous: the particles are what vectorizes.  The least and the largest of numbers that are not negative
+are found by their bits, which are in the same order, for integers may be compared in any order, and so side by side.
 """
 
 from __future__ import annotations
@@ -9,142 +9,127 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.mesh import ClothMesh
 
-# columns of ``summarize``'s output
+# what ``summarize`` writes
 CENTROID, SPEED2, STRETCH2, FINITE = 0, 3, 4, 5
 SUMMARY = 6
+FAR2 = 1e6  # a kilometre or a kilometre a second is no cloth [m^2, m^2/s^2]
 MOST_STRAIN = 1e3  # what is told of a sheet that has diverged
+LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
+
+GROUP = 4  # triangles that share a box in ``covered_share``
+
+
+@inlined
+def _distance2(p, q):
+    return (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
 
 
 @kernel
-def summarize(first, last, x, v, share, springs, structural, out):
-    """Summary of each sheet, (blocks, SUMMARY, lanes).
+def distance(p, q):
+    """Of two points, in float64."""
+    x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@kernel
+def length_of(v):
+    """Of a vector, in float64."""
+    x, y, z = np.float64(v[0]), np.float64(v[1]), np.float64(v[2])
+    return np.sqrt(x * x + y * y + z * z)
+
+
+@inlined
+def _bits(value):
+    """A float32's bits, as an integer."""
+    return np.float32(value).view(np.int32)
+
+
+@inlined
+def _from_bits(bits):
+    return np.int32(bits).view(np.float32)
+
+
+@apart
+def summarize(x, v, share, ends, inverse2, out):
+    """Summary of a sheet: (SUMMARY,).
 
     Centre of area [m] (3), mean squared speed [m^2/s^2], largest squared stretch of the structural springs (length over
     rest length), and 1 where every position and velocity is finite and sane, else 0.
-    share: each particle's share of the sheet's area, summing to 1, (particles,); structural: indices of springs.
+    share: each particle's share of the sheet's area, summing to 1, (particles,).  ends: of the structural springs, (2, springs);
+    inverse2: one over the squares of their rest lengths [1/m^2], (springs,).
     """
-    ends, rest_length = springs[0], springs[1]
-    zero = x.dtype.type(0)
-    one = x.dtype.type(1)
-    far2 = x.dtype.type(1e6)
-    lanes = x.shape[3]
-    for b in range(first, last):
-        total = out[b]
-        for c in range(SUMMARY):
-            for l in range(lanes):
-                total[c, l] = zero
-        for p in range(x.shape[2]):
-            a = share[p]
-            for c in range(3):
-                for l in range(lanes):
-                    total[CENTROID + c, l] += a * x[b, c, p, l]
-            for l in range(lanes):
-                vx, vy, vz = v[b, 0, p, l], v[b, 1, p, l], v[b, 2, p, l]
-                total[SPEED2, l] += a * (vx * vx + vy * vy + vz * vz)
-        for s in structural:
-            i, j = ends[s, 0], ends[s, 1]
-            scale = one / (rest_length[s] * rest_length[s])
-            for l in range(lanes):
-                dx, dy, dz = x[b, 0, j, l] - x[b, 0, i, l], x[b, 1, j, l] - x[b, 1, i, l], x[b, 2, j, l] - x[b, 2, i, l]
-                stretch2 = (dx * dx + dy * dy + dz * dz) * scale
-                total[STRETCH2, l] = max(total[STRETCH2, l], stretch2)
-        for l in range(lanes):
-            # comparisons with NaN are false; a kilometre or a kilometre a second is no cloth
-            c2 = total[0, l] * total[0, l] + total[1, l] * total[1, l] + total[2, l] * total[2, l]
-            sane = c2 < far2 and total[SPEED2, l] < far2 and total[STRETCH2, l] < far2
-            total[FINITE, l] = one if sane else zero
-
-
-def largest_strain(summary: NDArray) -> NDArray:
-    """Of the structural springs, from ``summarize``'s output as (SUMMARY, num_envs); MOST_STRAIN for a sheet that is not sane."""
-    return np.where(summary[FINITE] > 0, np.sqrt(summary[STRETCH2]) - 1, MOST_STRAIN)
+    cx = cy = cz = speed2 = np.float32(0)
+    for p in range(x.shape[1]):
+        cx += share[p] * x[0, p]
+        cy += share[p] * x[1, p]
+        cz += share[p] * x[2, p]
+        speed2 += share[p] * (v[0, p] * v[0, p] + v[1, p] * v[1, p] + v[2, p] * v[2, p])
+    largest = np.int32(0)
+    for s in range(inverse2.shape[0]):
+        i, j = ends[0, s], ends[1, s]
+        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
+        largest = max(largest, _bits((dx * dx + dy * dy + dz * dz) * inverse2[s]))
+    stretch2 = _from_bits(largest)
+    out[CENTROID], out[CENTROID + 1], out[CENTROID + 2], out[SPEED2], out[STRETCH2] = cx, cy, cz, speed2, stretch2
+    # comparisons with NaN are false
+    out[FINITE] = cx * cx + cy * cy + cz * cz < FAR2 and speed2 < FAR2 and stretch2 < FAR2
 
 
 @kernel
-def stretch_quantile(first, last, x, springs, structural, share, out):
-    """Quantile ``share`` of the structural springs' stretch, length over rest length, (blocks, lanes).
+def largest_strain(summary):
+    """Of the structural springs; MOST_STRAIN for a sheet that is not sane."""
+    return np.sqrt(summary[STRETCH2]) - np.float32(1) if summary[FINITE] > 0 else np.float32(MOST_STRAIN)
+
+
+@apart
+def stretch_quantile(x, ends, inverse2, share):
+    """Quantile ``share`` of the structural springs' stretch, length over rest length.
 
     By bisection, from 1 to twice that, to 2^-20: the least stretch (at least 1) that no more than ``1 - share`` of the springs
-    exceed.  No sorting: lanes stay side by side.
+    exceed.
     """
-    ends, rest_length = springs[0], springs[1]
-    one = x.dtype.type(1)
-    half = x.dtype.type(0.5)
-    lanes = x.shape[3]
-    allowed = int((1 - share) * structural.shape[0])
-    stretch = np.empty((structural.shape[0], lanes), x.dtype)
-    for b in range(first, last):
-        for k in range(structural.shape[0]):
-            s = structural[k]
-            i, j, own = ends[s, 0], ends[s, 1], stretch[k]
-            scale = one / rest_length[s]
-            for l in range(lanes):
-                dx, dy, dz = x[b, 0, j, l] - x[b, 0, i, l], x[b, 1, j, l] - x[b, 1, i, l], x[b, 2, j, l] - x[b, 2, i, l]
-                own[l] = np.sqrt(dx * dx + dy * dy + dz * dz) * scale
-        low = np.ones(lanes, x.dtype)
-        step = half
-        count = np.empty(lanes, np.int32)
-        for _ in range(20):
-            count[:] = 0
-            for k in range(structural.shape[0]):
-                own = stretch[k]
-                for l in range(lanes):
-                    count[l] += 1 if own[l] > low[l] + step else 0
-            for l in range(lanes):
-                low[l] = low[l] + step if count[l] > allowed else low[l]
-            step *= half
-        out[b] = low
+    count = inverse2.shape[0]
+    stretch = np.empty(count, np.float32)
+    for s in range(count):
+        i, j = ends[0, s], ends[1, s]
+        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
+        stretch[s] = np.sqrt((dx * dx + dy * dy + dz * dz) * inverse2[s])
+    allowed = int((1 - share) * count)
+    low, step = np.float32(1), np.float32(0.5)
+    for _ in range(20):
+        middle, above = low + step, np.int32(0)
+        for s in range(count):
+            above += np.int32(stretch[s] > middle)
+        low = middle if above > allowed else low
+        step *= np.float32(0.5)
+    return low
 
 
-@kernel
-def see_points(first, last, x, v, particles, origin, scale, out):
-    """Positions of some particles relative to ``origin`` [m], times ``scale``, and their velocities [m/s].
+@apart
+def soft_coverage(x, points, reach):
+    """How near a sheet is to points of a surface [m], (points, 3): mean of ``1/(1 + (d/reach)^2)`` over them.
 
-    particles: (count,); origin: (blocks, 3, lanes); out: (blocks, 6 * count, lanes).
+    d: distance [m] from the point to the nearest particle.
     """
-    count = len(particles)
-    for b in range(first, last):
-        for k in range(count):
-            for c in range(3):
-                xc, vc, here = x[b, c, particles[k]], v[b, c, particles[k]], origin[b, c]
-                for l in range(x.shape[3]):
-                    out[b, 3 * k + c, l] = (xc[l] - here[l]) * scale
-                for l in range(x.shape[3]):
-                    out[b, 3 * (count + k) + c, l] = vc[l]
+    one, total = np.float32(1), np.float32(0)
+    weight = one / (np.float32(reach) * np.float32(reach))
+    for k in range(points.shape[0]):
+        px, py, pz = np.float32(points[k, 0]), np.float32(points[k, 1]), np.float32(points[k, 2])
+        nearest = np.int32(LARGEST_BITS)
+        for p in range(x.shape[1]):
+            dx, dy, dz = x[0, p] - px, x[1, p] - py, x[2, p] - pz
+            nearest = min(nearest, _bits(dx * dx + dy * dy + dz * dz))
+        total += one / (one + _from_bits(nearest) * weight)
+    return total / np.float32(points.shape[0])
 
 
 def key_particles(mesh: ClothMesh) -> NDArray:
     """Corners, middles of the edges, centre of a grid: particles of a 3 x 3 subgrid, row by row, (9,)."""
     rows, columns = (np.array([0, n // 2, n - 1]) for n in mesh.grid_shape)
     return (rows[:, None] * mesh.grid_shape[1] + columns[None, :]).ravel()
-
-
-@kernel
-def soft_coverage(first, last, x, points, reach, out):
-    """How near the sheet is to points of a surface: mean of ``1/(1 + (d/reach)^2)`` over them, (blocks, lanes).
-
-    d: distance [m] from the point to the nearest particle.  points [m]: (blocks, points, 3, lanes).
-    """
-    one = x.dtype.type(1)
-    share = one / x.dtype.type(points.shape[1])
-    inverse_reach2 = one / (reach * reach)
-    lanes = x.shape[3]
-    for b in range(first, last):
-        nearest = np.empty(lanes, x.dtype)
-        out[b] = 0
-        for k in range(points.shape[1]):
-            px, py, pz = points[b, k, 0], points[b, k, 1], points[b, k, 2]
-            nearest[:] = x.dtype.type(1e9)
-            for p in range(x.shape[2]):
-                xx, xy, xz = x[b, 0, p], x[b, 1, p], x[b, 2, p]
-                for l in range(lanes):
-                    dx, dy, dz = xx[l] - px[l], xy[l] - py[l], xz[l] - pz[l]
-                    nearest[l] = min(nearest[l], dx * dx + dy * dy + dz * dz)
-            for l in range(lanes):
-                out[b, l] += share / (one + nearest[l] * inverse_reach2)
 
 
 @kernel
@@ -181,35 +166,38 @@ def _distance2_to_triangle(p, a, b, c):
     return rx * rx + ry * ry + rz * rz
 
 
-@kernel
-def covered_share(sheet, triangles, points, tolerance):
-    """Share of points [m], (points, 3), that lie within ``tolerance`` [m] of a triangle of one sheet, (particles, 3).
+@apart
+def covered_share(x, triangles, points, tolerance):
+    """Share of points [m], (points, 3), that lie within ``tolerance`` [m] of a triangle of a sheet.
 
     float64 throughout: this is a judgement, made once an episode.
     """
-    count = len(triangles)
-    center = np.empty((count, 3))
-    reach2 = np.empty(count)
-    for t in range(count):
-        a, b, c = sheet[triangles[t, 0]], sheet[triangles[t, 1]], sheet[triangles[t, 2]]
-        far = 0.0
-        for k in range(3):
-            center[t, k] = (a[k] + b[k] + c[k]) / 3
-        for corner in (a, b, c):
-            d2 = 0.0
-            for k in range(3):
-                d2 += (corner[k] - center[t, k]) ** 2
-            far = max(far, d2)
-        reach2[t] = (np.sqrt(far) + tolerance) ** 2
+    count = triangles.shape[0]
+    # a box about triangles that lie together, within which a point is near enough
+    corners, low, high = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3))
+    for first in range(0, count, GROUP):
+        g = first // GROUP
+        for c in range(3):
+            least, most = np.inf, -np.inf
+            for t in range(first, min(first + GROUP, count)):
+                for m in range(3):
+                    corners[t, m, c] = x[c, triangles[t, m]]
+                    least, most = min(least, corners[t, m, c]), max(most, corners[t, m, c])
+            low[g, c], high[g, c] = least - tolerance, most + tolerance
     covered = 0
-    for k in range(len(points)):
-        p = points[k]
-        for t in range(count):
-            dx, dy, dz = p[0] - center[t, 0], p[1] - center[t, 1], p[2] - center[t, 2]
-            if dx * dx + dy * dy + dz * dz > reach2[t]:
-                continue
-            a, b, c = sheet[triangles[t, 0]], sheet[triangles[t, 1]], sheet[triangles[t, 2]]
-            if _distance2_to_triangle(p, a, b, c) <= tolerance * tolerance:
-                covered += 1
-                break
-    return covered / len(points)
+    for k in range(points.shape[0]):
+        covered += _near_any(points[k], corners, low, high, tolerance * tolerance)
+    return covered / points.shape[0]
+
+
+@kernel
+def _near_any(p, corners, low, high, tolerance2):
+    """Whether a triangle is within the root of ``tolerance2`` [m^2] of point p; low, high: boxes of GROUP triangles each."""
+    x, y, z = p[0], p[1], p[2]
+    for g in range((corners.shape[0] + GROUP - 1) // GROUP):
+        if x < low[g, 0] or x > high[g, 0] or y < low[g, 1] or y > high[g, 1] or z < low[g, 2] or z > high[g, 2]:
+            continue
+        for t in range(GROUP * g, min(GROUP * (g + 1), corners.shape[0])):
+            if _distance2_to_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2]) <= tolerance2:
+                return True
+    return False

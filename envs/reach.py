@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym._jit import inlined
 from clothgym.checks import vector
-from clothgym.envs.episode import length
-from clothgym.envs.measures import key_particles
+from clothgym.envs.episode import Fields, length
+from clothgym.envs.measures import distance, key_particles, length_of
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import POSITION_BOUND, Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
@@ -37,6 +39,42 @@ GOAL = (90, 170, 110)  # colour of the goal's marker
 EXPERT_GAIN = 4.0  # how fast the scripted expert closes on the place above the goal [1/s]
 
 
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _nearer(own, rules, sheet):
+    """How much of the way is done, in [0, 1]."""
+    return min(max(1 - distance(own.goal, sheet.x[:, rules.free]) / own.distance, 0.0), 1.0)
+
+
+@inlined
+def _calm(rules, sheet):
+    """1 where the free corner is at rest, 1/2 at CALM_SCALE."""
+    return 1 / (1 + (length_of(sheet.v[:, rules.free]) / (CALM_SCALE * rules.side)) ** 2)
+
+
+@inlined
+def _potential(own, rules, sheet):
+    close = 1 / (1 + (distance(own.goal, sheet.x[:, rules.free]) / (CLOSE_SCALE * rules.side)) ** 2)
+    return (_nearer(own, rules, sheet) + close * _calm(rules, sheet)) / 2
+
+
+@inlined
+def _judge(own, rules, sheet, info):
+    info.goal_distance = distance(own.goal, sheet.x[:, rules.free]) / rules.side
+    info.corner_speed = length_of(sheet.v[:, rules.free]) / rules.side
+    info.is_success = info.goal_distance <= NEAR_ENOUGH and info.corner_speed < CALM_ENOUGH
+    return _nearer(own, rules, sheet) * _calm(rules, sheet)
+
+
+@inlined
+def _observe(own, rules, sheet, seen):
+    for c in range(3):
+        seen.way[c] = (own.goal[c] - rules.hangs[c] - sheet.hands[0, c]) * (10 / rules.side)
+    seen.time_left = 1 - own.step / rules.acting_steps
+
+
 class ReachTask(Task):
     """The task of ``ClothReach-v0``, see ``ClothReachEnv``."""
 
@@ -50,19 +88,26 @@ class ReachTask(Task):
         anchors=(DRIVEN,),
         air_density=0.0,
     )
+    kernels = Kernels(_potential, _judge, _observe)
     acting_steps = 40
     key_particles = key_particles(SHEET)
+    judgement = (("goal_distance", float), ("corner_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
-
-    def __init__(self, num_envs: int, **kwargs: Any) -> None:
-        super().__init__(num_envs, **kwargs)
-        self.episode |= {"goal": np.zeros((num_envs, 3)), "distance": np.ones(num_envs)}
 
     def _colliders(self) -> list:
         return []  # the floor is out of reach
 
     def _arena(self) -> tuple[NDArray, NDArray]:
         return LOW, HIGH
+
+    def _remembers(self) -> Fields:
+        return [("goal", float, 3), ("distance", float)]
+
+    def _figures(self) -> dict[str, Any]:
+        return {"free": FREE, "hangs": hanging()[FREE]}
+
+    def _observes(self) -> Fields:
+        return [("way", 10 * POSITION_BOUND, 3), ("time_left", 1.0)]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -80,66 +125,20 @@ class ReachTask(Task):
         rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
         x = start + hanging() + rng.normal(scale=1e-4, size=hanging().shape)
-        self._place_goal(env, goal)
-        self.episode["distance"][env] = max(length(x[FREE] - goal), NEAREST * SIDE)
+        own = self.episode[env]
+        own["goal"] = own["origin"] = goal
+        own["distance"] = max(length(x[FREE] - goal), NEAREST * SIDE)
         return x
-
-    def _place_goal(self, env: int, goal: NDArray) -> None:
-        self.episode["goal"][env] = goal
-        self._set_origin(env, goal)
-
-    def set_state(self, state: Any) -> None:
-        super().set_state(state)
-        for env, goal in enumerate(self.episode["goal"]):
-            self._place_goal(env, goal)
-
-    # --- what the agent sees --------------------------------------------------------------------------------------------
-
-    def _more_bounds(self) -> list[float]:
-        return [10 * POSITION_BOUND] * 3 + [1.0]
-
-    def _observe_more(self) -> list[NDArray]:
-        return [self._way() * (10 / SIDE), (1 - self.episode["step"] / self.acting_steps)[:, None]]
-
-    def _way(self) -> NDArray:
-        """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
-        return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
-
-    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
-
-    def _corner(self) -> tuple[NDArray, NDArray]:
-        """The free corner's vector to the goal [m] and velocity [m/s], (num_envs, 3) each."""
-        view, public = self.simulation.view, self.simulation.layout.to_public
-        return self.episode["goal"] - public(view.x[:, :, FREE]), public(view.v[:, :, FREE]).astype(np.float64)
-
-    def _nearer(self, away: NDArray) -> NDArray:
-        """How much of the way is done, in [0, 1]."""
-        return np.clip(1 - length(away) / self.episode["distance"], 0, 1)
-
-    def _potential(self, summary: NDArray) -> NDArray:
-        away, velocity = self._corner()
-        close = 1 / (1 + (length(away) / (CLOSE_SCALE * SIDE)) ** 2)
-        return (self._nearer(away) + close * _calm(velocity)) / 2
-
-    def _judgement(self) -> dict[str, NDArray]:
-        names = ("normalized_performance", "goal_distance", "corner_speed")
-        return {name: np.zeros(self.num_envs) for name in names} | {"is_success": np.zeros(self.num_envs, bool)}
-
-    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
-        away, velocity = self._corner()
-        distance, speed = length(away)[envs] / SIDE, length(velocity)[envs] / SIDE
-        return {
-            "normalized_performance": (self._nearer(away) * _calm(velocity))[envs],
-            "goal_distance": distance,
-            "corner_speed": speed,
-            "is_success": (distance <= NEAR_ENOUGH) & (speed < CALM_ENOUGH),
-        }
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
         """To the place from which the corner hangs in the goal, ever slower: the air calms the rest."""
         return EXPERT_GAIN * self._way() / self.physics.hand_speed
+
+    def _way(self) -> NDArray:
+        """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
+        return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
 
     def solids(self, env: int) -> list[Solid]:
         return []
@@ -154,11 +153,6 @@ class ReachTask(Task):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.84), vertical_fov=36.0)
-
-
-def _calm(velocity: NDArray) -> NDArray:
-    """1 at rest, 1/2 at CALM_SCALE."""
-    return 1 / (1 + (length(velocity) / (CALM_SCALE * SIDE)) ** 2)
 
 
 @cache

@@ -35,14 +35,15 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         super().reset(seed=seed)
         self.task.reset(np.array([0]), [seed], options)
         self._np_random = self.task.generators[0]
-        return self.task.episode["observation"][0].copy(), {"failure": ""}
+        return self.task.observation[0].copy(), {"failure": ""}
 
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
         if np.shape(action) != self.action_space.shape:
             raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
-        outcome = self.task.step(np.asarray(action)[None])
-        observation = self.task.episode["observation"][0].copy()
-        return observation, float(outcome.reward[0]), bool(outcome.terminated[0]), bool(outcome.truncated[0]), pick(outcome.info, 0)
+        task = self.task
+        task.step(np.asarray(action)[None])
+        reward, terminated, *_ = task.outcome[0].item()
+        return task.observation[0].copy(), reward, terminated, False, task.told_of(0)
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
@@ -63,8 +64,3 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
     def set_state(self, state: TaskState) -> None:
         self.task.set_state(state)
         self._np_random = self.task.generators[0]
-
-
-def pick(info: dict[str, Any], env: int) -> dict[str, Any]:
-    """One environment's part of a batch's info, as plain Python values."""
-    return {key: pick(value, env) if isinstance(value, dict) else value[env].item() for key, value in info.items()}

@@ -9,15 +9,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import _jit, integrators
+from clothgym import integrators
+from clothgym._jit import inlined
 from clothgym.checks import number, positive
 from clothgym.collisions import Capsule
 from clothgym.envs import carriers
-from clothgym.envs.carriers import middle
-from clothgym.envs.episode import length
-from clothgym.envs.measures import MOST_STRAIN, key_particles, largest_strain, stretch_quantile
+from clothgym.envs.episode import FINE, Fields
+from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, key_particles, largest_strain, length_of, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
@@ -48,9 +49,94 @@ WAYPOINTS = 3  # beside the post, beyond it, and the goal
 PASSED, ARRIVED = 0.1, 0.15 * SIDE  # mean distance of the clips from a way-point; of the farther clip from the goal [m]
 LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # room of the clips [m]
 MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
+TENSIONS = (("tension_left", float), ("tension_right", float))
 FAR = 10.0  # bound of observed distances, in sides
 
 WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colours of the markers
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _to_places(own, sheet):
+    """Distance of each clip from its place at the next way-point [m]."""
+    places = own.places[own.next]
+    return distance(places[0], sheet.hands[0]), distance(places[1], sheet.hands[1])
+
+
+@inlined
+def _tick_off(own, rules, sheet, move, free):
+    """Way-points that the clips have passed are ticked off."""
+    left, right = _to_places(own, sheet)
+    if own.next < WAYPOINTS - 1 and (left + right) / 2 < PASSED:
+        own.next += 1
+
+
+@inlined
+def _measure(own, rules, sheet):
+    own.strain_p95 = stretch_quantile(sheet.x, sheet.mesh.ends, sheet.mesh.inverse2, 0.95) - 1
+    for k in range(2):
+        pull = length_of(sheet.pulls[k])
+        own.tension[k] = pull if pull < np.inf else 0.0
+    # observed from the middle of the next way-point
+    for c in range(3):
+        own.origin[c] = (own.places[own.next, 0, c] + own.places[own.next, 1, c]) / 2
+
+
+@inlined
+def _arrived(own, rules, sheet):
+    """Whether both clips are in their places at the goal."""
+    left, right = _to_places(own, sheet)
+    return own.next == WAYPOINTS - 1 and max(left, right) < rules.arrived
+
+
+@inlined
+def _potential(own, rules, sheet):
+    """Share of the way that lies behind the clips."""
+    left, right = _to_places(own, sheet)
+    return min(max(1 - ((left + right) / 2 + own.after[own.next]) / own.way, 0.0), 1.0)
+
+
+@inlined
+def _judge(own, rules, sheet, info):
+    info.is_success = _arrived(own, rules, sheet)
+    info.is_safe_success = info.is_success and own.episode_cost == 0
+    return 1.0 if info.is_success else _potential(own, rules, sheet)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    strain = largest_strain(sheet.summary)
+    info.cost = 1.0 if running and strain > rules.threshold else 0.0
+    # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
+    cost = info.cost + (rules.acting_steps - own.step if failure != FINE else 0)
+    own.episode_cost += cost
+    info.episode_cost = own.episode_cost
+    info.strain_excess = max(strain - rules.threshold, 0.0)
+    info.strain_p95 = own.strain_p95 if sheet.summary[FINITE] > 0 else MOST_STRAIN
+    info.tension_left, info.tension_right = own.tension[0], own.tension[1]
+    terms.cost = -rules.cost_penalty * cost
+    return terms.cost
+
+
+@inlined
+def _observe(own, rules, sheet, seen):
+    following = min(own.next + 1, WAYPOINTS - 1)
+    for k in range(2):
+        for c in range(3):
+            seen.to_next[k, c] = (own.places[own.next, k, c] - sheet.hands[k, c]) * (5 / rules.side)
+            seen.to_following[k, c] = (own.places[following, k, c] - sheet.hands[k, c]) / rules.side
+        seen.pulls[k] = own.tension[k] / rules.weight
+    seen.at_goal = own.next == WAYPOINTS - 1
+    for c in range(2):
+        seen.post[c] = (own.post[c] - (sheet.hands[0, c] + sheet.hands[1, c]) / 2) / rules.side
+    for c in range(3):
+        seen.wind[c] = sheet.air[min(own.step, sheet.air.shape[0] - 1), c]
+    seen.strain_max = largest_strain(sheet.summary) / rules.threshold
+    seen.strain_p95 = own.strain_p95 / rules.threshold
+    seen.threshold = rules.threshold
+    seen.time_left = 1 - own.step / rules.acting_steps
 
 
 class StrainTask(Task):
@@ -66,10 +152,15 @@ class StrainTask(Task):
         anchors=CLIPS,
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
     )
+    kernels = Kernels(_potential, _judge, _observe, act=_tick_off, measure=_measure, done=_arrived, account=_account)
     acting_steps = 150
     strain_shown = 0.1
     key_particles = key_particles(SHEET)
     position_bound = FAR
+    judgement = (("is_safe_success", bool),)
+    accounts = (("cost", float), ("episode_cost", float), ("strain_excess", np.float32), ("strain_p95", float), *TENSIONS)
+    prices = ("cost",)
+    feels_pulls = True
 
     def __init__(
         self,
@@ -89,27 +180,38 @@ class StrainTask(Task):
         self.threshold = positive("threshold", threshold)
         if self.threshold > 1:
             raise ValueError(f"threshold={threshold!r}: must be at most 1, at which the sheet tears; usual are 0.05 to 0.2")
-        self.cost_penalty = checked_penalty(cost_penalty)
         super().__init__(num_envs, integrator=integrator, **kwargs)
+        self.cost_penalty = cost_penalty
         self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
-        layout = self.simulation.layout
-        # measured anew in each step: not part of the state
-        self._stretch = np.zeros((layout.blocks, layout.lanes), np.float32)
-        self._strain_p95, self._tension = np.zeros(num_envs), np.zeros((num_envs, 2))
-        self.episode |= {
-            "post": np.zeros((num_envs, 2)),
-            "places": np.zeros((num_envs, WAYPOINTS, 2, 3)),  # where each clip is to be [m]
-            "next": np.zeros(num_envs, np.int64),
-            "after": np.zeros((num_envs, WAYPOINTS)),  # length of the way that is left at each way-point [m]
-            "way": np.ones(num_envs),  # its whole length [m]
-            "episode_cost": np.zeros(num_envs),
-        }
+
+    @property
+    def cost_penalty(self) -> float:
+        """What a step beyond the threshold takes from the reward."""
+        return float(self.rules["cost_penalty"][0])
+
+    @cost_penalty.setter
+    def cost_penalty(self, value: float) -> None:
+        self.rules["cost_penalty"] = checked_penalty(value)
 
     def _colliders(self) -> list:
         return [_post(0.0, 0.0)]
 
     def _arena(self) -> tuple[NDArray, NDArray]:
         return LOW, HIGH
+
+    def _remembers(self) -> Fields:
+        # the post's axis, where each clip is to be at each way-point [m], the next one, and the way that is left at each, and in all
+        way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
+        return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
+
+    def _figures(self) -> dict[str, Any]:
+        return {"threshold": self.threshold, "cost_penalty": 0.0, "weight": WEIGHT, "arrived": ARRIVED}
+
+    def _observes(self) -> Fields:
+        return [
+            *[("to_next", 5 * FAR, (2, 3)), ("to_following", FAR, (2, 3)), ("at_goal", 1.0), ("post", FAR, 2), ("wind", 20.0, 3)],
+            *[("strain_max", 20.0), ("strain_p95", 20.0), ("pulls", 20.0, 2), ("threshold", 1.0), ("time_left", 1.0)],
+        ]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -129,13 +231,10 @@ class StrainTask(Task):
         half = SIDE / 2 * np.stack([-np.sin(yaws), np.cos(yaws), np.zeros(4)], axis=1)
         clips = np.stack([middles + half, middles - half], axis=1)
         self._place_post(env, post)
-        episode = self.episode
-        episode["places"][env] = clips[1:]
-        episode["next"][env] = 0
-        episode["episode_cost"][env] = 0
+        own = self.episode[env]
+        own["places"], own["next"], own["episode_cost"] = clips[1:], 0, 0
         legs = np.linalg.norm(np.diff(clips, axis=0), axis=2).mean(axis=1)
-        episode["after"][env] = legs.sum() - np.cumsum(legs)
-        episode["way"][env] = legs.sum()
+        own["after"], own["way"] = legs.sum() - np.cumsum(legs), legs.sum()
         ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
         ripple[[particle for clip in CLIPS for particle in clip]] = 0
         x = middles[0] + hanging()
@@ -152,114 +251,11 @@ class StrainTask(Task):
         for env, post in enumerate(self.episode["post"]):
             self._place_post(env, post)
 
-    # --- what the agent sees --------------------------------------------------------------------------------------------
-
-    def _more_bounds(self) -> list[float]:
-        return [5 * FAR] * 6 + [FAR] * 6 + [1.0] + [FAR] * 2 + [20.0] * 3 + [20.0] * 4 + [1.0, 1.0]
-
-    def _observe_more(self) -> list[NDArray]:
-        episode = self.episode
-        everyone, following = np.arange(self.num_envs), np.minimum(episode["next"] + 1, WAYPOINTS - 1)
-        clips = self.simulation.hand_positions
-        wind = self.episode["wind"]
-        now = np.minimum(episode["step"], wind.shape[1] - 1)
-        return [
-            ((episode["places"][everyone, episode["next"]] - clips) * (5 / SIDE)).reshape(self.num_envs, 6),
-            ((episode["places"][everyone, following] - clips) / SIDE).reshape(self.num_envs, 6),
-            (episode["next"] == WAYPOINTS - 1)[:, None],
-            (episode["post"] - middle(clips)[:, :2]) / SIDE,
-            wind[everyone, now] if wind.shape[1] else np.zeros((self.num_envs, 3)),
-            (largest_strain(self.simulation.layout.to_public(self._summary).T) / self.threshold)[:, None],
-            (self._strain_p95 / self.threshold)[:, None],
-            self._tension / WEIGHT,
-            np.full((self.num_envs, 1), self.threshold),
-            (1 - episode["step"] / self.acting_steps)[:, None],
-        ]
-
-    # --- the way --------------------------------------------------------------------------------------------------------
-
-    def _to_places(self, waypoint: NDArray) -> NDArray:
-        """Distance of each clip from its place at a way-point [m], (num_envs, 2)."""
-        places = self.episode["places"][np.arange(self.num_envs), waypoint]
-        return length(places - self.simulation.hand_positions)
-
-    def _grip(self, moves: NDArray, acting: NDArray) -> None:
-        """Nothing is gripped; way-points that the clips have passed are ticked off, and the sheet is measured."""
-        episode = self.episode
-        passed = acting & (episode["next"] < WAYPOINTS - 1) & (middle(self._to_places(episode["next"])) < PASSED)
-        episode["next"] += passed
-        self._measure()
-
-    def _measure(self) -> None:
-        simulation = self.simulation
-        view = simulation.view
-
-        def work(first: int, last: int) -> None:
-            stretch_quantile(first, last, view.x, view.springs, self._structural, 0.95, self._stretch)
-
-        _jit.run_spans(work, len(self._stretch), self.threads)
-        stretch = simulation.layout.to_public(self._stretch).astype(np.float64)
-        self._strain_p95 = stretch - 1
-        self._tension = length(np.nan_to_num(simulation.pulls().astype(np.float64), posinf=0.0, neginf=0.0))
-        _, places = self._clips_and_places()
-        self._origin = simulation.layout.to_blocks(middle(places), np.dtype(np.float32))
-
-    def _place_hands(self, envs: NDArray) -> None:
-        self._measure()
-
-    def _done(self) -> NDArray:
-        """Arrived: both clips are in their places at the goal."""
-        at_goal = self.episode["next"] == WAYPOINTS - 1
-        return at_goal & np.all(self._to_places(self.episode["next"]) < ARRIVED, axis=1)
-
-    # --- how it is rewarded and judged ----------------------------------------------------------------------------------
-
-    def _potential(self, summary: NDArray) -> NDArray:
-        """Share of the way that lies behind the clips."""
-        episode = self.episode
-        left = middle(self._to_places(episode["next"])) + episode["after"][np.arange(self.num_envs), episode["next"]]
-        return np.clip(1 - left / episode["way"], 0, 1)
-
-    def _judgement(self) -> dict[str, NDArray]:
-        return {
-            "normalized_performance": np.zeros(self.num_envs),
-            "is_success": np.zeros(self.num_envs, bool),
-            "is_safe_success": np.zeros(self.num_envs, bool),
-        }
-
-    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
-        arrived = self._done()[envs]
-        return {
-            "normalized_performance": np.where(arrived, 1.0, self._potential(summary)[envs]),
-            "is_success": arrived,
-            "is_safe_success": arrived & (self.episode["episode_cost"][envs] == 0),
-        }
-
-    def _account(self, running: NDArray, failure: NDArray, strain: NDArray) -> dict[str, NDArray]:
-        cost = (running & (strain > self.threshold)).astype(np.float64)
-        self.episode["episode_cost"] += cost + self._left(failure)
-        return {
-            "cost": cost,
-            "episode_cost": self.episode["episode_cost"].copy(),
-            "strain_excess": np.maximum(strain - self.threshold, 0),
-            "strain_p95": np.where(strain < MOST_STRAIN, self._strain_p95, MOST_STRAIN),
-            "tension_left": self._tension[:, 0].copy(),
-            "tension_right": self._tension[:, 1].copy(),
-        }
-
-    def _left(self, failure: NDArray) -> NDArray:
-        # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
-        return np.where(failure > 0, self.acting_steps - self.episode["step"], 0)
-
-    def _prices(self, failure: NDArray, info: dict[str, Any]) -> dict[str, NDArray]:
-        return {"cost": -self.cost_penalty * (info["cost"] + self._left(failure))}
-
     # --- experts and picture --------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
         """As a rigid pair, gently, see ``carriers.careful``."""
-        view, public = self.simulation.view, self.simulation.layout.to_public
-        velocity = np.stack([public(view.v[:, :, clip[0]]) for clip in CLIPS], axis=1).astype(np.float64)
+        velocity = self.simulation.velocities[:, [clip[0] for clip in CLIPS]].astype(np.float64)
         last = self.episode["next"] == WAYPOINTS - 1
         return self._as_actions(carriers.careful(*self._clips_and_places(), velocity, last, SIDE, self.physics.time_step))
 
@@ -434,4 +430,4 @@ class ClothStrainVectorEnv(ClothVectorEnv):
 
     @cost_penalty.setter
     def cost_penalty(self, value: float) -> None:
-        self.task.cost_penalty = checked_penalty(value)
+        self.task.cost_penalty = value

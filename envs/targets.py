@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym._jit import kernel
 from clothgym.checks import finite, number, positive
 from clothgym.collisions import Box, Capsule, Collider, Sphere
 
@@ -106,32 +107,40 @@ class Target:
 
     def upper_surface(self, count: int) -> NDArray[np.float64]:
         """About ``count`` points, evenly by area, where the surface slopes by at most UPPER_SLOPE [m], (points, 3)."""
-        if self.shape == "box":
-            points = _square(count) * self.radius
-            c, s = math.cos(self.yaw), math.sin(self.yaw)
-            turned = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            return turned + (*self.center, self.height)
-        return _cap(count) * self.radius + (*self.center, self.height - self.radius)
+        points = unit_surface(self.shape, count).copy()
+        place_points(points, np.array(self.top), self.radius, np.array([math.cos(self.yaw), math.sin(self.yaw)]))
+        return points
 
     def describe(self) -> dict[str, object]:
         return asdict(self)
 
 
 @lru_cache
-def _cap(count: int) -> NDArray[np.float64]:
-    """Fibonacci points on the unit sphere's cap up to UPPER_SLOPE: equal steps in z are equal areas (Archimedes)."""
+def unit_surface(shape: str, count: int) -> NDArray[np.float64]:
+    """The points of ``Target.upper_surface`` for a radius of 1, unturned, relative to its top, (points, 3)."""
+    if shape == "box":
+        # cell centres of the square [-1, 1]^2, count rounded to a square number
+        n = max(1, round(math.sqrt(count)))
+        line = (np.arange(n) + 0.5) / n * 2 - 1
+        return np.stack([*(g.ravel() for g in np.meshgrid(line, line)), np.zeros(n * n)], axis=1)
+    # Fibonacci points on the unit sphere's cap up to UPPER_SLOPE: equal steps in z are equal areas (Archimedes)
     k = np.arange(count)
-    z = 1 - (1 - math.cos(UPPER_SLOPE)) * (k + 0.5) / count
-    r = np.sqrt(1 - z * z)
-    return np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE), z], axis=1)
+    below = (1 - math.cos(UPPER_SLOPE)) * (k + 0.5) / count
+    r = np.sqrt(1 - (1 - below) ** 2)
+    return np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE), -below], axis=1)
 
 
-@lru_cache
-def _square(count: int) -> NDArray[np.float64]:
-    """Cell centres of the square [-1, 1]^2 at z = 0: ``count`` rounded to a square number."""
-    n = max(1, round(math.sqrt(count)))
-    line = (np.arange(n) + 0.5) / n * 2 - 1
-    return np.stack([*(g.ravel() for g in np.meshgrid(line, line)), np.zeros(n * n)], axis=1)
+@kernel
+def place_points(points, top, radius, turn):
+    """Put points of a unit surface, (points, 3), in their places on a target [m].
+
+    top: see ``Target.top``.  turn: cosine and sine of the target's yaw, (2,).
+    """
+    for k in range(points.shape[0]):
+        x, y = points[k, 0] * radius, points[k, 1] * radius
+        points[k, 0] = top[0] + turn[0] * x - turn[1] * y
+        points[k, 1] = top[1] + turn[1] * x + turn[0] * y
+        points[k, 2] = top[2] + points[k, 2] * radius
 
 
 @lru_cache

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.envs.episode import FAILURES, Outcome, TaskState, failures, physics_info, within_ball
-from clothgym.envs.measures import SUMMARY, largest_strain, see_points, summarize
+from clothgym.envs.episode import FAILURES, Fields, TaskState, record_of, records
 from clothgym.envs.physics import Physics, check_material_option, check_ranges, checked_ranges, checked_wind, most_demanding
-from clothgym.mesh import SHEAR
+from clothgym.envs.stepping import Kernels, compiled, mesh_arrays
 from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
 from clothgym.simulation import Simulation
 
@@ -29,11 +28,9 @@ if TYPE_CHECKING:
     from clothgym.render import Camera, Solid
 
 REWARD_MODES = ("delta", "sparse")
-FAILURE_PENALTY = 0.5
-SUCCESS_BONUS = 0.25
-EFFORT_PRICE = 0.001
 HELD = (250, 200, 60)  # colour of the anchors' markers
 POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
+ENVS_A_THREAD = 16  # fewer are not worth another thread
 
 
 class Task(ABC):
@@ -50,17 +47,28 @@ class Task(ABC):
         wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for a calm.
         threads: threads to use; all processors by default for a batch.
 
+    Attributes:
+        episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``_remembers``; with
+            ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
+        rules: one record of figures that all environments share.
+        outcome, info, terms: records of what the last step has brought, (num_envs,).
+
     Raises:
         ValueError: an unknown mode, figure or integrator, or a range that is none; the message says what would do.
     """
 
     physics: ClassVar[Physics]
+    kernels: ClassVar[Kernels]  # what a step is about, see ``stepping``
     acting_steps: ClassVar[int]
     settling_steps: ClassVar[int] = 0
     hand_actions: ClassVar[int] = 3  # numbers for each hand: a velocity, and what comes after it
     key_particles: ClassVar[NDArray]  # those that are observed with obs_mode="keypoints"
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
     position_bound: ClassVar[float] = POSITION_BOUND
+    judgement: ClassVar[Fields]  # what info tells of the judgement, zero until then, beside performance and success
+    accounts: ClassVar[Fields] = ()  # what else it tells of each step
+    prices: ClassVar[tuple[str, ...]] = ()  # reward terms of the task's own
+    feels_pulls: ClassVar[bool] = False  # whether its kernels must know how the sheet pulls at the hands
     reset_options: ClassVar[tuple[str, ...]] = ("material",)
     strain_shown: ClassVar[float] = 0.05  # where the colours of render_color="strain" end
 
@@ -114,29 +122,46 @@ class Task(ABC):
         self.num_hands = len(physics.anchors) + len(physics.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.hand_actions * self.num_hands,), np.float32)
         self.particles = self.key_particles if obs_mode == "keypoints" else np.arange(physics.mesh.num_particles)
-        bound = self._observation_bound()
-        self.single_observation_space = gym.spaces.Box(-bound, bound, dtype=np.float32)
+        self._prepare_observation()
+        self._prepare_records()
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
         self._seeded = np.zeros(num_envs, bool)
 
-        mesh = physics.mesh
-        self._share = (mesh.area / mesh.area.sum()).astype(np.float32)
-        self._structural = np.flatnonzero(self.simulation.view.springs.kind < SHEAR)
-        layout = self.simulation.layout
-        self._summary = np.zeros((layout.blocks, SUMMARY, layout.lanes), np.float32)
-        self._origin = np.zeros((layout.blocks, 3, layout.lanes), np.float32)
-        self._seen = np.zeros((layout.blocks, 6 * len(self.particles), layout.lanes), np.float32)
-        # the episode: arrays over the batch, all of them part of the state
-        self.episode: dict[str, NDArray] = {
-            "step": np.zeros(num_envs, np.int64),
-            "settling_since": np.full(num_envs, -1, np.int64),
-            "over": np.ones(num_envs, bool),
-            "targets": np.zeros((num_envs, self.num_hands, 3)),
-            "potential": np.zeros(num_envs),
-            "observation": np.zeros((num_envs, len(bound)), np.float32),
-            "material": np.tile(of_material(self.simulation.material), (num_envs, 1)),
-            "wind": np.zeros((num_envs, self.acting_steps + self.settling_steps if self.wind is not None else 0, 3)),
-        }
+    def _prepare_observation(self) -> None:
+        """Space and memory of what is observed: the sheet's points, and what the task declares."""
+        points, declared = 3 * len(self.particles), self._observes()
+        bounds = [np.full(points, self.position_bound), np.full(points, VELOCITY_BOUND)]
+        bounds += [np.broadcast_to(bound, size[0] if size else 1).ravel() for _, bound, *size in declared]
+        self._bound = np.concatenate(bounds).astype(np.float32)
+        self.single_observation_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
+        self.observation = np.zeros((self.num_envs, len(self._bound)), np.float32)
+        self._seen = records(self.num_envs, [(name, np.float32, *size) for name, _, *size in declared])
+        self._more = self._seen.view(np.float32).reshape(self.num_envs, -1)
+
+    def _prepare_records(self) -> None:
+        """Records of the episodes and their steps, and the kernels that go through them."""
+        physics, count = self.physics, self.num_envs
+        hand, low, high = (self.num_hands, 3), *self._arena()
+        memory = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand), ("potential", float)]
+        memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self._remembers()]
+        self.episode = records(count, memory)
+        self.episode["over"] = True
+        steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
+        self.air = np.zeros((count, steps, 3))
+        self.rules = record_of(
+            low=low, high=high, reach=physics.hand_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
+            acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
+            side=max(physics.mesh.size), **self._figures(),
+        )  # fmt: skip
+        brought = [("reward", float), ("terminated", bool), ("failure", np.int64)]
+        brought += [("moves", float, (self.num_hands, self.hand_actions)), ("free", np.uint8, self.num_hands)]
+        self.outcome = records(count, brought)
+        told = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
+        self.info = records(count, [*told, ("normalized_performance", float), ("is_success", bool), *self.judgement, *self.accounts])
+        self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
+        self._mesh = mesh_arrays(physics.mesh, self.particles)
+        self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *hand))
+        self._order, self._conclude = compiled(type(self).__name__, self.kernels)
 
     # --- what each task says --------------------------------------------------------------------------------------------
 
@@ -145,51 +170,28 @@ class Task(ABC):
         """The scene's solids; those that change at reset are replaced by ``_begin``."""
 
     @abstractmethod
-    def _more_bounds(self) -> list[float]:
-        """Largest magnitude of each component of ``_observe_more``."""
+    def _arena(self) -> tuple[NDArray, NDArray]:
+        """Lowest and highest corner of the room in which hands move [m]; the sheet is out of bounds 0.5 m beyond it."""
+
+    @abstractmethod
+    def _remembers(self) -> Fields:
+        """What its episodes remember: fields of ``episode`` beside those that all have."""
+
+    def _figures(self) -> dict[str, Any]:
+        """Figures that its kernels must know: fields of ``rules``, numbers or arrays."""
+        return {}
+
+    @abstractmethod
+    def _observes(self) -> Fields:
+        """What is observed beside the points of the sheet, in that order: a number's name and largest magnitude, or those of some
+        numbers and how many they are."""
 
     @abstractmethod
     def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         """Draw one environment's scene; the sheet's particles at the start [m], (particles, 3)."""
 
-    @abstractmethod
-    def _observe_more(self) -> list[NDArray]:
-        """What is observed beside the points of the sheet, arrays (num_envs, size)."""
-
-    @abstractmethod
-    def _potential(self, summary: NDArray) -> NDArray:
-        """How far along each environment is, in [0, 1], (num_envs,); its change is the reward on the way."""
-
-    def _order(self, targets: NDArray, moves: NDArray, acting: NDArray) -> None:
-        """Tell the simulation where the hands are to be [m], (num_envs, hands, 3)."""
-        self.simulation.move_anchors(targets)
-
-    def _grip(self, moves: NDArray, acting: NDArray) -> None:  # noqa: B027 - some only move
-        """Do what an action says beside where to move, after the step; all must have let go where the time for acting is up."""
-
-    def _account(self, running: NDArray, failure: NDArray, strain: NDArray) -> dict[str, NDArray]:
-        """What else ``info`` tells of a step, (num_envs,) each; strain: the largest of the structural springs', (num_envs,)."""
-        return {}
-
-    def _prices(self, failure: NDArray, info: dict[str, Any]) -> dict[str, NDArray]:
-        """Reward terms of the task's own, (num_envs,) each; failure: index into FAILURES."""
-        return {}
-
-    def _done(self) -> NDArray:
-        """Whether each environment's agent is done before its time is up, (num_envs,)."""
-        return np.zeros(self.num_envs, bool)
-
-    @abstractmethod
-    def _judge(self, envs: NDArray, summary: NDArray) -> dict[str, NDArray]:
-        """Judge environments at the end of their episodes: at least "normalized_performance" and "is_success", (len(envs),)."""
-
-    @abstractmethod
-    def _judgement(self) -> dict[str, NDArray]:
-        """The keys of ``_judge`` for an environment that has not been judged."""
-
-    @abstractmethod
-    def _arena(self) -> tuple[NDArray, NDArray]:
-        """Lowest and highest corner of the room in which hands move [m]; the sheet is out of bounds 0.5 m beyond it."""
+    def _place_hands(self, envs: NDArray) -> None:  # noqa: B027 - anchors need nothing
+        """Put grippers where an episode begins with them; anchors hold their particles."""
 
     @abstractmethod
     def expert_actions(self) -> NDArray:
@@ -211,37 +213,27 @@ class Task(ABC):
         self._check_options(options)
         if not len(envs):
             return
+        simulation = self.simulation
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
-        length = self.episode["wind"].shape[1]
-        for k, env in enumerate(envs):
+        for k, env in enumerate(envs.tolist()):
             seed = seeds[k] if seeds is not None else None
             if seed is not None or not self._seeded[env]:
                 self.generators[env] = seeding.np_random(seed)[0]
                 self._seeded[env] = True
             self._draw_material(env, options.get("material", {}))
             if self.wind is not None:
-                self.episode["wind"][env] = self.wind.series(self.generators[env], length, self.physics.time_step)
+                self.air[env] = self.wind.series(self.generators[env], self.air.shape[1], self.physics.time_step)
             starts[k] = self._begin(env, self.generators[env], options)
         material = self.episode["material"][envs]
-        if not np.array_equal(material, self.simulation.parameters[envs]):
+        if not np.array_equal(material, simulation.parameters[envs]):
             # the declared ranges were held against the integrator's bound at construction; one episode's figures are now
             figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
-            self.simulation.set_parameters(envs, warn="material" in options, **figures)
-        self.simulation.reset(envs, positions=starts)
+            simulation.set_parameters(envs, warn="material" in options, **figures)
+        simulation.reset(envs, positions=starts)
         if self.wind is not None:
-            self.simulation.set_wind(self.episode["wind"][envs, 0], envs)
+            simulation.set_wind(self.air[envs, 0], envs)
         self._place_hands(envs)
-        episode = self.episode
-        episode["step"][envs] = 0
-        episode["settling_since"][envs] = -1
-        episode["over"][envs] = False
-        episode["targets"][envs] = self.simulation.hand_positions[envs]
-        summary = self._summarize()
-        episode["potential"][envs] = self._potential(summary)[envs]
-        episode["observation"][envs] = self._clipped_observation()[envs]
-
-    def _place_hands(self, envs: NDArray) -> None:  # noqa: B027 - anchors need nothing
-        """Put grippers where an episode begins with them; anchors hold their particles."""
+        self._look(envs, begins=True)
 
     def _check_options(self, options: Mapping[str, Any]) -> None:
         """Refuse options that no episode can have, before anything is changed."""
@@ -250,147 +242,85 @@ class Task(ABC):
         unknown = set(options) - set(self.reset_options)
         if unknown:
             raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
-        check_material_option(options.get("material", {}), self.physics, self.randomize, self.simulation)
+        if "material" in options:
+            check_material_option(options["material"], self.physics, self.randomize, self.simulation)
 
     def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
-        figures = {name: getattr(self.physics.material, name) for name in FIGURES}
+        figures = of_material(self.physics.material)
         for name, (low, high) in self.randomize.items():
-            figures[name] = float(self.generators[env].uniform(low, high))
-        self.episode["material"][env] = list((figures | dict(fixed)).values())
+            figures[FIGURES.index(name)] = self.generators[env].uniform(low, high)
+        for name, value in fixed.items():
+            figures[FIGURES.index(name)] = value
+        self.episode["material"][env] = figures
 
-    def check_actions(self, actions: Any) -> NDArray:
-        """Actions as float64, clipped to [-1, 1], (num_envs, actions).
+    def step(self, actions: Any) -> None:
+        """One control step of all environments that are not over; the others keep still and get no reward.
 
         Raises:
-            ValueError: a wrong shape or a value that is not finite; nothing has moved then.
+            ValueError: actions, (num_envs, numbers), of a wrong shape or not finite; nothing has moved then.
         """
+        if not self._seeded.all():
+            raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
+        actions, simulation = self._checked(actions), self.simulation
+        wrong = self._order(actions, simulation.layout.lanes, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
+        if wrong >= 0:
+            env, component = divmod(wrong, actions.shape[1])
+            raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
+        simulation.step()
+        self._look(self._everyone, begins=False)
+        if self.outcome["free"].any():
+            simulation.release(*np.nonzero(self.outcome["free"]))
+
+    def _checked(self, actions: Any) -> NDArray:
         try:
-            array = np.asarray(actions, dtype=np.float64)
+            array = np.ascontiguousarray(actions, np.float64)
         except (TypeError, ValueError):
             raise ValueError(f"action {actions!r}: must be an array of numbers") from None
         shape = (self.num_envs, *self.single_action_space.shape)
         if array.shape != shape:
             raise ValueError(f"action has shape {array.shape}: must be {shape}")
-        if not np.isfinite(array).all():
-            env, component = np.argwhere(~np.isfinite(array))[0]
-            raise ValueError(f"action[{component}] of environment {env} is {array[env, component]}: actions must be finite")
-        return np.clip(array, -1.0, 1.0)
+        return array
 
-    def step(self, actions: NDArray) -> Outcome:
-        """One control step of all environments that are not over; the others keep still and get no reward."""
-        if not self._seeded.all():
-            raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
-        actions = self.check_actions(actions)
-        episode, simulation = self.episode, self.simulation
-        running = ~episode["over"]
-        acting = running & (episode["settling_since"] < 0)
-        moves = actions.reshape(self.num_envs, self.num_hands, self.hand_actions)
-        self._move_hands(moves, acting)
-        if self.wind is not None:
-            now = np.minimum(episode["step"], episode["wind"].shape[1] - 1)  # those that are over wait at the end of theirs
-            simulation.set_wind(episode["wind"][np.arange(self.num_envs), now])
-        simulation.step()
-        episode["step"][running] += 1
-        self._grip(moves, acting)
-
-        summary = self._summarize()
-        failure = failures(summary, *self._arena())
-        done = acting & (self._done() | (episode["step"] >= self.acting_steps))
-        episode["settling_since"][done] = episode["step"][done]
-        settled = (episode["settling_since"] >= 0) & (episode["step"] - episode["settling_since"] >= self.settling_steps)
-        failure[~running] = 0
-        judged = running & settled & (failure == 0)
-        terminated = judged | (failure > 0)
-        strain = largest_strain(summary)
-        info: dict[str, Any] = physics_info(self.simulation, strain)
-        info |= self._account(running, failure, strain) | self._judgement()
-        for key, value in self._judge(np.flatnonzero(judged), summary).items():
-            info[key][judged] = value
-        terms = self._reward_terms(moves, acting, running, judged, failure, summary, info) | self._prices(failure, info)
-        reward = np.zeros(self.num_envs)
-        for term in terms.values():
-            reward += term
-
-        fresh = self._clipped_observation()
-        keep = ~running | (failure == 1)
-        episode["observation"] = np.where(keep[:, None], episode["observation"], fresh)
-        episode["over"] |= terminated
-        info |= {
-            "reward_terms": terms,
-            "settling": episode["settling_since"] >= 0,
-            "failure": np.array(FAILURES)[failure],
-        }
-        return Outcome(reward, terminated, np.zeros(self.num_envs, bool), info)
-
-    def _move_hands(self, moves: NDArray, acting: NDArray) -> None:
-        low, high = self._arena()
-        reach = self.physics.hand_speed * self.physics.time_step
-        targets = self.episode["targets"]
-        wanted = np.clip(targets + reach * within_ball(moves[:, :, :3]), low, high)
-        self.episode["targets"] = np.where(acting[:, None, None], wanted, targets)
-        self._order(self.episode["targets"], moves, acting)
-
-    def _summarize(self) -> NDArray:
-        """Summary of the batch, (SUMMARY, num_envs) (see ``measures.summarize``)."""
-        view = self.simulation.view
+    def _look(self, envs: NDArray, begins: bool) -> None:
+        """Score and observe environments after a step, all of them, or where their episodes begin."""
+        view, lanes, mesh = self.simulation.view, self.simulation.layout.lanes, self._mesh
+        pulls = self.simulation.pulls(envs if begins else None) if self.feels_pulls else self._no_pulls
+        if not begins:
+            self.info = np.zeros_like(self.info)
 
         def work(first: int, last: int) -> None:
-            summarize(first, last, view.x, view.v, self._share, view.springs, self._structural, self._summary)
+            self._conclude(
+                first, last, envs, begins, lanes, view.x, view.v, view.holder, view.hands, view.openings, pulls, mesh, self.rules,
+                self.episode, self.air, self.outcome, self.info, self.terms, self._seen, self._more, self._bound, self.observation,
+            )  # fmt: skip
 
-        _jit.run_spans(work, len(self._summary), self.threads)
-        return self.simulation.layout.to_public(self._summary).T
+        _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))
 
-    def _reward_terms(
-        self,
-        moves: NDArray,
-        acting: NDArray,
-        running: NDArray,
-        judged: NDArray,
-        failure: NDArray,
-        summary: NDArray,
-        info: dict[str, Any],
-    ) -> dict[str, NDArray]:
-        """Reward terms, (num_envs,) each: the potential's change, which ends at the judged performance, and small ones."""
-        performance = info["normalized_performance"]
-        with np.errstate(invalid="ignore", over="ignore"):
-            potential = np.where(judged, performance, np.where(failure > 0, 0.0, self._potential(summary)))
-        previous = self.episode["potential"]
-        self.episode["potential"] = np.where(running, potential, previous)
-        if self.reward_mode == "sparse":
-            nothing = np.zeros(self.num_envs)
-            return {"progress": performance * judged, "effort": nothing, "success": nothing.copy(), "failure": nothing.copy()}
-        squares = moves[:, :, 0] ** 2 + moves[:, :, 1] ** 2 + moves[:, :, 2] ** 2
-        effort = squares[:, 0].copy()
-        for a in range(1, self.num_hands):
-            effort += squares[:, a]
-        return {
-            "progress": np.where(running, potential - previous, 0.0),
-            "effort": -EFFORT_PRICE * effort * acting,
-            "success": SUCCESS_BONUS * (info["is_success"] & judged),
-            "failure": -FAILURE_PENALTY * (failure > 0),
-        }
+    # --- what a step has brought ----------------------------------------------------------------------------------------
 
-    def _observation_bound(self) -> NDArray:
-        points = 3 * len(self.particles)
-        return np.array([self.position_bound] * points + [VELOCITY_BOUND] * points + self._more_bounds(), np.float32)
+    def told(self) -> dict[str, Any]:
+        """What info tells of the last step: arrays over the batch, and a dict of them for the reward's terms."""
+        info = {name: self.info[name].copy() for name in self.info.dtype.names} | self._told_by_physics()
+        info["failure"] = np.array(FAILURES)[self.outcome["failure"]]
+        info["reward_terms"] = {name: self.terms[name].copy() for name in self.terms.dtype.names}
+        return info
 
-    def _clipped_observation(self) -> NDArray:
-        """Points of the sheet relative to the origin, in sides, their velocities [m/s], and more; within the bounds."""
-        view, scale = self.simulation.view, np.float32(1 / max(self.physics.mesh.size))
+    def told_of(self, env: int) -> dict[str, Any]:
+        """The same of one environment, as plain Python values."""
+        info = dict(zip(self.info.dtype.names, self.info[env].item()))
+        info |= {name: value[env].item() for name, value in self._told_by_physics().items()}
+        info["failure"] = FAILURES[self.outcome["failure"][env]]
+        info["reward_terms"] = dict(zip(self.terms.dtype.names, self.terms[env].item()))
+        return info
 
-        def work(first: int, last: int) -> None:
-            see_points(first, last, view.x, view.v, self.particles, self._origin, scale, self._seen)
-
-        _jit.run_spans(work, len(self._seen), self.threads)
-        space = self.single_observation_space
-        with np.errstate(invalid="ignore", over="ignore"):
-            seen = [self.simulation.layout.to_public(self._seen), *self._observe_more()]
-            return np.clip(np.concatenate(seen, axis=1, dtype=np.float32, casting="unsafe"), space.low, space.high)
-
-    def _set_origin(self, env: int, origin: ArrayLike) -> None:
-        """Observe an environment's positions relative to this point [m]."""
-        block, lane = divmod(env, self.simulation.layout.lanes)
-        self._origin[block, :, lane] = origin
+    def _told_by_physics(self) -> dict[str, NDArray]:
+        """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and the largest lag
+        of what is held [m]."""
+        limiting, contacts = self.simulation.limiting, self.simulation.self_contacts
+        info = {} if limiting is None else {"strain_before_limiting": limiting.before}
+        if contacts is not None:
+            info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "hand_lag": contacts.lag}
+        return info
 
     # --- pictures -------------------------------------------------------------------------------------------------------
 
@@ -404,9 +334,13 @@ class Task(ABC):
     def get_state(self) -> TaskState:
         return TaskState(
             simulation=self.simulation.get_state(),
-            episode={name: value.copy() for name, value in self.episode.items()},
+            episode={name: value.copy() for name, value in self._memory().items()},
             generators=[json.dumps(g.bit_generator.state) for g in self.generators],
         )
+
+    def _memory(self) -> dict[str, NDArray]:
+        """All that is remembered of the episodes, live."""
+        return {name: self.episode[name] for name in self.episode.dtype.names} | {"observation": self.observation, "wind": self.air}
 
     def set_state(self, state: TaskState) -> None:
         """Continue from a state of the same task with as many environments.
@@ -414,10 +348,9 @@ class Task(ABC):
         Raises:
             ValueError: the state is another task's or of another size; nothing is changed then.
         """
+        memory = self._memory()
         missing = {
-            name
-            for name in {*self.episode, *state.episode}
-            if np.shape(self.episode.get(name, ())) != np.shape(state.episode.get(name, ()))
+            name for name in {*memory, *state.episode} if np.shape(memory.get(name, ())) != np.shape(state.episode.get(name, ()))
         }
         if missing or len(state.generators) != self.num_envs:
             raise ValueError(
@@ -427,7 +360,8 @@ class Task(ABC):
         if np.any(state.episode["over"] & (state.episode["step"] == 0)):
             raise ValueError("the state is from before the first reset: there is no episode to continue")
         self.simulation.set_state(state.simulation)
-        self.episode = {name: value.copy() for name, value in state.episode.items()}
+        for name, value in memory.items():
+            value[...] = state.episode[name]
         for env, text in enumerate(state.generators):
             self.generators[env] = np.random.default_rng()
             self.generators[env].bit_generator.state = json.loads(text)

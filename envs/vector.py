@@ -82,24 +82,26 @@ class ClothVectorEnv(VectorEnv):
 
     def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
         """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
-        over = self.task.episode["over"].copy()
-        outcome = self.task.step(actions)
-        info = _with_masks(_only(outcome.info, ~over), ~over)
+        task = self.task
+        over = task.episode["over"].copy()
+        task.step(actions)
+        told, terminated = task.told(), task.outcome["terminated"].copy()
+        info = _with_masks(_only(told, ~over), ~over)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # those that ended in the last step begin anew in this one: their actions were ignored
-            self.task.reset(np.flatnonzero(over))
+            task.reset(np.flatnonzero(over))
             info["_failure"] = info["_failure"] | over  # a reset says that there is none
         elif self.autoreset_mode == AutoresetMode.SAME_STEP:
-            ended = outcome.terminated | outcome.truncated
-            if ended.any():
-                info = self._reset_ended(ended, outcome.info)
-        return self._observation(), outcome.reward, outcome.terminated, outcome.truncated, info
+            if terminated.any():
+                info = self._reset_ended(terminated, told)
+        # the time limit is part of the tasks: nothing is truncated
+        return self._observation(), task.outcome["reward"].copy(), terminated, np.zeros(self.num_envs, bool), info
 
     def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> dict[str, Any]:
         """Same-step mode: begin anew; what was last goes to ``final_info`` and ``final_obs``, the rest is of those that run on."""
         final = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            final[env] = self.task.episode["observation"][env].copy()
+            final[env] = self.task.observation[env].copy()
         self.task.reset(np.flatnonzero(ended))
         running = _with_masks(_only(info, ~ended), ~ended)
         running["_failure"] = np.ones(self.num_envs, bool)  # the reset of the others says that there is none
@@ -111,7 +113,7 @@ class ClothVectorEnv(VectorEnv):
         }
 
     def _observation(self) -> NDArray:
-        return self.task.episode["observation"].copy()
+        return self.task.observation.copy()
 
     def render(self) -> tuple[NDArray, ...] | None:
         if self.render_mode is None:

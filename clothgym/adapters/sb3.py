@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from clothgym.envs.single import pick
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.registration import ENVIRONMENTS
 
@@ -47,10 +46,8 @@ class ClothSB3VecEnv(VecEnv):
         # a constrained learner needs each step's cost
         infos: list[dict[str, Any]] = [{"cost": float(c)} for c in info["cost"]] if "cost" in info else [{} for _ in done]
         if done.any():
-            final = {key: value for key, value in info["final_info"].items() if not key.startswith("_")}
-            final["reward_terms"] = {k: v for k, v in final["reward_terms"].items() if not k.startswith("_")}
             for env in np.flatnonzero(done):
-                infos[env] = pick(final, int(env))
+                infos[env] = self.env.task.told_of(int(env))
                 infos[env]["terminal_observation"] = info["final_obs"][env]
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
         return observation, reward.astype(np.float32), done, infos
