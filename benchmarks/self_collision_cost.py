@@ -24,7 +24,6 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import mujoco
@@ -33,7 +32,8 @@ from numpy.typing import NDArray
 from self_collision import Case, Row, fill, table
 from tqdm import tqdm
 
-from clothgym import ClothMesh, Material, Plane, Simulation, grid
+from clothgym import ClothMesh, Plane, Simulation, grid
+from clothgym.bench_mujoco import COTTON, DROP, FRAME, ROWS, SECONDS, SIDE, THIN, mujoco_model, start_of
 from clothgym.collisions.intersections import count_intersections
 from clothgym.crumpling import FRICTION, Drag, EdgeDrop, Fold, Heap, Manoeuvre, ZFold
 
@@ -42,7 +42,7 @@ from matplotlib import pyplot as plt
 
 RESULT = Path(__file__).parent / "results" / "self_collision_cost.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "self_collision.png"
-FRAME, THICKNESS, LANES = 1 / 60, 0.008, 64
+THICKNESS, LANES = 0.008, 64
 MODES = ("none", "fast", "strict")
 WARM, TIMED = 20, 60  # frames of a state
 ROUNDS = 2  # of an episode; of each frame the faster run counts
@@ -61,10 +61,6 @@ SPACING = 1 / 24  # of the sheets that grow [m]
 SIDES = (13, 17, 25, 35, 49, 71, 100)
 LEAF = 8  # cells of a leaf of the folded sheet that grows
 
-# MuJoCo's scene
-ROWS, SIDE, SECONDS, DROP, THIN = 25, 0.5, 2.0, 0.05, 0.004
-COTTON = Material.preset("cotton")
-YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # where the preset comes from: [Pa], [m]
 THEIRS = [
     {"engine": "MuJoCo", "contact": contact, "steps": steps}
     for contact, counts in (("ipc", (1, 4)), ("ordinary", (4,)))
@@ -196,39 +192,13 @@ def measure_growth(side: int, scene: str, frames: int = TIMED) -> Row:
     return {"particles": side * side} | {f"{mode}_ms": 1000 * s for mode, s in seconds.items()}
 
 
-def mujoco_model(contact: str, steps: int) -> Any:
-    spacing = SIDE / (ROWS - 1)
-    spec = mujoco.MjSpec.from_string(f"""
-        <mujoco>
-          <size memory="200M"/>
-          <option timestep="{FRAME / steps!r}" integrator="discrete" solver="Newton" gravity="0 0 -9.81">
-            <flag ipc="{"enable" if contact == "ipc" else "disable"}"/>
-          </option>
-          <worldbody>
-            <geom type="plane" size="2 2 0.1"/>
-            <flexcomp name="sheet" type="grid" dim="2" count="{ROWS} {ROWS} 1" spacing="{spacing!r} {spacing!r} 1"
-                      radius="{THIN / 2!r}" pos="0 0 {SIDE / 2 + DROP!r}" euler="88 0 0">
-              <contact selfcollide="auto"/>
-              <elasticity young="{YOUNG!r}" poisson="{POISSON!r}" thickness="{SHEET_THICKNESS!r}" damping="{COTTON.damping_time!r}"
-                          elastic2d="both"/>
-            </flexcomp>
-          </worldbody>
-        </mujoco>""")
-    for body in spec.bodies[1:]:
-        borders = int(np.sum(np.isclose(np.abs(body.pos[:2]), SIDE / 2)))
-        body.mass = COTTON.density * spacing**2 / 2**borders
-    return spec.compile()
-
-
 def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECONDS) -> Row:
     """One sheet on one core."""
     model = mujoco_model(contact, steps)
     triangles = model.flex_elem.reshape(-1, 3)
     best, counts, warned = np.full(round(seconds / FRAME), np.inf), [], 0
     for _ in range(ROUNDS):
-        data = mujoco.MjData(model)
-        data.qpos[:] += np.random.default_rng(0).normal(scale=2e-5, size=model.nq)
-        mujoco.mj_forward(model, data)
+        data = start_of(model)
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {steps}", leave=False):
             begun = time.perf_counter()
             mujoco.mj_step(model, data, nstep=steps)

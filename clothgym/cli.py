@@ -19,6 +19,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = commands.add_parser("bench", help="measure speed on this machine")
     bench.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
     bench.add_argument("--quick", action="store_true", help="fewer cases, in a few seconds")
+    bench.add_argument(
+        "--table", action="store_true", help="what everything costs, beside what is wanted and what the machine allows"
+    )
+    bench.add_argument("--select", nargs="*", default=[], metavar="GROUP", help="of the table: springs, strict, start, ...")
     compare = commands.add_parser("compare", help="one scene, several integrators: errors, costs and pictures")
     compare.add_argument("--scene", default="stiff_sheet", metavar="NAME", help="see --list (default: stiff_sheet)")
     compare.add_argument("--list", action="store_true", help="the scenes, and what each breaks")
@@ -59,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     elif options.command == "view":
         _view(options, view)
     else:
-        _bench(options.json, options.quick)
+        _bench(options, bench)
     return 0
 
 
@@ -114,14 +118,21 @@ def _warm_up(everything: bool) -> None:
     print(f"{what} ready ({time.perf_counter() - begun:.1f} s)")
 
 
-def _bench(path: Path | None, quick: bool) -> None:
-    from clothgym import bench
+def _bench(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    from clothgym import bench, bench_table
 
-    results = bench.run(quick)
-    print(bench.table(results))
-    if path is not None:
-        path.write_text(json.dumps(results, indent=1) + "\n")
-        print(f"written to {path}")
+    if options.table:
+        try:
+            results = bench_table.run(options.select)
+        except ValueError as error:
+            parser.error(str(error))
+        print(bench_table.table(results))
+    else:
+        results = bench.run(options.quick)
+        print(bench.table(results))
+    if options.json is not None:
+        options.json.write_text(json.dumps(results, indent=1) + "\n")
+        print(f"written to {options.json}")
 
 
 def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:

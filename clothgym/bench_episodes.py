@@ -1,0 +1,294 @@
+"""The rows of the table that take seconds: episodes of the tasks, manoeuvres, MuJoCo, and whole processes."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+from unittest import mock
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.bench_mujoco import measure_mujoco, measure_ours
+from clothgym.bench_table import Row, beat, row_of, tell
+from clothgym.crumpling import Fold, Manoeuvre, ZFold
+from clothgym.mesh import grid
+from clothgym.registration import ENVIRONMENTS
+from clothgym.simulation import Simulation
+
+DRAPE = "ClothDrape-v0"
+MANY, STEPS = 128, 100  # environments and steps of an episode
+LETS_GO = 0.81  # chance acts below this, and so lets go in a step of a hundred
+SPACING, LEAF = 1 / 24, 8  # of the sheets that grow [m], and cells of a leaf
+FRAME, THICKNESS = 1 / 60, 0.008
+
+
+def make(env_id: str, num_envs: int | None = None, **options: Any) -> Any:
+    """An environment, or a batch, whose options its task may not take yet: ``contact`` is slipped in, ``physics`` left out."""
+    if num_envs is not None:
+        options |= {"num_envs": num_envs, "threads": 1}
+        options.setdefault("autoreset_mode", "SameStep")
+    maker = gym.make if num_envs is None else gym.make_vec
+    try:
+        return maker(f"clothgym:{env_id}", **options)
+    except TypeError as error:
+        unknown = [name for name in ("contact", "physics") if f"argument '{name}'" in str(error)]
+        if not unknown:
+            raise
+    value = options.pop(unknown[0])
+    from clothgym.envs import task
+
+    def altered(*args: Any, **world: Any) -> Simulation:
+        return Simulation(*args, **{**world, "contact": value})
+
+    with mock.patch.object(task, "Simulation", altered) if unknown == ["contact"] else nullcontext():
+        return make(env_id, **options)
+
+
+class Stopwatch:
+    """Adds up the processor time of this thread spent in a simulation's steps [s]."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.seconds = 0.0
+        self.step = simulation.step
+        simulation.step = self  # type: ignore[method-assign, assignment]
+
+    def __call__(self, n: int = 1) -> None:
+        begun = time.thread_time()
+        self.step(n)
+        self.seconds += time.thread_time() - begun
+
+
+# --- batches of ClothDrape-v0 -------------------------------------------------------------------------------------------------
+
+
+def play(variants: dict[str, Row], expert: bool, num_envs: int = MANY, steps: int = STEPS, rounds: int = 2) -> dict[str, float]:
+    """Microseconds of an environment step by variant, in turns step by step; of each step the fastest round counts."""
+    best: dict[str, NDArray] = {name: np.full(steps, np.inf) for name in variants}
+    envs = {name: make(DRAPE, num_envs, **options).unwrapped for name, options in variants.items()}
+    for turn in range(rounds):
+        random = np.random.default_rng(0)
+        for env in envs.values():
+            env.reset(seed=0)
+        for step in range(steps):
+            chance = random.uniform(-1, LETS_GO, next(iter(envs.values())).action_space.shape).astype(np.float32)
+            for name, env in envs.items():
+                action = env.expert_actions() if expert else chance
+                begun = time.thread_time()
+                env.step(action)
+                best[name][step] = min(best[name][step], time.thread_time() - begun)
+            beat(f"{DRAPE} {'expert' if expert else 'chance'}: round {turn + 1} of {rounds}, step {step + 1} of {steps}")
+    return {name: float(times.mean()) * 1e6 / num_envs for name, times in best.items()}
+
+
+PARTICLES: Row = {"contact": "particles", "bending": "springs"}
+SHEET, STRICT = {**PARTICLES, "contact": "sheet"}, {**PARTICLES, "self_collision": "strict"}
+
+
+def contact() -> list[Row]:
+    us = play({"particles": PARTICLES, "sheet": SHEET}, expert=True)
+    return [
+        row_of("contact", f"{DRAPE}, particles, expert, {MANY}", 1e6 / us["particles"], "steps/s"),
+        row_of("contact", f"{DRAPE}, sheet, expert, {MANY}", 1e6 / us["sheet"], "steps/s"),
+        row_of("contact", f"{DRAPE}, sheet instead of particles, expert, {MANY}", us["sheet"] - us["particles"], "us more", 40),
+    ]
+
+
+def strict() -> list[Row]:
+    both = {**SHEET, "self_collision": "strict"}
+    expert = play({"without": PARTICLES, "with": STRICT, "both": both, "rigid": {**both, "bending": "quadratic"}}, expert=True)
+    chance = play({"without": PARTICLES, "with": STRICT}, expert=False)
+    name, rows = f"{DRAPE}, strict self-collision", []
+    for actor, us, goal in (("expert", expert, 120), ("chance", chance, 350)):
+        rows.append(row_of("strict", f"{name}, {actor}, {MANY}", us["with"] - us["without"], "us more", goal))
+    rows.append(row_of("strict", f"{name} and sheet, expert, {MANY}", 1e6 / expert["both"], "steps/s", 3500, least=True))
+    rigid = f"{name}, sheet and rigidity (quadratic), expert, {MANY}"
+    return [*rows, row_of("strict", rigid, 1e6 / expert["rigid"], "steps/s", 3000, least=True)]
+
+
+# --- single environments, and what is not physics -----------------------------------------------------------------------------
+
+
+def env() -> list[Row]:
+    """Steps a second of ``gym.make``, resets included."""
+    rows = []
+    cases = [(env_id, actor) for env_id in ENVIRONMENTS for actor in ("chance", "expert")]
+    made = {case: make(case[0], physics="fast") for case in cases}
+    times: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
+    for turn in range(6):
+        for case, one in made.items():
+            one.action_space.seed(0)
+            one.reset(seed=turn)
+            seconds = 0.0
+            for _ in range(STEPS):
+                action = one.unwrapped.expert_action() if case[1] == "expert" else one.action_space.sample()
+                begun = time.thread_time()
+                if one.step(action)[2]:
+                    one.reset()
+                seconds += time.thread_time() - begun
+            if turn:
+                times[case].append(seconds / STEPS)
+        beat(f"gym.make: turn {turn + 1} of 6")
+    for (env_id, actor), taken in times.items():
+        goal = 3000.0 if env_id == DRAPE else None
+        what = f"gym.make({env_id!r}), today's physics, {actor}"
+        rows.append(row_of("env", what, 1 / statistics.median(taken), "steps/s", goal, least=True))
+    return rows
+
+
+def overhead(rounds: int = 3) -> list[Row]:
+    """What everything that is not physics costs: the time of steps, less that of the simulation's steps in them."""
+    rows = []
+    for env_id in ENVIRONMENTS:
+        ways: list[tuple[str, int, float, Callable[[], Any]]] = [
+            ("one", 1, 80, partial(make, env_id)),
+            ("each of 256", 256, 10, partial(make, env_id, 256)),
+        ]
+        if find_spec("stable_baselines3") is not None:
+            from clothgym.adapters.sb3 import make_sb3_vec_env
+
+            ways.append(("each of 256, SB3", 256, 10, partial(make_sb3_vec_env, env_id, 256, seed=0, threads=1)))
+        for what, num_envs, goal, maker in ways:
+            beside = [_beside(maker(), num_envs, 500 if num_envs == 1 else 60) for _ in range(rounds)]
+            rows.append(row_of("overhead", f"{env_id}, beside the physics, {what}", statistics.median(beside), "us", goal))
+            beat(rows[-1]["what"])
+    return rows
+
+
+def _beside(one: Any, num_envs: int, steps: int) -> float:
+    """Microseconds of an environment step without its physics, resets included; chance acts."""
+    random, adapted = np.random.default_rng(0), not isinstance(one, gym.Env | gym.vector.VectorEnv)
+    simulation = (one.env if adapted else one).unwrapped.task.simulation
+    one.reset() if adapted else one.reset(seed=0)
+    shape = (num_envs, *one.action_space.shape) if adapted else one.action_space.shape
+    # by then the episodes' ends are spread over time
+    for _ in range(110 if num_envs > 1 else 1):
+        one.step(random.uniform(-1, LETS_GO, shape).astype(np.float32))
+    watch, total = Stopwatch(simulation), 0.0
+    for _ in range(steps):
+        action = random.uniform(-1, LETS_GO, shape).astype(np.float32)
+        begun = time.thread_time()
+        outcome = one.step(action)
+        if num_envs == 1 and outcome[2]:
+            one.reset()
+        total += time.thread_time() - begun
+    return (total - watch.seconds) * 1e6 / (steps * num_envs)
+
+
+# --- sheets that touch themselves ---------------------------------------------------------------------------------------------
+
+
+def frames(manoeuvres: Mapping[str, Manoeuvre], count: int) -> dict[str, float]:
+    """Mean milliseconds of a frame of each, the physics alone, in turns frame by frame."""
+    watches = {name: Stopwatch(manoeuvre.simulation) for name, manoeuvre in manoeuvres.items()}
+    for frame in range(count):
+        for manoeuvre in manoeuvres.values():
+            manoeuvre.step()
+        beat(f"{', '.join(manoeuvres)}: frame {frame + 1} of {count}")
+    return {name: 1e3 * watch.seconds / count for name, watch in watches.items()}
+
+
+def _options(mode: str) -> Row:
+    return {"threads": 1} | ({} if mode == "none" else {"self_collision": {"mode": mode, "thickness": THICKNESS}})
+
+
+def fold(num_envs: int = 64) -> list[Row]:
+    mesh, modes = grid(25, 25, 1.0, 1.0), ("none", "strict")
+    made = {mode: Fold(mesh, seeds=range(num_envs), thickness=THICKNESS, **_options(mode)) for mode in modes}
+    for mode in modes:  # loads what is compiled
+        Fold(mesh, seeds=[0], thickness=THICKNESS, **_options(mode)).step()
+    ms = {mode: time / num_envs for mode, time in frames(made, round(made["none"].seconds / FRAME)).items()}
+    return [
+        row_of("fold", f"folding in half, 25 x 25, strict, {num_envs}", ms["strict"], "ms a frame, each", 0.6),
+        row_of("fold", f"folding in half, 25 x 25, without self-collision, {num_envs}", ms["none"], "ms a frame, each"),
+    ]
+
+
+def growth(sides: tuple[int, int] = (25, 100), count: int = 60) -> list[Row]:
+    """A folded sheet's first second of falling, by size."""
+    made = {}
+    for side in sides:
+        mesh = grid(side, side, (side - 1) * SPACING, (side - 1) * SPACING)
+        for name in ("falling", "warm"):
+            made[f"{name} {side}"] = ZFold(mesh, thickness=THICKNESS, leaves=(side - 1) // LEAF, **_options("strict"))
+        made.pop(f"warm {side}").simulation.step()
+    ms = frames(made, count)
+    small, large = (ms[f"falling {side}"] for side in sides)
+    told = [
+        row_of("growth", f"a folded sheet that falls, {side} x {side}, strict", ms[f"falling {side}"], "ms a frame")
+        for side in sides
+    ]
+    times = f"the same, {sides[0]} x {sides[0]} to {sides[1]} x {sides[1]}"
+    return [*told, row_of("growth", times, large / small, "times", 20)]
+
+
+def mujoco() -> list[Row]:
+    if find_spec("mujoco") is None:
+        return [row_of("mujoco", "MuJoCo is not installed: pip install 'mujoco>=4'", float("nan"), "")]
+    name = "a sheet that falls on its edge"
+    ours = {lanes: measure_ours(lanes) for lanes in (1, 64)}
+    rows = [row_of("mujoco", f"{name}, strict, {lanes} at once", speed, "frames/s") for lanes, speed in ours.items()]
+    for steps, goal in ((1, 50), (4, 120)):
+        theirs = measure_mujoco("ipc", steps)
+        rows.append(row_of("mujoco", f"{name}, MuJoCo's ipc, {steps} a frame", theirs, "frames/s"))
+        rows.append(
+            row_of("mujoco", f"64 at once over MuJoCo's ipc, {steps} a frame", ours[64] / theirs, "times", goal, least=True)
+        )
+    return rows
+
+
+# --- whole processes ----------------------------------------------------------------------------------------------------------
+
+FIRST_STEP = "import gymnasium as gym; e = gym.make('clothgym:{}'); e.reset(seed=0); e.step(e.action_space.sample())"
+ALL_PHYSICS = (
+    "from clothgym.bench_episodes import make; "
+    "e = make('{}', contact='sheet', self_collision='strict', bending='quadratic'); "
+    "e.reset(seed=0); e.step(e.action_space.sample())"
+)
+
+
+def start(runs: int = 7) -> list[Row]:
+    imports, first, times = "import numba, gymnasium", FIRST_STEP.format(DRAPE), []
+    rows = []
+    for what, code in (("the id as it is", first), ("all of its physics", ALL_PHYSICS.format(DRAPE))):
+        with tempfile.TemporaryDirectory() as folder:
+            goal = 20 if what != "the id as it is" else None
+            rows.append(row_of("start", f"cold, first step of {DRAPE}, {what}", process_seconds(code, folder), "s", goal))
+            if code is first:
+                for run in range(runs):
+                    times.append((process_seconds(imports, folder), process_seconds(code, folder)))
+                    tell(f"start: run {run + 1} of {runs}")
+    bare, warm = (statistics.median(taken) for taken in zip(*times))
+    ratio = statistics.median(b / a for a, b in times)
+    rows += [row_of("start", imports, bare, "s"), row_of("start", f"warm, first step of {DRAPE}", warm, "s")]
+    return [*rows, row_of("start", "the same over those imports", ratio, "times", 1.3)]
+
+
+def process_seconds(code: str, cache: str) -> float:
+    """Seconds of a whole process on the clock."""
+    begun = time.perf_counter()
+    environment = os.environ | {"CLOTHGYM_CACHE_DIR": cache}
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
+    return time.perf_counter() - begun
+
+
+GROUPS: dict[str, Callable[[], list[Row]]] = {
+    "contact": contact,
+    "strict": strict,
+    "env": env,
+    "overhead": overhead,
+    "fold": fold,
+    "growth": growth,
+    "mujoco": mujoco,
+    "start": start,
+}

@@ -1,0 +1,201 @@
+"""The table of speeds: what each thing costs here, beside what is wanted of it and what the machine allows.
+
+    python -m clothgym bench --table                                    # all of it, about a quarter of an hour
+    python -m clothgym bench --table --select springs bending           # some groups; --json FILE writes the rows too
+
+All on one thread, by the processor time of that thread (but "start", whole processes).  What takes milliseconds is measured in
+turns, round after round over all of it, and its median counts: whatever else the machine does hits all alike, and ratios hold
+where figures do not.  What takes seconds is measured in turns with what it is held against, frame by frame, and beside each of its
+rows stands what a plain step took meanwhile.
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+from clothgym.bench import machine
+from clothgym.bench_limits import PlainSheet, Work, measure_limits, stand
+
+Row = dict[str, Any]
+ROUNDS = 15
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """Something that takes milliseconds.
+
+    Attributes:
+        group, what: its group, and what it is.
+        call: what is timed.
+        scale: from seconds of a call to the unit.
+        wanted: in words, where there is no goal.
+        over, beyond: told as so many times that case's time, or as so much more.
+        goal: at most this, or so many times what another case takes.
+        visits: springs times substeps times environments of a call: what a physics row is also told by, in ns.
+        work, springs, size: of a substep, see ``bench_limits.stand``; with ``beyond``, of what it does more.
+    """
+
+    group: str
+    what: str
+    call: Callable[[], object]
+    scale: float
+    unit: str
+    wanted: str = ""
+    over: Case | None = None
+    beyond: Case | None = None
+    goal: float | tuple[float, Case] | None = None
+    visits: int = 0
+    work: Work | None = None
+    springs: int = 0
+    size: int = 0
+
+    def figure(self, seconds: dict[Case, float]) -> float:
+        if self.over is not None:
+            return seconds[self] * self.scale / (seconds[self.over] * self.over.scale)
+        less = seconds[self.beyond] * self.beyond.scale if self.beyond is not None else 0.0
+        return seconds[self] * self.scale - less
+
+    def row(self, seconds: dict[Case, float], limits: Row) -> Row:
+        goal, wanted = self.goal, self.wanted
+        if isinstance(goal, tuple):
+            factor, other = goal
+            goal = factor * other.figure(seconds)
+            wanted = f"{goal:.3g}: {factor:g} times {other.what}"
+        row = row_of(self.group, self.what, self.figure(seconds), self.unit, goal, wanted)
+        if self.visits:
+            row["ns a spring"] = 1e9 * (seconds[self] - (seconds[self.beyond] if self.beyond else 0.0)) / self.visits
+        if self.work is not None:
+            row["limits"] = stand(row["ns a spring"], self.work, self.springs, self.size, limits)
+        return row
+
+
+def row_of(group: str, what: str, now: float, unit: str, goal: float | None = None, wanted: str = "", least: bool = False) -> Row:
+    """A row; goal: at most, or at least, this."""
+    reached = None if goal is None else bool(now >= goal if least else now <= goal)
+    wanted = wanted or ("" if goal is None else f"{goal:g}")
+    return {"group": group, "what": what, "now": now, "unit": unit, "goal": goal, "wanted": wanted, "reached": reached}
+
+
+def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
+    """Median processor seconds of each case's calls; the cases take turns, and so does who begins."""
+    times: dict[Case, list[float]] = {case: [] for case in cases}
+    for case in cases:
+        case.call()
+    for turn in range(rounds):
+        first = turn * len(cases) // rounds
+        for case in (*cases[first:], *cases[:first]):
+            begun = time.thread_time()
+            case.call()
+            times[case].append(time.thread_time() - begun)
+        tell(f"round {turn + 1} of {rounds}, {len(cases)} cases")
+    return {case: statistics.median(taken) for case, taken in times.items()}
+
+
+def with_what_they_need(cases: Iterable[Case]) -> list[Case]:
+    """The cases, and those that they are held against, once each."""
+    found: dict[Case, None] = {}
+
+    def add(case: Case) -> None:
+        if case not in found:
+            others = (case.over, case.beyond, case.goal[1] if isinstance(case.goal, tuple) else None)
+            for other in others:
+                if other is not None:
+                    add(other)
+            found[case] = None
+
+    for case in cases:
+        add(case)
+    return list(found)
+
+
+class Pace:
+    """How fast the machine is while something long runs: plain steps in between, by which figures of two runs can be compared."""
+
+    def __init__(self) -> None:
+        self.sheet = PlainSheet(25)
+        self.times: list[float] = []
+
+    def sample(self, steps: int = 40) -> None:
+        begun = time.thread_time()
+        self.sheet.step(steps)
+        self.times.append((time.thread_time() - begun) * 1e9 / (steps * self.sheet.springs))
+
+    def take(self) -> float | None:
+        """Median nanoseconds of a plain step, a spring, since it was last asked."""
+        times, self.times = self.times, []
+        return statistics.median(times) if times else None
+
+
+@cache
+def pace() -> Pace:
+    return Pace()
+
+
+def beat(text: str) -> None:
+    """Tell how far it is, and take the machine's pace."""
+    pace().sample()
+    tell(text)
+
+
+def tell(text: str) -> None:
+    print(f"\r{text:<78}", end="", file=sys.stderr, flush=True)
+
+
+def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]:
+    """All rows of those groups, or of all, with the machine and its limits.
+
+    Raises:
+        ValueError: a group that there is not.
+    """
+    from clothgym.bench_cases import GROUPS as SHORT  # each looks at the other's rows
+    from clothgym.bench_episodes import GROUPS as LONG
+
+    known = {**SHORT, **LONG}
+    for name in select:
+        if name not in known:
+            raise ValueError(f"no group {name!r} (there are: {', '.join(known)})")
+    chosen = list(select) or list(known)
+    results: dict[str, Any] = {"machine": machine(), "limits": measure_limits(), "rows": []}
+    cases = with_what_they_need(case for name in chosen if name in SHORT for case in SHORT[name]())
+    if cases:
+        seconds = in_turns(cases, rounds or ROUNDS)
+        results["rows"] += [case.row(seconds, results["limits"]) for case in cases]
+    for name in chosen:
+        if name in LONG:
+            beat(name)
+            rows = LONG[name]()
+            beat(name)
+            plain = pace().take()
+            results["rows"] += [row | {"plain step ns": plain} for row in rows]
+    tell("")
+    return results
+
+
+def table(results: dict[str, Any]) -> str:
+    """The rows as text."""
+    about, limits = results["machine"], results["limits"]
+    lines = [f"{about['processor']}, {about['date']}; " + ", ".join(f"{k} {v}" for k, v in about["versions"].items())]
+    bandwidth = ", ".join(f"{level} {speed / 1e9:.0f}" for level, speed in limits["bytes/s"].items())
+    lines.append(
+        f"one core: {limits['operations/s'] / 1e9:.0f} thousand million operations a second, "
+        f"{limits['inverse roots/s'] / 1e9:.2f} inverse roots; GB/s: {bandwidth}"
+    )
+    group = ""
+    for row in results["rows"]:
+        if row["group"] != group:
+            group = row["group"]
+            lines += ["", f"{group:<66} {'now':>9} {'':<22} wanted"]
+        mark = {True: "reached", False: "", None: ""}[row["reached"]]
+        now = row["now"] if row["now"] is not None else float("nan")
+        told = f"{now:,.0f}" if abs(now) >= 1000 else f"{now:.3g}"
+        lines.append(f"  {row['what']:<64} {told:>9} {row['unit']:<22} {row['wanted']} {mark}".rstrip())
+        if "limits" in row:
+            shares = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in row["limits"]["shares"].items())
+            lines.append(f"  {'':<64} {'':>9} {shares}")
+    return "\n".join(lines)
