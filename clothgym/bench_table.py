@@ -3,7 +3,7 @@
     python -m clothgym bench --table                                    # all of it, about a quarter of an hour
     python -m clothgym bench --table --select springs bending           # some groups; --json FILE writes the rows too
 
-All on one thread, by the processor time of that thread (but "start", whole processes).  What takes milliseconds is measured in
+All on one thread, by the processor time of that thread ("start": of whole processes).  What takes milliseconds is measured in
 turns, round after round over all of it, and its median counts: whatever else the machine does hits all alike, and ratios hold
 where figures do not.  What takes seconds is measured in turns with what it is held against, frame by frame, and beside each of its
 rows stands what a plain step took meanwhile.
