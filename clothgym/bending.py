@@ -13,8 +13,8 @@ A model is three kernels on one block of lanes, to which ``_jit.specialize`` bin
         ``integrators.xpbd``), with scale ``B h^2``, (lanes,), damping ``tau/h``, (lanes,), and the share ``relaxation`` of each
         move.  multipliers: (hinges, 3, lanes), updated; or (0, 3, lanes), where they need no memory.
 
-``elements``, ``elastic``, ``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles lie side by side, the same
-forces are in ``grid_forces``.
+``elements``, ``elastic``, ``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles lie side by side, the
+same forces are in ``grid_forces``.
 """
 
 from __future__ import annotations
@@ -141,7 +141,8 @@ def project_quadratic(x, start, w, bends, scale, damping, relaxation, multiplier
 
 @disjoint
 def _first_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, length, inverse, foot):
-    """The normal ``N = e x a`` of the triangle over edge e with the corner a, ``|e|``, ``1/|e|^2``, and where a's foot is on the edge."""
+    """The normal ``N = e x a`` of the triangle over edge e with the corner a, ``|e|``, ``1/|e|^2``, and where a's foot is on the
+    edge."""
     one, tiny = inverse.dtype.type(1), inverse.dtype.type(1e-30)
     for l in range(inverse.shape[0]):
         ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]

@@ -179,8 +179,8 @@ def grid_of(mesh: ClothMesh, dtype: np.dtype, bending: str) -> Grid:
         q = np.sqrt(h.weight)[:, None] * h.slopes
         for a in range(4):
             for b in range(a):
-                ends = np.sort(h.particles[:, [a, b]], axis=1).T
-                np.add.at(curve, (_kind_of(*ends, columns), ends[0]), -q[:, a] * q[:, b])
+                low, high = np.sort(h.particles[:, [a, b]], axis=1).T
+                np.add.at(curve, (_kind_of(low, high, columns), low), -q[:, a] * q[:, b])
     springs = len(KINDS) if bending == "springs" else sum(kind <= SHEAR for kind, _, _ in KINDS)
     return Grid(
         offset=np.array([down * columns + right for _, down, right in KINDS]),

@@ -1,7 +1,7 @@
 """Floor 3: forces on one block of lanes, and what they say about the largest stable step.
 
-In all kernels ``x``: positions [m] and ``v``: velocities [m/s] are (3, particles, lanes); loops over lanes are innermost.  For a grid
-whose particles lie side by side the same forces are in ``grid_forces``.
+In all kernels ``x``: positions [m] and ``v``: velocities [m/s] are (3, particles, lanes); loops over lanes are innermost.  For a
+grid whose particles lie side by side the same forces are in ``grid_forces``.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def add_spring_forces(x, v, f, elements, elastic, scratch):
     """Add Hooke's force and the damper's along each spring to ``f`` [N], (3, particles, lanes).
 
     On the first end, with d the vector to the second, u its velocity, r the rest length and tau the damping time:
-    ``f = k ((1 - r/|d|) + tau (u . d)/|d|^2) d``.  The stiffness k [N/m] is a row of ``elastic.stiffness``, (kinds, lanes), times the
-    spring's weight.
+    ``f = k ((1 - r/|d|) + tau (u . d)/|d|^2) d``.  The stiffness k [N/m] is a row of ``elastic.stiffness``, (kinds, lanes), times
+    the spring's weight.
     """
     stiffness, damping_time = elastic.stiffness, elastic.damping_time
     if x.shape[2] == 1:

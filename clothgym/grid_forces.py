@@ -8,8 +8,8 @@ index array.  What a particle gets is one sum over the kinds, in a fixed order,
 which is the order in which a plain loop over the springs, by kind and then by particle, would add them.  Springs that would wrap
 around the end of a row have no weight.
 
-The quadratic bending model is a constant matrix K.  Its rows sum to zero, so the force on p is ``B sum_q -K_pq (x_q - x_p)``: springs
-without rest length along the same six offsets, for a grid's hinges reach no farther.
+The quadratic bending model is a constant matrix K.  Its rows sum to zero, so the force on p is ``B sum_q -K_pq (x_q - x_p)``:
+springs without rest length along the same six offsets, for a grid's hinges reach no farther.
 
 Arrays are as in ``forces``, with one lane: positions x [m] and velocities v [m/s] are (3, particles, 1).
 """

@@ -52,8 +52,8 @@ class Limiting(NamedTuple):
 def _limit_strain(x, v, w, weave, limit, report):
     """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
 
-    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes); weave: see ``elements.Weave``.  report: rows BEFORE, AFTER and USED, (3, lanes): the first
-    and the last keep the largest of the control step.
+    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes); weave: see ``elements.Weave``.  report: rows BEFORE, AFTER
+    and USED, (3, lanes): the first and the last keep the largest of the control step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
@@ -81,7 +81,8 @@ def _measure_strain(x, weave, report):
 
 @disjoint
 def _raise_to_stretch(x, y, z, o, weight, inverse, out):
-    """Raise ``out``, (particles,), to the squared stretch of a grid's springs of one kind; inverse: one over their length's square."""
+    """Raise ``out``, (particles,), to the squared stretch of a grid's springs of one kind; inverse: one over their length's
+    square."""
     x1, y1, z1, zero = x[o:], y[o:], z[o:], x.dtype.type(0)
     for p in range(x1.shape[0]):
         dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
@@ -170,7 +171,8 @@ def no_measure(x, weave, report):
 
 @cache
 def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
-    """The names that the main loop calls, without a limit or with one; by_particle: whether one grid's particles lie side by side."""
+    """The names that the main loop calls, without a limit or with one; by_particle: whether one grid's particles lie side by
+    side."""
     if not limits:
         return {"restrain": no_limit, "remeasure": no_measure}
     largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")

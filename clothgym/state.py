@@ -1,7 +1,7 @@
 """Floor 2: how a batch lies in memory, and all that is needed to continue it bit for bit.
 
-Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see ``(block, component, particle, lane)``, and what
-lies side by side is what they do at once.
+Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see ``(block, component, particle, lane)``, and
+what lies side by side is what they do at once.
 
 For a grid under a method in which the order of the springs does not matter, that is the sheet's own particles: a block is one
 environment, of one lane, and the springs of one kind are one loop with a constant offset (see ``grid_forces``).  One environment
@@ -88,7 +88,8 @@ class Layout(NamedTuple):
 
     @staticmethod
     def choose(num_envs: int, threads: int, by_particle: bool) -> Layout:
-        """One lane a block where particles lie side by side; else as few and as wide blocks as give every thread the same number."""
+        """One lane a block where particles lie side by side; else as few and as wide blocks as give every thread the same
+        number."""
         if by_particle:
             return Layout(num_envs, num_envs, 1, True)
         blocks = min(-(-num_envs // VECTOR), threads * -(-num_envs // (threads * WIDEST_BLOCK)))
@@ -162,9 +163,9 @@ class State:
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
         contact_start, contact_frame, contact_bounds, contact_limits: where each vertex was when self-collision last looked around
-            it [m], (num_envs, particles, 3), in a frame of which this is the place, (num_envs, 3), and the squares of how far it may
-            go from there, see ``collisions.proximity`` [m^2], (num_envs, particles), negative where it has not looked; no particles
-            without self-collision.
+            it [m], (num_envs, particles, 3), in a frame of which this is the place, (num_envs, 3), and the squares of how far it
+            may go from there, see ``collisions.proximity`` [m^2], (num_envs, particles), negative where it has not looked; no
+            particles without self-collision.
         contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
         contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
             ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).

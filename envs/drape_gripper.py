@@ -36,7 +36,6 @@ FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
 
 
-
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
 
 

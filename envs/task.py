@@ -157,7 +157,9 @@ class Task(ABC):
         brought += [("moves", float, (self.num_hands, self.hand_actions)), ("free", np.uint8, self.num_hands)]
         self.outcome = records(count, brought)
         told = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
-        self.info = records(count, [*told, ("normalized_performance", float), ("is_success", bool), *self.judgement, *self.accounts])
+        self.info = records(
+            count, [*told, ("normalized_performance", float), ("is_success", bool), *self.judgement, *self.accounts]
+        )
         self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
         self._mesh = mesh_arrays(physics.mesh, self.particles)
         self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *hand))

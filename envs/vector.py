@@ -91,9 +91,8 @@ class ClothVectorEnv(VectorEnv):
             # those that ended in the last step begin anew in this one: their actions were ignored
             task.reset(np.flatnonzero(over))
             info["_failure"] = info["_failure"] | over  # a reset says that there is none
-        elif self.autoreset_mode == AutoresetMode.SAME_STEP:
-            if terminated.any():
-                info = self._reset_ended(terminated, told)
+        elif self.autoreset_mode == AutoresetMode.SAME_STEP and terminated.any():
+            info = self._reset_ended(terminated, told)
         # the time limit is part of the tasks: nothing is truncated
         return self._observation(), task.outcome["reward"].copy(), terminated, np.zeros(self.num_envs, bool), info
 

@@ -224,11 +224,21 @@ def list_near(pairs, active, close, number, seen, vertices, sides):
                 continue
             seen[n] = True
             if n < near_corners:
-                vertices[first, 0], vertices[first, 1], vertices[first, 2], vertices[first, 3] = near_pairs[n, 0], near_pairs[n, 1], one, two
+                vertices[first, 0], vertices[first, 1], vertices[first, 2], vertices[first, 3] = (
+                    near_pairs[n, 0],
+                    near_pairs[n, 1],
+                    one,
+                    two,
+                )
                 vertices[first, 4] = 0
                 first += 1
             else:
-                sides[second, 0], sides[second, 1], sides[second, 2], sides[second, 3] = near_pairs[n, 0], near_pairs[n, 1], one, two
+                sides[second, 0], sides[second, 1], sides[second, 2], sides[second, 3] = (
+                    near_pairs[n, 0],
+                    near_pairs[n, 1],
+                    one,
+                    two,
+                )
                 second += 1
     return first, second
 

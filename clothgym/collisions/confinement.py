@@ -151,7 +151,11 @@ def _draw_back(x, v, w, memory, block, l, h, asks, fx, fy, fz):
     start, limits, old, frame = memory.start[block, l], memory.limits[block, l], memory.old[block, l], memory.frame[block, l]
     lag, report = memory.lag[block, :, :, l], memory.report[block, l]
     for p in range(x.shape[1]):
-        dx, dy, dz = x[0, p] - (frame[0] + fx) - start[0, p], x[1, p] - (frame[1] + fy) - start[1, p], x[2, p] - (frame[2] + fz) - start[2, p]
+        dx, dy, dz = (
+            x[0, p] - (frame[0] + fx) - start[0, p],
+            x[1, p] - (frame[1] + fy) - start[1, p],
+            x[2, p] - (frame[2] + fz) - start[2, p],
+        )
         square = dx * dx + dy * dy + dz * dz
         if not square > limits[p]:
             continue

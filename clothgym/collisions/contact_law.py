@@ -1,8 +1,9 @@
 """What a contact with a solid does: no inward velocity, Coulomb friction, and the way out.
 
-The normal impulse is the inward velocity that is taken away; friction takes at most ``mu`` times as much from the tangential velocity
-(Bridson, Fedkiw and Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction takes from the velocity is taken from
-the displacement too, as far as the integrator has moved by it, or a sheet at rest on a slope would creep by ``h^2 g sin`` a substep.
+The normal impulse is the inward velocity that is taken away; friction takes at most ``mu`` times as much from the tangential
+velocity (Bridson, Fedkiw and Anderson 2002: ``v_T <- max(1 - mu dv_N/|v_T|, 0) v_T``).  What friction takes from the velocity is
+taken from the displacement too, as far as the integrator has moved by it, or a sheet at rest on a slope would creep by ``h^2 g
+sin`` a substep.
 
 Both laws take and give numbers, so that lanes and sheets share them.  zero, one and tiny: in the dtype of the others.
 """

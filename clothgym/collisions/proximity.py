@@ -381,7 +381,23 @@ def query(
     )  # fmt: skip
     if strict:
         tie_layers(
-            p, pairs.corners, leaves, number, gaps, closest, ends, reach, held, moved, bounds, limits, layered, found, ties, planes, report
+            p,
+            pairs.corners,
+            leaves,
+            number,
+            gaps,
+            closest,
+            ends,
+            reach,
+            held,
+            moved,
+            bounds,
+            limits,
+            layered,
+            found,
+            ties,
+            planes,
+            report,
         )
     edge_box, ridge = np.empty((7, pairs.own_edges.shape[0])), np.empty(pairs.own_edges.shape[0], np.bool_)
     sides = np.empty((8 * number + 1, 4), np.int32)
@@ -390,5 +406,22 @@ def query(
         sides = np.empty((count + 1, 4), np.int32)
         far_edges(p, start, around, pairs, leaves, layered, number, edge_box, ridge, sides)
     edge_contacts(
-        p, sides, count, pairs, far, strict, reach, wide, held, moved, bounds, limits, found, particles, figures, ties, planes, report
+        p,
+        sides,
+        count,
+        pairs,
+        far,
+        strict,
+        reach,
+        wide,
+        held,
+        moved,
+        bounds,
+        limits,
+        found,
+        particles,
+        figures,
+        ties,
+        planes,
+        report,
     )

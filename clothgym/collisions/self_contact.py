@@ -29,9 +29,9 @@ from clothgym.collisions.proximity import (
     TIE,
     UNCERTAIN,
     VERTICES,
+    edge_contacts,
     gap_of_edges,
     gap_of_vertex,
-    edge_contacts,
     vertex_contacts,
 )
 from clothgym.collisions.repulsion import CALM
@@ -417,7 +417,9 @@ def shortest_far(p: NDArray, pairs: Pairs, near: float, dtype: np.dtype) -> floa
     far_edges(*sides, edges)
     own = Reach(near, near, 0.0, 0.0, 0.0, 0.0, 0.0), wide, none, np.zeros(particles), limits, limits.copy()
     closest, counts = np.zeros((number, 4)), np.zeros(2, np.int64)
-    vertex_contacts(p, vertices, len(vertices), pairs, 0.0, 0.0, True, *own, closest, np.zeros(number, np.int64), counts, *rows, report)
+    vertex_contacts(
+        p, vertices, len(vertices), pairs, 0.0, 0.0, True, *own, closest, np.zeros(number, np.int64), counts, *rows, report
+    )
     edge_contacts(p, edges, len(edges) - 1, pairs, 0.0, True, *own, counts, *rows, report)
     return float(report[GAP])
 

@@ -1,7 +1,7 @@
 """Contact of one sheet with solids, where its particles lie side by side: the same as ``response`` and ``surface`` in lanes.
 
-Particles are measured all at once, from the first that a solid may touch to the last.  Triangles are chosen by the cells of the grid:
-those that may touch are put on desks of ``COLUMNS`` triangles, where lanes have one triangle each (see ``distance``).
+Particles are measured all at once, from the first that a solid may touch to the last.  Triangles are chosen by the cells of the
+grid: those that may touch are put on desks of ``COLUMNS`` triangles, where lanes have one triangle each (see ``distance``).
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
             if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[RADIUS], rows[GAP]) > 0:
                 a, b = _span(rows[GAP])
                 _respond_to_plane(
-                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[GAP, a:b], nx, ny, nz, sx, sy, sz,
-                    friction, carried,
+                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[GAP, a:b], nx, ny, nz, sx, sy,
+                    sz, friction, carried,
                 )  # fmt: skip
             continue
         if _squares(r[0], r[1], r[2], px, py, pz, c[REACH2], rows[GAP]) == 0:

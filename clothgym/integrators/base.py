@@ -9,8 +9,8 @@ on one block of lanes, and describe it by an ``Integrator``.  The substep advanc
 
 * ``w``: inverse masses [1/kg], (particles, lanes); a particle with ``w = 0`` is held: it keeps its velocity, and moves with it.
 * ``elements``, ``elastic``: an ``elements.Elements`` and a block's part of ``elements.Elastic``.  ``add_spring_forces`` and
-  ``add_spring_products``, imported from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends``, imported from
-  ``bending``, become those of the chosen model, for lanes or for particles that lie side by side (``specialized``).
+  ``add_spring_products``, imported from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends``, imported
+  from ``bending``, become those of the chosen model, for lanes or for particles that lie side by side (``specialized``).
 * ``drag_rate`` [1/s], (lanes,), and ``gravity`` [m/s^2], (3, lanes).  ``push``: forces from outside [N], (3, particles, lanes), of
   the air for instance: slow against the springs, and not to be written to.
 * ``options``: the values of ``Integrator.options``, in that order.  ``plan``: what ``Integrator.prepare`` made.
@@ -39,8 +39,8 @@ Figures = frozenset[str]
 class Work(NamedTuple):
     """What a substep may write to.
 
-    fields: arrays like positions, (fields, 3, particles, lanes).  of_springs, of_bends: multipliers, (springs, lanes) and (hinges, 3,
-    lanes), of methods that keep some.  scratch: for the forces of elements.
+    fields: arrays like positions, (fields, 3, particles, lanes).  of_springs, of_bends: multipliers, (springs, lanes) and (hinges,
+    3, lanes), of methods that keep some.  scratch: for the forces of elements.
     """
 
     fields: NDArray
@@ -50,8 +50,8 @@ class Work(NamedTuple):
 
 
 class Preparation(NamedTuple):
-    """What a method that factorises in advance is told: one environment's figures, the substep [s], who may be held, and whether one
-    sheet's particles lie side by side."""
+    """What a method that factorises in advance is told: one environment's figures, the substep [s], who may be held, and whether
+    one sheet's particles lie side by side."""
 
     oscillators: Oscillators
     h: float
