@@ -162,17 +162,16 @@ class State:
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
-        contact_start, contact_frame, contact_bounds, contact_limits: where each vertex was when self-collision last looked around
-            it [m], (num_envs, particles, 3), in a frame of which this is the place, (num_envs, 3), and the squares of how far it
-            may go from there, see ``collisions.proximity`` [m^2], (num_envs, particles), negative where it has not looked; no
-            particles without self-collision.
+        contact_start, contact_bounds, contact_limits: where each vertex was when self-collision last looked around it [m],
+            (num_envs, particles, 3), and the squares of how far it may go from there, see ``collisions.proximity`` [m^2],
+            (num_envs, particles), negative where it has not looked; no particles without self-collision.
         contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
         contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
             ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
         contact_pressed: what these change velocities by in a substep [m/s], (num_envs, particles, 3); contact_waited, contact_span:
             substeps since they were last corrected, and after which they are again, (num_envs,).
-        contact_tight: its pairs that may come no closer, (num_envs,); contact_ties, contact_planes: see there,
-            (num_envs, pairs, ...).
+        contact_tight: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,); contact_ties,
+            contact_planes: see there, (num_envs, pairs, ...).
         steps: control steps since the environment's reset, (num_envs,).
         diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
         sheet: digest of the mesh and of what bends, the same for all, ().
@@ -198,7 +197,6 @@ class State:
     colliders: NDArray
     collider_homes: NDArray
     contact_start: NDArray
-    contact_frame: NDArray
     contact_bounds: NDArray
     contact_limits: NDArray
     contact_lag: NDArray
@@ -207,6 +205,7 @@ class State:
     contact_figures: NDArray
     contact_impulses: NDArray
     contact_tight: NDArray
+    contact_looks: NDArray
     contact_pressed: NDArray
     contact_waited: NDArray
     contact_span: NDArray

@@ -1,7 +1,7 @@
 """What tasks measure on one sheet, as kernels: no figure depends on who else is in the batch.
 
-Sheets are (3, particles), contiguous: the particles are what vectorizes.  The least and the largest of numbers that are not negative
-are found by their bits, which are in the same order, for integers may be compared in any order, and so side by side.
+Sheets are (3, particles), contiguous: the particles are what vectorizes.  The least and the largest of numbers that are not
+negative are found by their bits, which are in the same order, for integers may be compared in any order, and so side by side.
 """
 
 from __future__ import annotations

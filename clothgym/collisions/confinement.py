@@ -1,7 +1,7 @@
-"""The limits of self-collision: what has come to its limit is looked around anew, and in strict mode drawn back.
+"""The bounds of self-collision: what has left its bound is looked at anew, and in strict mode drawn back.
 
-Everything happens between two certified states, the positions at the end of two substeps.  A move is cut short on a straight way
-that lies within the limits, in which also the first of them does.
+Everything happens between two certified states, the positions at the end of two substeps.  A move is cut short on the straight way
+from the first, which lies in every bound.
 """
 
 from __future__ import annotations
@@ -11,165 +11,201 @@ import numpy as np
 from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.proximity import (
     CLAMPED,
-    DROPPED,
-    HELD,
-    INSIDE,
+    GROUP,
+    JAMMED,
     KEPT,
     LAG,
-    MARGIN,
     NUMBER,
     OWN,
     QUERIES,
     ROWS,
+    SHARE,
     UNCERTAIN,
     VERTICES,
-    keep_others,
     query,
 )
 
+INSIDE = 0.999  # of a bound that is used, for rounding
 REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
-AHEAD = 12  # substeps for which a fast vertex' limit shall last
-SOON = 0.7  # share of its limit from which on a vertex asks if others do
+PATIENCE = 4  # looks at all tied pairs after which a query, which frees the vertices again, is the cheaper
+AHEAD = 8  # substeps for which a query shall last: for fast vertices it looks farther
+FORESEEN = 1.0  # of the reach, the most that it looks beyond it for one
 HALVES = 4  # times that the way of a tied pair is halved before it stays
-PATIENCE = 16  # substeps for which a pair that is held is not looked around again: that would say the same
+PASSING = 8  # tied pairs passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
 
 
 @inlined
-def confine(x, v, w, sheet, block, l, h):
-    """Keep one sheet within its limits; see the module.  Returns whether it has been moved."""
-    memory, strict, samples = sheet.memory, sheet.setting.strict, sheet.pairs.samples
-    start, bounds, limits = memory.start[block, l], memory.bounds[block, l], memory.limits[block, l]
-    old, frame = memory.old[block, l], memory.frame[block, l]
-    particles, clamped = x.shape[1], memory.report[block, l, CLAMPED]
-    moved = memory.behind[block, l] > 0
-    if moved:
-        memory.behind[block, l] = _catch_up(x, w, memory.lag[block, :, :, l], h)
-    # the frame goes with the motion that all share
-    fx, fy, fz = _share(x, old, samples, 0), _share(x, old, samples, 1), _share(x, old, samples, 2)
-    beyond = np.empty(particles, np.bool_)
-    some, far = _leave(x, start, bounds, limits, frame[0] + fx, frame[1] + fy, frame[2] + fz, beyond)
-    if some:
-        ties, planes = memory.ties[block, l], memory.planes[block, l]
-        asks = np.zeros(particles, np.bool_)
-        close = False
-        if strict:
-            far_ties, close = _ask(x, ties, planes, memory.tight[block, l], beyond, asks)
-            far |= far_ties
-        if far:
-            _add_those_soon(x, start, limits, frame[0] + fx, frame[1] + fy, frame[2] + fz, asks)
-            look_around(v, w, sheet, block, l, h, asks)
-        if strict and (far or close):
-            if far and _is_torn(x, w, start, limits, frame[0] + fx, frame[1] + fy, frame[2] + fz):
-                fx = fy = fz = x.dtype.type(0)
-            if far:
-                _draw_back(x, v, w, memory, block, l, h, asks, fx, fy, fz)
-                _leave(x, start, bounds, limits, frame[0] + fx, frame[1] + fy, frame[2] + fz, beyond)
-                close = _is_any_close(x, ties, planes, memory.tight[block, l], beyond)
-            if close:
-                # what is held does not share the motion of the others
-                fx = fy = fz = x.dtype.type(0)
-                _draw_back(x, v, w, memory, block, l, h, asks, fx, fy, fz)
-                _leave(x, start, bounds, limits, frame[0], frame[1], frame[2], beyond)
-                _hold_apart(x, v, w, memory, block, l, beyond)
-            if memory.report[block, l, CLAMPED] > clamped:
-                moved = True
-                _note_lag(w, memory, block, l)
-    frame[0], frame[1], frame[2] = frame[0] + fx, frame[1] + fy, frame[2] + fz
+def confine(x, v, w, sheet, block, h):
+    """Keep one block's sheets within their bounds; see the module."""
+    memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
+    start, bounds, limits, old = memory.start[block], memory.bounds[block], memory.limits[block], memory.old[block]
+    lanes = x.shape[2]
+    for l in range(memory.used[block]):
+        if memory.behind[block, l] > 0:
+            memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
+    left = np.empty((x.shape[1], lanes), np.bool_)
+    out, far = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
+    if lanes == 1:
+        out[0], far[0] = _mark(x, start, bounds, limits, samples, 0, left[:, 0])
+    else:
+        _leave(x, start, bounds, limits, samples, left, out, far)
+    beyond = np.empty(x.shape[1], np.bool_)
+    for l in range(memory.used[block]):
+        # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
+        if not out[l]:
+            continue
+        due = far[l]
+        if not due and setting.strict:
+            for p in range(x.shape[1]):
+                beyond[p] = left[p, l]
+            touched = np.empty(memory.tight[block, l], np.int32)
+            number = _list_touched(memory.ties[block, l], beyond, touched)
+            due, close = _comes_close(x, memory, block, l, touched[:number])
+            if close and not due:
+                _hold_apart(x, v, w, sheet, block, l, beyond, touched, number)
+                # what has stayed has not shared the motion of the others
+                _, due = _mark(x, start, bounds, limits, samples, l, beyond)
+        if due:
+            _renew(x, v, w, sheet, block, l, h, beyond)
     old[:] = x
-    return moved
-
-
-@inlined
-def _share(x, old, samples, c):
-    """A component of the motion in a substep that all vertices share [m]: it changes no distance."""
-    total = x.dtype.type(0)
-    for s in range(samples.shape[0]):
-        total += x[c, samples[s]] - old[c, samples[s]]
-    return total * x.dtype.type(1 / samples.shape[0])
 
 
 @kernel
-def _leave(x, start, bounds, limits, fx, fy, fz, beyond):
-    """Which vertices have left their bounds, with the frame at f; returns whether some have, and whether one has left its limit."""
+def _leave(x, start, bounds, limits, samples, left, some, far):
+    """Which vertices have left their bounds, (particles, lanes), in which lanes some have, and in which one has left its limit.
+
+    A motion that all share does not count: it changes no distance.
+    """
+    lanes = x.shape[2]
+    share = x.dtype.type(1 / samples.shape[0])
+    mean = np.zeros((3, lanes), x.dtype)
+    for s in range(samples.shape[0]):
+        for c in range(3):
+            xs, ss = x[c, samples[s]], start[c, samples[s]]
+            for l in range(lanes):
+                mean[c, l] += (xs[l] - ss[l]) * share
+    for p in range(x.shape[1]):
+        bp, lp, out = bounds[p], limits[p], left[p]
+        for l in range(lanes):
+            dx = x[0, p, l] - start[0, p, l] - mean[0, l]
+            dy = x[1, p, l] - start[1, p, l] - mean[1, l]
+            dz = x[2, p, l] - start[2, p, l] - mean[2, l]
+            square = dx * dx + dy * dy + dz * dz
+            inside, allowed = square <= bp[l], square <= lp[l]
+            out[l] = not inside
+            some[l] |= not inside
+            far[l] |= not allowed
+
+
+@kernel
+def _shift(x, start, samples, l):
+    """The motion of one lane that all its vertices share [m]: it changes no distance."""
+    share = x.dtype.type(1 / samples.shape[0])
+    mx, my, mz = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
+    for s in range(samples.shape[0]):
+        p = samples[s]
+        mx += (x[0, p, l] - start[0, p, l]) * share
+        my += (x[1, p, l] - start[1, p, l]) * share
+        mz += (x[2, p, l] - start[2, p, l]) * share
+    return mx, my, mz
+
+
+@kernel
+def _mark(x, start, bounds, limits, samples, l, left):
+    """The same of one lane; left: (particles,).  Without loops of one round."""
+    mx, my, mz = _shift(x, start, samples, l)
     some, far = False, False
     for p in range(x.shape[1]):
-        dx, dy, dz = x[0, p] - fx - start[0, p], x[1, p] - fy - start[1, p], x[2, p] - fz - start[2, p]
+        dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
         square = dx * dx + dy * dy + dz * dz
-        inside, allowed = square <= bounds[p], square <= limits[p]
-        beyond[p] = not inside
+        inside, allowed = square <= bounds[p, l], square <= limits[p, l]
+        left[p] = not inside
         some |= not inside
         far |= not allowed
     return some, far
 
 
 @kernel
-def _add_those_soon(x, start, limits, fx, fy, fz, asks):
-    """Let those ask, too, that have almost come to their limit."""
-    soon = x.dtype.type(SOON * SOON)
-    for p in range(x.shape[1]):
-        dx, dy, dz = x[0, p] - fx - start[0, p], x[1, p] - fy - start[1, p], x[2, p] - fz - start[2, p]
-        asks[p] |= not dx * dx + dy * dy + dz * dz <= soon * limits[p]
-
-
-@kernel
-def _is_torn(x, w, start, limits, fx, fy, fz):
-    """Whether what a hand holds, or what may not move at all, does not go with the others: a jam would carry the hands away."""
-    torn = False
-    for p in range(x.shape[1]):
-        dx, dy, dz = x[0, p] - fx - start[0, p], x[1, p] - fy - start[1, p], x[2, p] - fz - start[2, p]
-        torn |= (limits[p] <= 0) | ((w[p] <= 0) & (not dx * dx + dy * dy + dz * dz <= limits[p]))
-    return torn
-
-
-@kernel
-def _catch_up(x, w, lag, h):
+def _catch_up(x, w, lag, l, h):
     """Move what lags behind its hand on, as far as the speed for it allows; who has been let go lags no more.  Returns the largest
     lag that is left."""
     zero = x.dtype.type(0)
     left = zero
     most = x.dtype.type(REPAY) * h
     for p in range(x.shape[1]):
-        if w[p] > zero:
-            lag[0, p] = lag[1, p] = lag[2, p] = zero
+        if w[p, l] > zero:
+            lag[0, p, l] = lag[1, p, l] = lag[2, p, l] = zero
             continue
-        lx, ly, lz = lag[0, p], lag[1, p], lag[2, p]
+        lx, ly, lz = lag[0, p, l], lag[1, p, l], lag[2, p, l]
         length = np.sqrt(lx * lx + ly * ly + lz * lz)
         if length > zero:
             share = min(most / length, x.dtype.type(1))
             for c in range(3):
-                way = share * lag[c, p]
-                x[c, p] += way
-                lag[c, p] -= way
+                way = share * lag[c, p, l]
+                x[c, p, l] += way
+                lag[c, p, l] -= way
             left = max(left, length - share * length)
     return left
 
 
+@inlined
+def _renew(x, v, w, sheet, block, l, h, beyond):
+    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it.
+
+    Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a tie or since it
+    may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand holds does
+    not go with the others: else a jam would carry the hands away.
+    """
+    memory, particles = sheet.memory, x.shape[1]
+    place, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
+    look_around(memory.old[block], v, w, sheet, block, l, h, place, limits, held)
+    if sheet.setting.strict:
+        start, zero = memory.start[block], x.dtype.type(0)
+        mx, my, mz = _shift(x, start, sheet.pairs.samples, l)
+        together = True
+        for p in range(particles):
+            together &= limits[p] > zero
+            if held[p]:
+                dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
+                together &= dx * dx + dy * dy + dz * dz <= limits[p]
+        if not together:
+            mx, my, mz = zero, zero, zero
+        _draw_back(x, v, memory, block, l, h, place, limits, held, mx, my, mz)
+        ties, planes, tight, close = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l], False
+        for t in range(tight):
+            close |= _is_close(x, ties, planes, t, l)
+        if close:
+            _draw_back(x, v, memory, block, l, h, place, limits, held, zero, zero, zero)
+            beyond[:] = True
+            touched = np.empty(tight, np.int32)
+            _hold_apart(x, v, w, sheet, block, l, beyond, touched, _list_touched(ties, beyond, touched))
+        _note_lag(w, memory, block, l)
+
+
 @kernel
-def _draw_back(x, v, w, memory, block, l, h, asks, fx, fy, fz):
-    """Draw one sheet's vertices back to their limits, with the frame moved by f in this substep [m]."""
-    start, limits, old, frame = memory.start[block, l], memory.limits[block, l], memory.old[block, l], memory.frame[block, l]
-    lag, report = memory.lag[block, :, :, l], memory.report[block, l]
+def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
+    """Draw one lane's vertices back to their limits about a common motion m since the query [m].
+
+    start: where they were at the query, (particles, 3); limits: the squares of how far they may go [m^2], (particles,).
+    """
+    lag, report = memory.lag[block], memory.report[block, l]
+    real = x.dtype.type
     for p in range(x.shape[1]):
-        dx, dy, dz = (
-            x[0, p] - (frame[0] + fx) - start[0, p],
-            x[1, p] - (frame[1] + fy) - start[1, p],
-            x[2, p] - (frame[2] + fz) - start[2, p],
-        )
+        sx, sy, sz = real(start[p, 0]), real(start[p, 1]), real(start[p, 2])
+        dx, dy, dz = x[0, p, l] - sx - mx, x[1, p, l] - sy - my, x[2, p, l] - sz - mz
         square = dx * dx + dy * dy + dz * dz
-        if not square > limits[p]:
-            continue
-        keep = np.sqrt(limits[p] / square)
-        report[CLAMPED] += 1
-        for c, m in ((0, fx), (1, fy), (2, fz)):
-            # what may not move at all must not creep by rounding
-            home = m + (old[c, p] if asks[p] else start[c, p] + frame[c])
-            goal = home + keep * (x[c, p] - home)
-            if w[p] <= 0:
-                lag[c, p] += x[c, p] - goal
-            else:
-                v[c, p] = m / h + keep * (v[c, p] - m / h)
-            x[c, p] = goal
+        if square > limits[p]:
+            keep = np.sqrt(limits[p] / square)
+            report[CLAMPED] += 1
+            for c, s, m, d in ((0, sx, mx, dx), (1, sy, my, dy), (2, sz, mz, dz)):
+                # from the start, so that what may not move at all does not creep by rounding
+                goal = s + (m + keep * d)
+                if held[p]:
+                    lag[c, p, l] += x[c, p, l] - goal
+                else:
+                    v[c, p, l] = m / h + keep * (v[c, p, l] - m / h)
+                x[c, p, l] = goal
 
 
 @inlined
@@ -181,15 +217,25 @@ def _touches(ties, t, beyond):
     return some
 
 
-@inlined
-def _is_close(x, ties, planes, t):
-    """Whether a tied pair is closer than it may be."""
+@kernel
+def _list_touched(ties, beyond, touched):
+    """List the tied pairs with a vertex beyond its bound, all there is room for; returns how many."""
+    number = 0
+    for t in range(touched.shape[0]):
+        touched[number] = t
+        number += _touches(ties, t, beyond)
+    return number
+
+
+@kernel
+def _is_close(x, ties, planes, t, l):
+    """Whether a tied pair of one lane is closer than it may be."""
     own = ties[t, OWN]
     nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
     low, high = np.inf, -np.inf
     for m in range(ties[t, NUMBER]):
         p = ties[t, VERTICES + m]
-        place = nx * x[0, p] + ny * x[1, p] + nz * x[2, p]
+        place = nx * x[0, p, l] + ny * x[1, p, l] + nz * x[2, p, l]
         if m < own:
             low = min(low, place)
         else:
@@ -199,54 +245,54 @@ def _is_close(x, ties, planes, t):
 
 
 @kernel
-def _ask(x, ties, planes, tight, beyond, asks):
-    """Let the vertices of tied pairs that have come too close ask, unless the pair has been held for that lately; returns whether
-    some do, and whether some are too close."""
-    some, close = False, False
-    for t in range(tight):
-        if not _touches(ties, t, beyond) or not _is_close(x, ties, planes, t):
-            continue
-        close = True
-        if ties[t, HELD] > 0:
-            ties[t, HELD] -= 1
-            continue
-        some = True
-        for m in range(ties[t, NUMBER]):
-            asks[ties[t, VERTICES + m]] = True
-    return some, close
+def _comes_close(x, memory, block, l, touched):
+    """Whether a query is due for tied pairs of one lane, and whether one that is touched is closer than it may be.
 
-
-@kernel
-def _is_any_close(x, ties, planes, tight, beyond):
-    """Whether a tied pair with a vertex beyond its bound is closer than it may be."""
-    for t in range(tight):
-        if _touches(ties, t, beyond) and _is_close(x, ties, planes, t):
-            return True
-    return False
+    Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
+    looked at than it is worth.
+    """
+    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
+    due, close = False, False
+    for c in range(touched.shape[0]):
+        if _is_close(x, ties, planes, touched[c], l):
+            close = True
+            due |= ties[touched[c], GROUP] != JAMMED
+    memory.looks[block, l] += tight // PASSING + touched.shape[0]
+    return due or memory.looks[block, l] > PATIENCE * tight, close
 
 
 @apart
-def _hold_apart(x, v, w, memory, block, l, beyond):
-    """Where a tied pair of one sheet would come closer than it may, halve the way of its vertices, and in the end leave them where
-    they were; others may follow."""
-    old, lag, report = memory.old[block, l], memory.lag[block, :, :, l], memory.report[block, l]
-    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
+def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
+    """Where a tied pair of one lane would come closer than it may, halve the way of its vertices, and in the end leave them where
+    they were; others may follow.
+
+    touched: room for all tied pairs; the first ``number`` are those with a vertex beyond its bound.
+    """
+    memory = sheet.memory
+    old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
+    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], touched.shape[0]
     zero, half = x.dtype.type(0), x.dtype.type(0.5)
-    halved, touched = np.zeros(x.shape[1], np.int64), np.empty(tight, np.int32)
-    going, spread, number = True, True, 0
+    going = False
+    for c in range(number):
+        if _is_close(x, ties, planes, touched[c], l):
+            ties[touched[c], GROUP] = JAMMED
+            going = True
+    halved = np.zeros(x.shape[1], np.int64)
     while going:
-        if spread:
-            number = 0
-            for t in range(tight):
-                touched[number] = t
-                number += _touches(ties, t, beyond)
-        going, spread = False, False
-        for c in range(number):
-            t = touched[c]
-            if not _is_close(x, ties, planes, t):
+        # in their order, round by round; once others are touched, the rest of the round looks at all
+        going, spread, c, t = False, False, 0, -1
+        while c < number or spread:
+            if spread:
+                t += 1
+                if t == tight:
+                    break
+                if not _touches(ties, t, beyond):
+                    continue
+            else:
+                t = touched[c]
+                c += 1
+            if not _is_close(x, ties, planes, t, l):
                 continue
-            if ties[t, HELD] < 0:
-                ties[t, HELD] = PATIENCE
             for m in range(ties[t, NUMBER]):
                 p = ties[t, VERTICES + m]
                 if halved[p] > HALVES:
@@ -258,79 +304,72 @@ def _hold_apart(x, v, w, memory, block, l, beyond):
                 beyond[p] = True
                 share = half if halved[p] <= HALVES else zero
                 for k in range(3):
-                    place = old[k, p]
+                    place = old[k, p, l]
                     if share > zero:  # what is not finite stays, too
-                        place += share * (x[k, p] - place)
-                    if w[p] <= zero:
-                        lag[k, p] += x[k, p] - place
+                        place += share * (x[k, p, l] - place)
+                    if w[p, l] <= zero:
+                        lag[k, p, l] += x[k, p, l] - place
                     else:
-                        v[k, p] *= share
-                    x[k, p] = place
+                        v[k, p, l] *= share
+                    x[k, p, l] = place
+        if spread:
+            number = _list_touched(ties, beyond, touched)
+    _note_lag(w, memory, block, l)
 
 
 @kernel
 def _note_lag(w, memory, block, l):
-    """The largest lag of one sheet."""
-    lag = memory.lag[block, :, :, l]
+    """The largest lag of one lane."""
+    lag = memory.lag[block]
     largest = lag.dtype.type(0)
     for p in range(w.shape[0]):
-        if w[p] <= 0:
-            largest = max(largest, lag[0, p] * lag[0, p] + lag[1, p] * lag[1, p] + lag[2, p] * lag[2, p])
+        if w[p, l] <= 0:
+            largest = max(largest, lag[0, p, l] * lag[0, p, l] + lag[1, p, l] * lag[1, p, l] + lag[2, p, l] * lag[2, p, l])
     memory.behind[block, l] = np.sqrt(largest)
     memory.report[block, l, LAG] = max(memory.report[block, l, LAG], np.float64(memory.behind[block, l]))
 
 
-@apart
-def look_around(v, w, sheet, block, l, h, asks):
-    """Look around those of one sheet's vertices that ask, where they were last certified; fast ones get higher limits."""
-    memory, pairs, reach = sheet.memory, sheet.pairs, sheet.reach
-    start, bounds, limits = memory.start[block, l], memory.bounds[block, l], memory.limits[block, l]
-    old, frame, report = memory.old[block, l], memory.frame[block, l], memory.report[block, l]
-    ties, planes, impulses = memory.ties[block, l], memory.planes[block, l], memory.impulses[block, l]
-    particles, figures = memory.particles[block, l], memory.figures[block, l]
-    number = asks.shape[0]
-    p, held, moved = np.empty((number, 3)), np.empty(number, np.bool_), np.zeros(number)
-    wide, around, active = np.empty(number), np.empty(number), np.zeros(pairs.corners.shape[0], np.bool_)
-    _foresee(v, sheet, h, wide)
-    least = 0.5 * (reach.far_thickness + reach.margin)
-    for k in range(number):
-        held[k] = w[k] <= 0
+@inlined
+def look_around(x, v, w, sheet, block, l, h, p, limits, held):
+    """Query one lane at the given positions; where it is fast it looks farther.
+
+    p, limits and held become its positions in float64 [m], (particles, 3), the squares of how far they may go before the next query
+    [m^2], (particles,), and whether they are held, (particles,): lanes lie far apart, so what is read again is copied.
+    """
+    memory, setting = sheet.memory, sheet.setting
+    start, bounds = memory.start[block], memory.bounds[block]
+    particles = x.shape[1]
+    room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
+    _foresee(v, sheet, l, h, extra)
+    for k in range(particles):
+        held[k] = w[k, l] <= 0
         for c in range(3):
-            if asks[k]:
-                start[c, k] = old[c, k] - frame[c]
-            p[k, c] = np.float64(old[c, k]) - frame[c]
-        if asks[k]:
-            bounds[k] = limits[k] = (INSIDE * wide[k]) ** 2
-            for n in range(pairs.vertex_leaves[k], pairs.vertex_leaves[k + 1]):
-                active[pairs.around_leaves[n]] = True
-        else:
-            dx, dy, dz = p[k, 0] - start[0, k], p[k, 1] - start[1, k], p[k, 2] - start[2, k]
-            moved[k] = np.sqrt(dx * dx + dy * dy + dz * dz)
-        wide[k] = np.sqrt(np.float64(limits[k])) / INSIDE
-        around[k] = max(wide[k], least) + 0.5 * MARGIN
-        wide[k] += moved[k]
-    before = memory.contacts[block, l]
-    lost, lost_impulses, found = np.empty((before, 4), np.int32), np.empty((before, 3), impulses.dtype), np.empty(2, np.int64)
-    pressed = keep_others(
-        active, before, memory.tight[block, l], particles, figures, impulses, ties, planes, lost, lost_impulses, found
-    )
-    kept, dropped = found[0], report[DROPPED]
-    query(
-        p, start, wide, around, moved, held, pairs, reach, sheet.setting.strict, active, memory.stale[block, l], memory.box[block, l],
-        memory.ball[block, l], memory.hulls[block, l], bounds, limits, found, particles, figures, ties, planes, report,
-    )  # fmt: skip
-    _take_over(lost, lost_impulses, pressed, particles, impulses, kept, found[0], number)
-    memory.tight[block, l], memory.contacts[block, l] = found[1], found[0]
-    # boxes were made for limits that may have become lower
-    memory.stale[block, l] = report[DROPPED] > dropped
+            start[c, k, l] = x[c, k, l]
+            p[k, c] = x[c, k, l]
+    report = memory.report[block, l]
     report[QUERIES] += 1
-    report[ROWS] = found[0]
-    if kept < before or kept < found[0]:
-        # what has been found is swept over at once
-        memory.choices[block, l] = -1
-        memory.span[block, l] = 0
-    if found[0] == 0:
+    before = memory.contacts[block, l]
+    known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
+    count, tight = query(
+        p, sheet.pairs, sheet.reach, extra, held, room, free, memory.particles[block, l], memory.figures[block, l],
+        memory.ties[block, l], memory.planes[block, l], report,
+    )  # fmt: skip
+    memory.tight[block, l] = tight
+    if not setting.strict:
+        room[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
+        free[:] = room + 2.0 * SHARE * extra
+    for k in range(particles):
+        bounds[k, l] = (INSIDE * room[k]) ** 2
+        limits[k] = (INSIDE * free[k]) ** 2
+        memory.limits[block, k, l] = limits[k]
+    _take_over(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
+    memory.contacts[block, l] = count
+    # what has been found is swept over at once
+    memory.choices[block, l] = -1
+    memory.looks[block, l] = memory.span[block, l] = 0
+    if count == 0:
         memory.pressed[block, :, :, l] = 0
+    report[ROWS] = count
 
 
 @kernel
@@ -348,34 +387,38 @@ def note_uncertain(x, report, used):
 
 
 @kernel
-def _foresee(v, sheet, h, limits):
-    """How far each vertex of one sheet may go before it is looked around again [m]: what is fast beside the whole sheet need not
-    ask too soon."""
-    samples, reach = sheet.pairs.samples, sheet.reach
+def _foresee(v, sheet, l, h, extra):
+    """How much farther than its reach a query of one lane looks for each vertex [m].
+
+    It is what the vertex needs, at the speed that it has beside the whole sheet's, not to ask for the next one too soon: few are
+    that fast.
+    """
+    samples, far = sheet.pairs.samples, sheet.reach.far
     mx, my, mz = 0.0, 0.0, 0.0
     for s in range(samples.shape[0]):
         p = samples[s]
-        mx, my, mz = mx + v[0, p], my + v[1, p], mz + v[2, p]
-    share, ahead = 1.0 / samples.shape[0], AHEAD * h
+        mx, my, mz = mx + v[0, p, l], my + v[1, p, l], mz + v[2, p, l]
+    share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, FORESEEN * far
     for p in range(v.shape[1]):
-        dx, dy, dz = v[0, p] - share * mx, v[1, p] - share * my, v[2, p] - share * mz
-        # not what is not a number
-        limits[p] = min(max(ahead * np.sqrt(dx * dx + dy * dy + dz * dz), reach.limit), reach.most)
+        dx, dy, dz = v[0, p, l] - share * mx, v[1, p, l] - share * my, v[2, p, l] - share * mz
+        extra[p] = dx * dx + dy * dy + dz * dz
+    for p in range(v.shape[1]):  # side by side: roots of many at once
+        extra[p] = min(max(ahead * np.sqrt(extra[p]) - 0.5 * far, 0.0), most)
 
 
 @kernel
-def _take_over(known, impulses, count, particles, fresh, begin, end, vertices):
-    """Give contacts that have been found the impulses which the same ones had before, so that stacks stay at rest.
+def _take_over(known, impulses, particles, fresh, count, vertices):
+    """Give the contacts that a query has found the impulses which the same contacts had before it, so that stacks stay at rest.
 
-    known, impulses: those of before, ``count`` of them; particles, fresh: of now, from ``begin`` to ``end``.
+    known, impulses: those of before; particles, fresh: of now, of which there are ``count``.
     """
-    last, before = np.full(vertices if count > 0 else 0, -1, np.int32), np.empty(count, np.int32)
-    for k in range(count):
+    last, before = np.full(vertices, -1, np.int32), np.empty(len(known), np.int32)
+    for k in range(len(known)):
         before[k] = last[known[k, 0]]
         last[known[k, 0]] = k
-    for k in range(begin, end):
+    for k in range(count):
         fresh[k, 0] = fresh[k, 1] = fresh[k, 2] = 0
-        old = last[particles[k, 0]] if count > 0 else -1
+        old = last[particles[k, 0]]
         while old >= 0:
             if known[old, 1] == particles[k, 1] and known[old, 2] == particles[k, 2] and known[old, 3] == particles[k, 3]:
                 for c in range(3):

@@ -41,16 +41,14 @@ class Pairs(NamedTuple):
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
     nodes: of the tree, each before its halves, the first of which follows it: see ``BEGIN``, (nodes, 3).
-    beside: where the nodes that hold leaves beside those of each node that is not halved begin, itself among them, (nodes + 1,);
-    ``beside_nodes`` says which, and ``beside_leaves`` which pairs of theirs are none to search: a leaf k of the first and m of the
-    second, which are the same or share a vertex, are bit ``LEAVES * k + m``.
-    vertex_leaves, vertex_triangles: where the leaves and triangles around each vertex begin, (particles + 1,), and which they
-    are, ``around_*``.
-    partners: where near pairs of vertices of each begin, (particles + 1,), each pair twice; partner: the other, and slack: of the
-    primitive pairs they are in, at rest [m^2], (near,); near: where these begin and end, (near, 2), in ``near_list``, which indexes
-    ``near_pairs``.
-    near_pairs: first and second primitive, and the leaves that own them, (near primitive pairs, 4): vertex and triangle for the
-    first ``near_corners``, then edges.
+    beside: where the nodes that hold leaves beside those of each node that is not halved begin, itself and some after it,
+    (nodes + 1,); ``beside_nodes`` says which, and ``beside_leaves`` which pairs of theirs are none to search: a leaf k of the first
+    and m of the second, which share a vertex or come in this order elsewhere, are bit ``LEAVES * k + m``.
+    partners: where near pairs of vertices of each first begin, (particles + 1,); partner: the second, and slack: of the primitive
+    pairs they are in, at rest [m^2], (near,).
+    near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
+    near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
+    edges.
     samples: (SAMPLES,).
     """
 
@@ -72,17 +70,13 @@ class Pairs(NamedTuple):
     beside: Int
     beside_nodes: Int
     beside_leaves: NDArray[np.int64]
-    vertex_leaves: Int
-    around_leaves: Int
-    vertex_triangles: Int
-    around_triangles: Int
     partners: Int
     partner: Int
     slack: Real
     near: Int
     near_list: Int
     near_pairs: Int
-    near_corners: int
+    vertex_triangles: int
     samples: Int
 
 
@@ -112,10 +106,6 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     beside = [sorted({other for vertex in set(own.tolist()) for other in around[vertex]}) for own in corners]
     vertex_triangle, edge_edge = _near_pairs(triangles, edges, members, beside, vertex_leaf, edge_leaf)
     ends, slack, near, near_list = _near_vertices(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge)
-    both = np.concatenate([ends, ends[:, ::-1]])
-    order, half = np.lexsort(both.T[::-1]), max(len(ends), 1)
-    owners = np.stack([vertex_leaf[vertex_triangle[:, 0]], leaf_of_triangle[vertex_triangle[:, 1]]], axis=1)
-    near_owners = np.concatenate([owners, edge_leaf[edge_edge]])
     counted = [_ranges(np.bincount(of, minlength=len(members))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     begins, beside_nodes, beside_leaves = _beside(np.array(nodes), beside)
@@ -138,17 +128,13 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         beside=begins,
         beside_nodes=beside_nodes,
         beside_leaves=beside_leaves,
-        vertex_leaves=_ranges(np.array([len(own) for own in around])),
-        around_leaves=_int(np.concatenate(around)),
-        vertex_triangles=_ranges(np.bincount(triangles.ravel(), minlength=len(x))),
-        around_triangles=_int(np.argsort(triangles.ravel(), kind="stable") // 3),
-        partners=_ranges(np.bincount(both[:, 0], minlength=len(x))),
-        partner=_int(both[order, 1]),
-        slack=np.concatenate([slack, slack])[order],
-        near=_int(np.stack([near[:-1], near[1:]], axis=1)[order % half].reshape(-1, 2)),
+        partners=_ranges(np.bincount(ends[:, 0], minlength=len(x))),
+        partner=_int(ends[:, 1]),
+        slack=slack,
+        near=near,
         near_list=_int(near_list),
-        near_pairs=_int(np.concatenate([np.concatenate([vertex_triangle, edge_edge]), near_owners], axis=1)),
-        near_corners=len(vertex_triangle),
+        near_pairs=_int(np.concatenate([vertex_triangle, edge_edge])),
+        vertex_triangles=len(vertex_triangle),
         samples=_int(np.linspace(0, len(x) - 1, SAMPLES).round()),
     )
 
@@ -215,9 +201,9 @@ def _beside(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[
     counts, others, bits = np.zeros(len(nodes), np.int64), [], []
     for node in whole:
         begin, end = nodes[node, [BEGIN, END]].tolist()
-        found: dict[int, int] = {}
+        found = {node: 0}
         for leaf in range(begin, end):
-            for other in beside[leaf]:
+            for other in {*range(begin, leaf + 1), *(other for other in beside[leaf] if other > leaf)}:
                 bit = LEAVES * (leaf - begin) + other - int(nodes[node_of[other], BEGIN])
                 found[node_of[other]] = found.get(node_of[other], 0) | 1 << bit
         counts[node] = len(found)

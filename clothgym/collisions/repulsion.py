@@ -44,7 +44,8 @@ def press_again(x, v, w, sheet, block, carried):
     nothing = -zero
     for c in range(3):
         _press(
-            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried, nothing
+            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried,
+            nothing
         )  # fmt: skip
 
 
@@ -58,32 +59,81 @@ def _press(x, v, w, pressed, carried, nothing):
         v[e] += change
 
 
-@inlined
-def repel(x, v, w, sheet, block, l, h, carried):
-    """Contacts of one sheet with itself, if a sweep is due for them; returns whether one was."""
+@apart
+def repel(x, v, w, sheet, block, h, carried):
+    """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
     memory, setting = sheet.memory, sheet.setting
-    count = memory.contacts[block, l]
-    if count == 0:
-        return False
-    memory.waited[block, l] += 1
-    memory.aged[block, l] += 1
-    waited = memory.waited[block, l]
-    if waited < memory.span[block, l]:
-        return False
-    particles, figures = memory.particles[block, l], memory.figures[block, l]
-    impulses, chosen, pressed = memory.impulses[block, l], memory.chosen[block, l], memory.pressed[block, :, :, l]
-    if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-        memory.choices[block, l] = _choose(x, v, particles, figures, impulses, chosen, count, h)
-        memory.aged[block, l] = 0
-    choices = memory.choices[block, l]
-    touching, most = _correct(
-        x, v, w, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
-    )
-    _add_up(w, particles, figures, impulses, chosen, choices, pressed)
-    memory.report[block, l, TOUCHING] = touching
-    memory.waited[block, l] = 0
-    memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
-    return True
+    particles_count = x.shape[1]
+    place, motion = np.empty((particles_count, 3), x.dtype), np.empty((particles_count, 3), x.dtype)
+    mobility = np.empty(particles_count, x.dtype)
+    for l in range(memory.used[block]):
+        count = memory.contacts[block, l]
+        if count == 0:
+            continue
+        memory.waited[block, l] += 1
+        memory.aged[block, l] += 1
+        waited = memory.waited[block, l]
+        if waited < memory.span[block, l]:
+            continue
+        particles, figures = memory.particles[block, l], memory.figures[block, l]
+        impulses, chosen, pressing = memory.impulses[block, l], memory.chosen[block, l], memory.pressing[block, l]
+        pressed = memory.pressed[block, :, :, l]
+        if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
+            memory.choices[block, l] = _choose(x[:, :, l].T, v[:, :, l].T, particles, figures, impulses, chosen, count, h)
+            memory.pressers[block, l] = _list_particles(particles, chosen, memory.choices[block, l], pressing, x.shape[1])
+            memory.aged[block, l] = 0
+            pressed[:] = 0
+        choices, pressing = memory.choices[block, l], pressing[: memory.pressers[block, l]]
+        _take(x, v, w, l, pressing, place, motion, mobility)
+        touching, most = _correct(
+            place, motion, mobility, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h,
+            waited,
+        )  # fmt: skip
+        _put_back(x, v, l, pressing, place, motion)
+        _add_up(mobility, particles, figures, impulses, chosen, choices, pressing, motion)
+        for m in range(pressing.shape[0]):
+            p = pressing[m]
+            for c in range(3):
+                pressed[c, p] = motion[p, c]
+        memory.report[block, l, TOUCHING] = touching
+        memory.waited[block, l] = 0
+        memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
+
+
+@kernel
+def _list_particles(particles, chosen, choices, pressing, number):
+    """List the particles of the chosen contacts, in their order; returns how many."""
+    some = np.zeros(number, np.bool_)
+    for c in range(choices):
+        for m in range(4):
+            some[particles[chosen[c], m]] = True
+    count = 0
+    for p in range(number):
+        if some[p]:
+            pressing[count] = p
+            count += 1
+    return count
+
+
+@kernel
+def _take(x, v, w, l, pressing, place, motion, mobility):
+    """Copy the particles of one lane that contacts press to where they lie side by side: contacts read each of them many times."""
+    for m in range(pressing.shape[0]):
+        p = pressing[m]
+        mobility[p] = w[p, l]
+        for c in range(3):
+            place[p, c] = x[c, p, l]
+            motion[p, c] = v[c, p, l]
+
+
+@kernel
+def _put_back(x, v, l, pressing, place, motion):
+    """And back."""
+    for m in range(pressing.shape[0]):
+        p = pressing[m]
+        for c in range(3):
+            x[c, p, l] = place[p, c]
+            v[c, p, l] = motion[p, c]
 
 
 @inlined
@@ -91,9 +141,9 @@ def _along(a, particles, figures, k, nx, ny, nz):
     """n.(sum of weights times positions or velocities) of contact k."""
     i, j, m, n = particles[k, 0], particles[k, 1], particles[k, 2], particles[k, 3]
     wi, wj, wm, wn = figures[k, 0], figures[k, 1], figures[k, 2], figures[k, 3]
-    ax = wi * a[0, i] + wj * a[0, j] + wm * a[0, m] + wn * a[0, n]
-    ay = wi * a[1, i] + wj * a[1, j] + wm * a[1, m] + wn * a[1, n]
-    az = wi * a[2, i] + wj * a[2, j] + wm * a[2, m] + wn * a[2, n]
+    ax = wi * a[i, 0] + wj * a[j, 0] + wm * a[m, 0] + wn * a[n, 0]
+    ay = wi * a[i, 1] + wj * a[j, 1] + wm * a[m, 1] + wn * a[n, 1]
+    az = wi * a[i, 2] + wj * a[j, 2] + wm * a[m, 2] + wn * a[n, 2]
     return nx * ax + ny * ay + nz * az, ax, ay, az
 
 
@@ -103,12 +153,12 @@ def _push(x, v, w, particles, figures, k, jx, jy, jz, carried, qx, qy, qz):
     for c in range(4):
         p = particles[k, c]
         share = w[p] * figures[k, c]
-        v[0, p] += share * jx
-        v[1, p] += share * jy
-        v[2, p] += share * jz
-        x[0, p] += share * (carried * jx + qx)
-        x[1, p] += share * (carried * jy + qy)
-        x[2, p] += share * (carried * jz + qz)
+        v[p, 0] += share * jx
+        v[p, 1] += share * jy
+        v[p, 2] += share * jz
+        x[p, 0] += share * (carried * jx + qx)
+        x[p, 1] += share * (carried * jy + qy)
+        x[p, 2] += share * (carried * jz + qz)
 
 
 @kernel
@@ -131,10 +181,11 @@ def _choose(x, v, particles, figures, impulses, chosen, count, h):
 
 
 @kernel
-def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
-    """What the impulses of a substep change each particle's velocity by [m/s], (3, particles)."""
+def _add_up(w, particles, figures, impulses, chosen, choices, pressing, pressed):
+    """What the impulses of a substep change each particle's velocity by [m/s], (particles, 3)."""
     zero = pressed.dtype.type(0)
-    pressed[:] = zero
+    for m in range(pressing.shape[0]):
+        pressed[pressing[m]] = zero
     for c in range(choices):
         k = chosen[c]
         jx, jy, jz = impulses[k, 0], impulses[k, 1], impulses[k, 2]
@@ -142,9 +193,9 @@ def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
             for m in range(4):
                 p = particles[k, m]
                 share = w[p] * figures[k, m]
-                pressed[0, p] += share * jx
-                pressed[1, p] += share * jy
-                pressed[2, p] += share * jz
+                pressed[p, 0] += share * jx
+                pressed[p, 1] += share * jy
+                pressed[p, 2] += share * jz
 
 
 @kernel

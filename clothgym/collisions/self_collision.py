@@ -39,30 +39,23 @@ PUSH = 0.5  # speed at which what is too close is pushed apart [m/s]
 class Memory(NamedTuple):
     """What contact remembers, in blocks; all of it belongs to the state, or follows from it.
 
-    start: where each vertex was looked around last, in the sheet's frame [m], (blocks, lanes, 3, particles); frame: the place of that,
-    (blocks, lanes, 3); bounds, limits: squares of how far it may go from there before what it is tied to is looked at, and before
-    it asks [m^2], or -1, (blocks, lanes, particles); old: the last certified positions [m], like ``start``; lag: how far what is held is
-    behind its hand [m]; behind: the largest, (blocks, lanes).  box, ball, hulls: see ``candidates``, and
-    whether they are stale.
-    contacts: how many, (blocks, lanes); particles, figures: see ``proximity``, (blocks, lanes, room, ...);
+    start: positions at the last query [m]; bounds, limits: squares of how far each vertex may go from there before tied pairs are
+    looked at, and before a query is due [m^2], or -1; old: the last certified positions [m]; lag: how far what is held is
+    behind its hand [m]; behind: the largest, (blocks, lanes).
+    contacts: how many, (blocks, lanes); particles, figures: see ``proximity``, (blocks, lanes, room, 4) and (..., FIGURES);
     impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
     contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  tight: how many
-    tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (blocks, lanes, room, ...).
-    chosen: contacts that may act soon, ``choices`` of them.
+    tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4); looks: at these since the last query.
+    chosen: contacts that may act soon, ``choices`` of them; pressing: the particles of these, ``pressers`` of them.
     used: lanes that are no padding, (blocks,).  report: see ``proximity``, (blocks, lanes, REPORT).
     """
 
     start: NDArray
-    frame: NDArray
     bounds: NDArray
     limits: NDArray
     old: NDArray
     lag: NDArray
     behind: NDArray
-    box: NDArray
-    ball: NDArray
-    hulls: NDArray
-    stale: NDArray
     contacts: NDArray
     particles: NDArray
     figures: NDArray
@@ -74,8 +67,11 @@ class Memory(NamedTuple):
     tight: NDArray
     ties: NDArray
     planes: NDArray
+    looks: NDArray
     chosen: NDArray
     choices: NDArray
+    pressing: NDArray
+    pressers: NDArray
     used: NDArray
     report: NDArray
 
@@ -119,19 +115,8 @@ def press(x, v, w, sheet, block, step, h, carried):
 @apart
 def keep_apart(x, v, w, sheet, block, h, carried):
     """And what happens after; see the module."""
-    particles, lanes = x.shape[1], x.shape[2]
-    if lanes == 1:
-        place, motion, mobility = x.reshape(3, particles), v.reshape(3, particles), w.reshape(particles)
-        repel(place, motion, mobility, sheet, block, 0, h, carried)
-        confine(place, motion, mobility, sheet, block, 0, h)
-        return
-    # what lies far apart is copied
-    place, motion, mobility = np.empty((3, particles), x.dtype), np.empty((3, particles), x.dtype), np.empty(particles, x.dtype)
-    for l in range(sheet.memory.used[block]):
-        place[:], motion[:], mobility[:] = x[:, :, l], v[:, :, l], w[:, l]
-        repel(place, motion, mobility, sheet, block, l, h, carried)
-        confine(place, motion, mobility, sheet, block, l, h)
-        x[:, :, l], v[:, :, l] = place, motion
+    repel(x, v, w, sheet, block, h, carried)
+    confine(x, v, w, sheet, block, h)
 
 
 @kernel

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.checks import not_negative, positive
-from clothgym.collisions.candidates import Reach, enclose, far_edges, far_leaves, far_vertices
+from clothgym.collisions.candidates import Reach, far_pairs, far_sides
 from clothgym.collisions.confinement import FARTHEST
 from clothgym.collisions.intersections import first_intersection
 from clothgym.collisions.pairs import Pairs, pairs_of
@@ -19,12 +19,9 @@ from clothgym.collisions.proximity import (
     FIGURES,
     GAP,
     LAG,
-    LEAF,
     MARGIN,
-    MEMBERS,
     NUMBER,
     OWN,
-    OWNERS,
     REPORT,
     TIE,
     UNCERTAIN,
@@ -40,8 +37,7 @@ from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
 
 MODES = ("fast", "strict")
-LIMIT = 0.7  # thicknesses that a vertex may go before it is looked around again, at least
-MOST = 0.4  # the same of a fast vertex, at most, in shortest distances at rest of near pairs, and of others
+REACH = 1.4  # how far a query sees, in thicknesses
 CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a contact
 ROOM = 12  # contacts for each vertex; more are counted as dropped
 TIGHT = 24  # tied pairs for each vertex; more bound their vertices instead
@@ -149,7 +145,7 @@ class SelfCollision:
         real = dtype.type
         friction, push, calm = real(self.options.friction), real(PUSH), real(CALM * self.thickness)
         setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, calm)
-        self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, pairs, dtype))
+        self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
         self.check(mesh.rest_positions[None], np.zeros(1, np.int64))
 
     @property
@@ -189,33 +185,32 @@ class SelfCollision:
         if self.options is None:
             return
         memory = self.sheet.memory
-        memory.start[block, lane] = memory.old[block, lane] = x[block, :, :, lane]
-        memory.frame[block, lane] = 0
-        memory.bounds[block, lane] = memory.limits[block, lane] = -1
-        memory.stale[block, lane] = True
+        for array in (memory.start, memory.old):
+            array[block, :, :, lane] = x[block, :, :, lane]
+        memory.bounds[block, :, lane] = memory.limits[block, :, lane] = -1
         memory.lag[block, :, :, lane] = 0
         memory.behind[block, lane] = 0
         memory.contacts[block, lane] = 0
         memory.tight[block, lane] = 0
-        memory.waited[block, lane] = memory.span[block, lane] = 0
+        memory.looks[block, lane] = memory.waited[block, lane] = memory.span[block, lane] = 0
         memory.pressed[block, :, :, lane] = 0
         memory.report[block, lane] = 0
         self._reported[block * self.layout.lanes + lane] = False
 
     def blank(self) -> dict[str, NDArray]:
         """The arrays of ``State`` that are contact's where every query is due."""
-        num_envs, particles = self.layout.num_envs, 0 if self.options is None else self.sheet.memory.bounds.shape[2]
+        num_envs, particles = self.layout.num_envs, 0 if self.options is None else self.sheet.memory.bounds.shape[1]
         return {
             "contact_start": np.zeros((num_envs, particles, 3)),
-            "contact_frame": np.zeros((num_envs, 3)),
             "contact_bounds": np.full((num_envs, particles), -1.0),
             "contact_limits": np.full((num_envs, particles), -1.0),
             "contact_lag": np.zeros((num_envs, particles, 3)),
             "contact_count": np.zeros(num_envs, np.int32),
-            "contact_particles": np.zeros((num_envs, 0, MEMBERS), np.int32),
+            "contact_particles": np.zeros((num_envs, 0, 4), np.int32),
             "contact_figures": np.zeros((num_envs, 0, FIGURES)),
             "contact_impulses": np.zeros((num_envs, 0, 3)),
             "contact_tight": np.zeros(num_envs, np.int32),
+            "contact_looks": np.zeros(num_envs, np.int32),
             "contact_pressed": np.zeros((num_envs, particles, 3)),
             "contact_waited": np.zeros(num_envs, np.int32),
             "contact_span": np.zeros(num_envs, np.int32),
@@ -228,18 +223,14 @@ class SelfCollision:
         if self.options is None:
             return self.blank()
         memory, public, vectors = self.sheet.memory, self.layout.to_public, self.layout.vectors_to_public
-        start, frame, bounds, limits = (
-            array.reshape(-1, *array.shape[2:])[: self.layout.num_envs].copy()
-            for array in (memory.start.swapaxes(2, 3), memory.frame, memory.bounds, memory.limits)
-        )
         state = {
-            "contact_start": start,
-            "contact_frame": frame,
-            "contact_bounds": bounds,
-            "contact_limits": limits,
+            "contact_start": vectors(memory.start),
+            "contact_bounds": public(memory.bounds),
+            "contact_limits": public(memory.limits),
             "contact_lag": vectors(memory.lag),
             "contact_count": public(memory.contacts),
             "contact_tight": public(memory.tight),
+            "contact_looks": public(memory.looks),
             "contact_pressed": vectors(memory.pressed),
             "contact_waited": public(memory.waited),
             "contact_span": public(memory.span),
@@ -262,7 +253,7 @@ class SelfCollision:
         """
         if self.options is None:
             return
-        memory, particles = self.sheet.memory, self.sheet.memory.bounds.shape[2]
+        memory, particles = self.sheet.memory, self.sheet.memory.bounds.shape[1]
         advice = "give what get_state() of such a simulation gave"
         for name, blank in self.blank().items():
             given, array = getattr(state, name), name.removeprefix("contact_")
@@ -279,16 +270,12 @@ class SelfCollision:
             wrong = np.isnan(given) if array == "planes" else ~np.isfinite(given)
             if wrong[~state.diverged].any():
                 raise ValueError(f"the state's {name} holds a value that is not finite: {advice}")
-        for name in ("contact_waited", "contact_span"):
+        for name in ("contact_looks", "contact_waited", "contact_span"):
             if getattr(state, name).min() < 0:
                 raise ValueError(f"the state's {name} holds {getattr(state, name).min()}, and counts: {advice}")
-        rows, ties, leaves = state.contact_particles, state.contact_ties, len(self.sheet.pairs.corners)
-        for name, named, what, most in (
-            ("particles", rows[:, :, :LEAF], "particles", particles), ("particles", rows[:, :, LEAF:], "leaves", leaves),
-            ("ties", ties[:, :, VERTICES:], "particles", particles), ("ties", ties[:, :, OWNERS:VERTICES], "leaves", leaves),
-        ):  # fmt: skip
-            if np.any((named < 0) | (named >= most)):
-                raise ValueError(f"the state's contact_{name} name {what} beyond the {most} of the sheet: {advice}")
+        for name, vertices in (("particles", state.contact_particles), ("ties", state.contact_ties[:, :, VERTICES:])):
+            if np.any((vertices < 0) | (vertices >= particles)):
+                raise ValueError(f"the state's contact_{name} name particles beyond the {particles} of the sheet: {advice}")
         own, number = state.contact_ties[:, :, OWN], state.contact_ties[:, :, NUMBER]
         if np.any((own < 0) | (number < own) | (number > TIE - VERTICES)):
             raise ValueError(f"the state's contact_ties count more vertices than a pair has: {advice}")
@@ -297,18 +284,20 @@ class SelfCollision:
         """Take over from a state, with positions x in blocks [m]."""
         if self.options is None:
             return
-        memory, vectors = self.sheet.memory, self.layout.vectors_to_blocks
+        memory, blocks, vectors = self.sheet.memory, self.layout.to_blocks, self.layout.vectors_to_blocks
         env = np.arange(self.layout.num_envs)
         block, lane = self.layout.place(env)
         self.begin(block, lane, x)
         memory.lag[:] = vectors(state.contact_lag, self.dtype)
         memory.behind[:] = np.sqrt((memory.lag**2).sum(axis=1)).max(axis=1)
-        memory.start[block, lane] = state.contact_start.swapaxes(1, 2)
-        memory.frame[block, lane] = state.contact_frame
-        memory.bounds[block, lane] = state.contact_bounds
-        memory.limits[block, lane] = state.contact_limits
+        due = np.any(state.contact_bounds < 0, axis=1).reshape(-1)
+        start = np.where(due[:, None, None], self.layout.vectors_to_public(x), state.contact_start)
+        memory.start[block, :, :, lane] = np.swapaxes(start, 1, 2)
+        memory.bounds[:] = blocks(state.contact_bounds, self.dtype)
+        memory.limits[:] = blocks(state.contact_limits, self.dtype)
         memory.contacts[block, lane] = state.contact_count
         memory.tight[block, lane] = state.contact_tight
+        memory.looks[block, lane] = state.contact_looks
         memory.pressed[:] = vectors(state.contact_pressed, self.dtype)
         memory.waited[block, lane] = state.contact_waited
         memory.span[block, lane] = state.contact_span
@@ -347,30 +336,25 @@ class SelfCollision:
         return SelfContacts(rows, touching, clamped, queries, dropped, numbers[GAP], numbers[LAG], numbers[UNCERTAIN] > 0)
 
 
-def memory_of(layout: Layout, particles: int, pairs: Pairs, dtype: np.dtype) -> Memory:
+def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
     """Room for a batch."""
-    leaves, nodes = len(pairs.corners), len(pairs.nodes)
     shape, room = (layout.blocks, layout.lanes), ROOM * particles
     used = np.clip(layout.num_envs - layout.lanes * np.arange(layout.blocks), 0, layout.lanes)
     return Memory(
-        start=np.zeros((*shape, 3, particles), dtype),
-        frame=np.zeros((*shape, 3), dtype),
-        bounds=np.full((*shape, particles), -1, dtype),
-        limits=np.full((*shape, particles), -1, dtype),
-        old=np.zeros((*shape, 3, particles), dtype),
+        start=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
+        bounds=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
+        limits=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
+        old=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         lag=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         behind=np.zeros(shape, dtype),
-        box=np.empty((*shape, 6, leaves)),
-        ball=np.empty((*shape, 4, leaves)),
-        hulls=np.empty((*shape, 6, nodes)),
-        stale=np.ones(shape, np.bool_),
         contacts=np.zeros(shape, np.int32),
         # contacts are written where they are needed only: an operating system gives no memory to what has never been touched
-        particles=np.empty((*shape, room, MEMBERS), np.int32),
+        particles=np.empty((*shape, room, 4), np.int32),
         figures=np.empty((*shape, room, FIGURES), dtype),
         tight=np.zeros(shape, np.int32),
         ties=np.empty((*shape, TIGHT * particles, TIE), np.int32),
         planes=np.empty((*shape, TIGHT * particles, 4)),
+        looks=np.zeros(shape, np.int32),
         impulses=np.zeros((*shape, room, 3), dtype),
         pressed=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
         waited=np.zeros(shape, np.int32),
@@ -378,50 +362,25 @@ def memory_of(layout: Layout, particles: int, pairs: Pairs, dtype: np.dtype) -> 
         aged=np.zeros(shape, np.int32),
         chosen=np.empty((*shape, room), np.int32),
         choices=np.zeros(shape, np.int32),
+        pressing=np.empty((*shape, particles), np.int32),
+        pressers=np.zeros(shape, np.int32),
         used=used,
         report=np.zeros((*shape, REPORT)),
     )
 
 
 @kernel
-def shortest_near(p, triangles, edges, near_pairs, near_corners):
+def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
     """Shortest distance of a near pair of primitives [m]."""
     shortest = np.inf
     for n in range(near_pairs.shape[0]):
         i, j = near_pairs[n, 0], near_pairs[n, 1]
-        if n < near_corners:
+        if n < vertex_triangles:
             _, _, _, x, y, z = gap_of_vertex(p, i, triangles[j, 0], triangles[j, 1], triangles[j, 2])
         else:
             _, _, x, y, z = gap_of_edges(p, edges[i, 0], edges[i, 1], edges[j, 0], edges[j, 1])
         shortest = min(shortest, x * x + y * y + z * z)
     return np.sqrt(shortest)
-
-
-def shortest_far(p: NDArray, pairs: Pairs, near: float, dtype: np.dtype) -> float:
-    """Shortest distance of what does not hang together, if it is below ``2 * near``, else infinity [m]."""
-    particles, leaves = len(p), len(pairs.corners)
-    wide, start, active = np.full(particles, near), np.ascontiguousarray(p.T.astype(dtype)), np.ones(leaves, np.bool_)
-    box, ball, hulls = np.empty((6, leaves)), np.empty((4, leaves)), np.empty((6, len(pairs.nodes)))
-    report, limits, none = np.full(REPORT, np.inf), np.full(particles, np.inf, dtype), np.zeros(particles, np.bool_)
-    # no contacts, and no room for ties
-    rows = np.empty((0, MEMBERS), np.int32), np.empty((0, FIGURES), dtype), np.empty((0, TIE), np.int32), np.empty((0, 4))
-    enclose(start, wide, pairs.corners, pairs.nodes, active, True, box, ball, hulls, np.empty(len(pairs.nodes), np.bool_))
-    number = far_leaves(pairs, active, ball, box, hulls, np.empty((1, 2), np.int32))
-    found = np.empty((number + 1, 2), np.int32)
-    far_leaves(pairs, active, ball, box, hulls, found)
-    vertices = np.empty((far_vertices(start, wide, pairs, box, found, number, np.empty((0, 5), np.int32)), 5), np.int32)
-    far_vertices(start, wide, pairs, box, found, number, vertices)
-    of_edges = np.empty((7, len(pairs.edges))), np.empty(len(pairs.edges), np.bool_)
-    sides = p, start, wide, pairs, found, np.zeros(number, np.bool_), number, *of_edges
-    edges = np.empty((far_edges(*sides, np.empty((1, 4), np.int32)) + 1, 4), np.int32)
-    far_edges(*sides, edges)
-    own = Reach(near, near, 0.0, 0.0, 0.0, 0.0, 0.0), wide, none, np.zeros(particles), limits, limits.copy()
-    closest, counts = np.zeros((number, 4)), np.zeros(2, np.int64)
-    vertex_contacts(
-        p, vertices, len(vertices), pairs, 0.0, 0.0, True, *own, closest, np.zeros(number, np.int64), counts, *rows, report
-    )
-    edge_contacts(p, edges, len(edges) - 1, pairs, 0.0, True, *own, counts, *rows, report)
-    return float(report[GAP])
 
 
 def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.dtype) -> Reach:
@@ -431,8 +390,19 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
         ValueError: the sheet is that close to itself at rest.
     """
     p = mesh.rest_positions.astype(np.float64)
-    near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.near_corners))
-    apart = min(2 * near, shortest_far(p, pairs, near, dtype))
+    near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.vertex_triangles))
+    # what does not hang together: nothing is looked for beyond two such distances
+    reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
+    extra = np.zeros(mesh.num_particles)
+    leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
+    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), reach, extra)
+    figures = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    no_contacts = np.empty((0, 4), np.int32), np.empty((0, FIGURES), dtype)
+    none = *no_contacts, 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
+    owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
+    vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
+    edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *figures, 0, *none)
+    apart = float(room.min())
     # of single triangles nothing is near, and of one alone nothing else
     shortest = np.sqrt(1 / pairs.rest_edges.max())
     usual = USUAL * min(near, apart, shortest) if near == np.inf else USUAL * near
@@ -443,5 +413,4 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
             f"at most {FAR_MOST * apart:.2g} fits, {usual:.2g} is usual"
         )
     thin = min(own, NEAR_MOST * near)
-    most = max(LIMIT * thin, MOST * min(near, apart, shortest))
-    return Reach(LIMIT * thin, most, thin, own, CONTACT * thin, STOP * thin, STANDOFF * thin)
+    return Reach(REACH * thin, REACH * own, thin, own, CONTACT * thin, STOP * thin, STANDOFF * thin)
