@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined
+from clothgym._jit import inlined, kernel
 from clothgym.collisions import Plane
 from clothgym.envs.episode import Fields
 from clothgym.envs.measures import CENTROID, SPEED2, covered_share, key_particles, soft_coverage
 from clothgym.envs.physics import Physics
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import SHAPES, Target, place_points, reference_coverage, unit_surface
+from clothgym.envs.targets import SHAPES, Target, placed, reference_coverage, unit_surface
 from clothgym.envs.task import POSITION_BOUND, Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
@@ -68,11 +68,21 @@ def _holds_nothing(own, rules, sheet):
 
 
 @inlined
-def _upper_surface(own, units):
-    """Points of the target's upper surface [m], (points, 3); units: those of a round one's and of a box's, for a radius of 1."""
-    points = units[1 if own.solid == BOX else 0].copy()
-    place_points(points, own.top, own.radius, own.turn)
-    return points
+def _surface_of(own, units):
+    """Points of the target's upper surface, as ``place_points`` takes them; units: those of a round one and of a box."""
+    return units[1 if own.solid == BOX else 0], own.top, own.radius, own.turn
+
+
+@kernel
+def _nearness(x, surface, reach):
+    points = placed(*surface)
+    return soft_coverage(x, points, reach)
+
+
+@kernel
+def _coverage(x, triangles, surface, tolerance):
+    points = placed(*surface)
+    return covered_share(x, triangles, points, tolerance)
 
 
 @inlined
@@ -91,14 +101,14 @@ def _centring(off_center):
 @inlined
 def covering(own, rules, sheet):
     """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
-    near = soft_coverage(sheet.x, _upper_surface(own, rules.guides), rules.guide_reach)
+    near = _nearness(sheet.x, _surface_of(own, rules.guides), rules.guide_reach)
     return (near + _centring(_off_center(own, rules, sheet))) / 2
 
 
 @inlined
 def _judge(own, rules, sheet, info):
-    points = _upper_surface(own, rules.judged)
-    info.coverage = covered_share(sheet.x, sheet.mesh.triangles, points, COVERED_WITHIN * rules.side)
+    surface = _surface_of(own, rules.judged)
+    info.coverage = _coverage(sheet.x, sheet.mesh.triangles, surface, COVERED_WITHIN * rules.side)
     info.off_center = _off_center(own, rules, sheet)
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     share = info.coverage / own.reference

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import apart, inlined, kernel, uncounted
 from clothgym.mesh import ClothMesh
 
 # what ``summarize`` writes
@@ -52,7 +52,7 @@ def _from_bits(bits):
     return np.int32(bits).view(np.float32)
 
 
-@apart
+@uncounted
 def summarize(x, v, share, ends, inverse2, out):
     """Summary of a sheet: (SUMMARY,).
 
@@ -108,7 +108,7 @@ def stretch_quantile(x, ends, inverse2, share):
     return low
 
 
-@apart
+@uncounted
 def soft_coverage(x, points, reach):
     """How near a sheet is to points of a surface [m], (points, 3): mean of ``1/(1 + (d/reach)^2)`` over them.
 

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, inlined, specialize
+from clothgym._jit import inlined, specialize, uncounted
 from clothgym.envs.episode import BEYOND, DIVERGED, EFFORT_PRICE, FAILURE_PENALTY, FINE, OUT_OF_BOUNDS, SUCCESS_BONUS, TORN, TWICE
 from clothgym.envs.measures import CENTROID, FINITE, STRETCH2, SUMMARY, largest_strain, summarize
 from clothgym.mesh import SHEAR, ClothMesh
@@ -80,8 +80,9 @@ def compiled(name: str, kernels: Kernels) -> tuple[Any, Any]:
     # where this folder is linked into the package, its files have no part in the name of the cache's folder
     sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     name, parts = f"{name}_{hashlib.sha256(sources).hexdigest()[:12]}", kernels._asdict()
-    close_step = specialize(close, f"close_{name}", apart=True, **parts)
-    return specialize(order, f"order_{name}", **parts), specialize(conclude, f"conclude_{name}", close_step=close_step, **parts)
+    scoring = specialize(score, f"score_{name}", apart=True, **parts)
+    one = specialize(conclude_one, f"conclude_one_{name}", apart=True, score=scoring, **parts)
+    return specialize(order, f"order_{name}", **parts), specialize(conclude, f"conclude_{name}", conclude_one=one)
 
 
 class Mesh(NamedTuple):
@@ -172,34 +173,45 @@ def conclude(
 
     x, v, holder, hands, openings: a simulation's, see ``state.View``.  pulls: (len(envs), hands, 3).  more: ``seen`` as numbers.
     """
-    rule = rules[0]
     points, summary = np.empty((2, 3, holder.shape[1]), x.dtype), np.empty(SUMMARY, x.dtype)
     holds = np.empty(hands.shape[1], np.int64)
     for i in range(first, last):
-        e = envs[i]
-        b, l = e // lanes, e % lanes
-        own = episode[e]
-        copy_points(x, v, b, l, points)
-        count_held(holder[b, :, l], holds)
-        summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
-        held = holder[b, :, l], hands[b, :, :, l], openings[b, :, l], holds
-        sheet = Sheet(points[0], points[1], *held, pulls[i], air[e], summary, mesh)
-        if begins:
-            own.step, own.settling_since, own.over = 0, -1, False
-            for k in range(hands.shape[1]):
-                for c in range(3):
-                    own.targets[k, c] = sheet.hands[k, c]
-            measure(own, rule, sheet)  # noqa: F821
-            own.potential = potential(own, rule, sheet)  # noqa: F821
-            changed = True
-        else:
-            changed = close_step(own, rule, sheet, outcome[e], info[e], terms[e])  # noqa: F821
-        if changed:
-            observe(own, rule, sheet, seen[e])  # noqa: F821
-            look(points, mesh.particles, own.origin, rule.per_side, more[e], bound, observation[e])
+        conclude_one(
+            envs[i], begins, lanes, x, v, holder, hands, openings, pulls[i], mesh, rules, episode, air, outcome, info, terms, seen,
+            more, bound, observation, points, summary, holds,
+        )  # fmt: skip
 
 
-def close(own, rule, sheet, out, told, terms):
+@uncounted
+def conclude_one(
+    e, begins, lanes, x, v, holder, hands, openings, pulls, mesh, rules, episode, air, outcome, info, terms, seen, more, bound,
+    observation, points, summary, holds,
+):  # fmt: skip
+    """The same for one environment; points, summary, holds: room for its ``Sheet``."""
+    b, l = e // lanes, e % lanes
+    own, rule = episode[e], rules[0]
+    copy_points(x, v, b, l, points)
+    count_held(holder[b, :, l], holds)
+    summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
+    held = holder[b, :, l], hands[b, :, :, l], openings[b, :, l], holds
+    sheet = Sheet(points[0], points[1], *held, pulls, air[e], summary, mesh)
+    if begins:
+        own.step, own.settling_since, own.over = 0, -1, False
+        for k in range(hands.shape[1]):
+            for c in range(3):
+                own.targets[k, c] = sheet.hands[k, c]
+        measure(own, rule, sheet)  # noqa: F821
+        own.potential = potential(own, rule, sheet)  # noqa: F821
+        changed = True
+    else:
+        changed = score(own, rule, sheet, outcome[e], info[e], terms[e])
+    if changed:
+        observe(own, rule, sheet, seen[e])  # noqa: F821
+        show(points, mesh.particles, own.origin, rule.per_side, more[e], bound, observation[e])
+
+
+@uncounted
+def score(own, rule, sheet, out, told, terms):
     """Score a step of one environment; whether it is to be observed anew."""
     running = not own.over
     acting = running and own.settling_since < 0
@@ -240,7 +252,7 @@ def close(own, rule, sheet, out, told, terms):
     return running and failure != DIVERGED
 
 
-@apart
+@uncounted
 def copy_points(x, v, b, l, points):
     """Positions and velocities of one environment, in its block and lane, to (2, 3, particles)."""
     for p in range(points.shape[2]):
@@ -280,8 +292,8 @@ def effort_of(moves):
     return total
 
 
-@apart
-def look(points, particles, origin, per_side, more, bound, observation):
+@uncounted
+def show(points, particles, origin, per_side, more, bound, observation):
     """Points of the sheet relative to the origin, in sides, their velocities [m/s], and more; within the bounds."""
     count = particles.shape[0]
     for k in range(count):

@@ -107,9 +107,8 @@ class Target:
 
     def upper_surface(self, count: int) -> NDArray[np.float64]:
         """About ``count`` points, evenly by area, where the surface slopes by at most UPPER_SLOPE [m], (points, 3)."""
-        points = unit_surface(self.shape, count).copy()
-        place_points(points, np.array(self.top), self.radius, np.array([math.cos(self.yaw), math.sin(self.yaw)]))
-        return points
+        turn = np.array([math.cos(self.yaw), math.sin(self.yaw)])
+        return placed(unit_surface(self.shape, count), np.array(self.top), self.radius, turn)
 
     def describe(self) -> dict[str, object]:
         return asdict(self)
@@ -131,16 +130,18 @@ def unit_surface(shape: str, count: int) -> NDArray[np.float64]:
 
 
 @kernel
-def place_points(points, top, radius, turn):
-    """Put points of a unit surface, (points, 3), in their places on a target [m].
+def placed(units, top, radius, turn):
+    """Points of a unit surface, (points, 3), in their places on a target [m].
 
     top: see ``Target.top``.  turn: cosine and sine of the target's yaw, (2,).
     """
-    for k in range(points.shape[0]):
-        x, y = points[k, 0] * radius, points[k, 1] * radius
+    points = np.empty(units.shape)
+    for k in range(units.shape[0]):
+        x, y = units[k, 0] * radius, units[k, 1] * radius
         points[k, 0] = top[0] + turn[0] * x - turn[1] * y
         points[k, 1] = top[1] + turn[1] * x + turn[0] * y
-        points[k, 2] = top[2] + points[k, 2] * radius
+        points[k, 2] = top[2] + units[k, 2] * radius
+    return points
 
 
 @lru_cache
