@@ -200,8 +200,8 @@ class StrainTask(Task):
         return LOW, HIGH
 
     def _remembers(self) -> Fields:
-        # the post's axis, where each clip is to be at each way-point [m], the next one, and the way that is left at each, and in
-        all way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
+        # the post's axis, where each clip is to be at each way-point [m], the next one, and the way that is left at each, and in all
+        way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
 
     def _figures(self) -> dict[str, Any]:
