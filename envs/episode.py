@@ -47,6 +47,11 @@ def records(count: int, fields: Fields) -> NDArray:
     return np.zeros(count, np.dtype(list(fields), align=True))
 
 
+def names_of(records: NDArray) -> tuple[str, ...]:
+    """The records' fields."""
+    return records.dtype.names or ()
+
+
 def record_of(**figures: Any) -> NDArray:
     """One record of these figures, numbers or arrays, (1,)."""
     values = {name: np.asarray(value) for name, value in figures.items()}

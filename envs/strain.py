@@ -200,7 +200,7 @@ class StrainTask(Task):
         return LOW, HIGH
 
     def _remembers(self) -> Fields:
-        # the post's axis, where each clip is to be at each way-point [m], the next one, and the way that is left at each, and in all
+        # the post's axis, where each clip is to be at each way-point [m], the next one, the way that is left at each, and in all
         way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
 

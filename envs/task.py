@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.envs.episode import FAILURES, Fields, TaskState, record_of, records
+from clothgym.envs.episode import FAILURES, Fields, TaskState, names_of, record_of, records
 from clothgym.envs.physics import Physics, check_material_option, check_ranges, checked_ranges, checked_wind, most_demanding
 from clothgym.envs.stepping import Kernels, compiled, mesh_arrays
 from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
@@ -142,7 +142,13 @@ class Task(ABC):
         """Records of the episodes and their steps, and the kernels that go through them."""
         physics, count = self.physics, self.num_envs
         hand, low, high = (self.num_hands, 3), *self._arena()
-        memory = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand), ("potential", float)]
+        memory: Fields = [
+            ("step", np.int64),
+            ("settling_since", np.int64),
+            ("over", bool),
+            ("targets", float, hand),
+            ("potential", float),
+        ]
         memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self._remembers()]
         self.episode = records(count, memory)
         self.episode["over"] = True
@@ -153,7 +159,7 @@ class Task(ABC):
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
             side=max(physics.mesh.size), **self._figures(),
         )  # fmt: skip
-        brought = [("reward", float), ("terminated", bool), ("failure", np.int64)]
+        brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_hands, self.hand_actions)), ("free", np.uint8, self.num_hands)]
         self.outcome = records(count, brought)
         told = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
@@ -302,17 +308,17 @@ class Task(ABC):
 
     def told(self) -> dict[str, Any]:
         """What info tells of the last step: arrays over the batch, and a dict of them for the reward's terms."""
-        info = {name: self.info[name].copy() for name in self.info.dtype.names} | self._told_by_physics()
+        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | self._told_by_physics()
         info["failure"] = np.array(FAILURES)[self.outcome["failure"]]
-        info["reward_terms"] = {name: self.terms[name].copy() for name in self.terms.dtype.names}
+        info["reward_terms"] = {name: self.terms[name].copy() for name in names_of(self.terms)}
         return info
 
     def told_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as plain Python values."""
-        info = dict(zip(self.info.dtype.names, self.info[env].item()))
+        info = dict(zip(names_of(self.info), self.info[env].item()))
         info |= {name: value[env].item() for name, value in self._told_by_physics().items()}
         info["failure"] = FAILURES[self.outcome["failure"][env]]
-        info["reward_terms"] = dict(zip(self.terms.dtype.names, self.terms[env].item()))
+        info["reward_terms"] = dict(zip(names_of(self.terms), self.terms[env].item()))
         return info
 
     def _told_by_physics(self) -> dict[str, NDArray]:
@@ -342,7 +348,7 @@ class Task(ABC):
 
     def _memory(self) -> dict[str, NDArray]:
         """All that is remembered of the episodes, live."""
-        return {name: self.episode[name] for name in self.episode.dtype.names} | {"observation": self.observation, "wind": self.air}
+        return {name: self.episode[name] for name in names_of(self.episode)} | {"observation": self.observation, "wind": self.air}
 
     def set_state(self, state: TaskState) -> None:
         """Continue from a state of the same task with as many environments.
