@@ -142,13 +142,8 @@ class Task(ABC):
         """Records of the episodes and their steps, and the kernels that go through them."""
         physics, count = self.physics, self.num_envs
         hand, low, high = (self.num_hands, 3), *self._arena()
-        memory: Fields = [
-            ("step", np.int64),
-            ("settling_since", np.int64),
-            ("over", bool),
-            ("targets", float, hand),
-            ("potential", float),
-        ]
+        memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand)]
+        memory += [("potential", float)]
         memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self._remembers()]
         self.episode = records(count, memory)
         self.episode["over"] = True
