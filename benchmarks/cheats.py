@@ -33,6 +33,11 @@ def moves(env: Any, velocity: NDArray) -> NDArray:
     return each.reshape(env.num_envs, -1)
 
 
+def _picks(task: Any) -> bool:
+    """Whether the sheet has to be taken hold of first."""
+    return "picked" in task.episode.dtype.names
+
+
 def never(env: Any, step: int) -> NDArray:
     return np.zeros(env.action_space.shape)
 
@@ -42,7 +47,7 @@ def hold(env: Any, step: int) -> NDArray:
     actions = task.expert_actions().reshape(env.num_envs, task.num_hands, task.hand_actions).copy()
     if task.hand_actions == 4:
         # a gripper must open first to take anything
-        ever_held = task.episode.get("picked", np.ones((env.num_envs, task.num_hands), bool))
+        ever_held = task.episode["picked"] if _picks(task) else np.ones((env.num_envs, task.num_hands), bool)
         actions[:, :, 3] = np.where(ever_held, -1.0, actions[:, :, 3])
     return actions.reshape(env.num_envs, -1)
 
@@ -68,7 +73,7 @@ CHEATS: tuple[Callable[[Any, int], NDArray], ...] = (never, hold, apart, away, s
 def with_the_sheet(env: Any, step: int, cheat: Callable[[Any, int], NDArray]) -> NDArray:
     """Where there is something to take hold of, the expert does that first."""
     actions, task = cheat(env, step), env.unwrapped.task
-    if "picked" in task.episode and cheat is not never:
+    if _picks(task) and cheat is not never:
         actions = np.where(task.episode["picked"].all(axis=1)[:, None], actions, task.expert_actions())
     return actions
 

@@ -180,11 +180,11 @@ def test_distance_to_a_triangle_against_a_fine_sampling():
 def test_coverage_of_a_flat_sheet_that_overhangs_half_a_box():
     box = Target("box", 0.12, 0.24, (0.0, 0.0))
     points = box.upper_surface(256)
-    sheet = SHEET.rest_positions + (SIDE / 2, 0, 0.24)  # covers x >= 0
+    sheet = (SHEET.rest_positions + (SIDE / 2, 0, 0.24)).T.copy()  # covers x >= 0
     share = covered_share(sheet, SHEET.triangles, points, 0.012)
     columns = (np.arange(16) + 0.5) / 16 * 0.24 - 0.12
     assert share == np.mean(columns >= -0.012)
-    assert covered_share(sheet + (0, 0, 0.0121), SHEET.triangles, points, 0.012) == 0
+    assert covered_share(sheet + np.array([[0], [0], [0.0121]]), SHEET.triangles, points, 0.012) == 0
 
 
 def test_upper_surface_lies_on_the_solid_and_is_spread_by_area():

@@ -70,7 +70,7 @@ def judgement(env, index=0):
     task = env.unwrapped.task
     target, x = task.targets[index], positions(env)[index]
     v = task.simulation.velocities[index].astype(float)
-    coverage = covered_share(x, SHEET.triangles, target.upper_surface(256), 0.02 * SIDE)
+    coverage = covered_share(x.T.copy(), SHEET.triangles, target.upper_surface(256), 0.02 * SIDE)
     share = coverage / reference_coverage(target, SIDE)
     off = np.linalg.norm(SHARE @ x[:, :2] - target.center) / SIDE
     speed = np.sqrt(SHARE @ np.sum(v**2, axis=1))

@@ -317,7 +317,7 @@ def test_starts_are_drawn_as_the_manual_page_says():
 
 def test_the_wind_differs_between_environments():
     env = batch(40)
-    wind = env.unwrapped.task.episode["wind"]
+    wind = env.get_state().episode["wind"]
     steady = np.linalg.norm(wind.mean(axis=1)[:, :2], axis=1)
     assert len(np.unique(steady)) == 40 and steady.min() < 0.3 and 0.7 < steady.max() < 1.5
     env.step(np.zeros((40, 6)))
