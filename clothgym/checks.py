@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +14,8 @@ LARGEST = 1e30  # of an array: its differences over a control step are still num
 
 def number(name: str, value: Any) -> float:
     """A finite number."""
+    if type(value) is float and math.isfinite(value):
+        return value
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -64,15 +67,18 @@ def finite(name: str, value: ArrayLike) -> NDArray:
         array = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError):
         raise ValueError(f"{name}={value!r}: must be numbers") from None
+    within = np.abs(array) <= LARGEST  # and so a number
+    if within.all():
+        return array
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} holds a value that is not finite: {array[~np.isfinite(array)][0]}")
-    if np.any(np.abs(array) > LARGEST):
-        raise ValueError(f"{name} holds {array[np.abs(array) > LARGEST][0]:g}: must lie within {LARGEST:g}")
-    return array
+    raise ValueError(f"{name} holds {array[~within][0]:g}: must lie within {LARGEST:g}")
 
 
 def vector(name: str, value: ArrayLike) -> NDArray:
     """Three finite numbers."""
+    if type(value) is tuple and len(value) == 3 and all(type(each) is float and abs(each) <= LARGEST for each in value):
+        return np.array(value)
     array = finite(name, value)
     if array.shape != (3,):
         raise ValueError(f"{name}={value!r}: must be three numbers")
@@ -89,6 +95,8 @@ def vectors(name: str, value: ArrayLike, number: int) -> NDArray:
 
 def spread(name: str, value: NDArray, shape: tuple[int, ...]) -> NDArray:
     """``value`` broadcast to ``shape``."""
+    if value.shape == shape:
+        return value
     try:
         return np.broadcast_to(value, shape)
     except ValueError:

@@ -142,7 +142,7 @@ class Layout(NamedTuple):
                 raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
         index = indices("envs", envs, self.num_envs, "this batch's environments")
-        if once and len(np.unique(index)) < len(index):
+        if once and len(index) > 1 and len(np.unique(index)) < len(index):
             raise ValueError(f"envs={envs!r}: names an environment twice")
         return index
 
