@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -51,6 +52,8 @@ class Collider:
     def __post_init__(self) -> None:
         for item in fields(self):
             name, value = f"{type(self).__name__} {item.name}", getattr(self, item.name)
+            if value is item.default:
+                continue
             if item.name == "rotation":
                 turned(name, value)
             elif isinstance(item.default, tuple):
@@ -66,7 +69,7 @@ class Collider:
     def rows(self) -> NDArray[np.float64]:
         """The numbers the kernel reads, (ROWS,)."""
         rows = np.zeros(ROWS)
-        rows[AXES : AXES + 9] = np.eye(3).ravel()
+        rows[AXES], rows[AXES + 4], rows[AXES + 8] = 1, 1, 1
         rows[FRICTION] = self.friction
         rows[VELOCITY : VELOCITY + 3] = rows[AFTER : AFTER + 3] = self.velocity
         rows[RADIUS] = rows[THICKNESS] = self.thickness
@@ -97,9 +100,8 @@ class Plane(Collider):
             raise ValueError(f"Plane normal={self.normal!r}: must have a length")
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
         rows[POINT : POINT + 3] = self.point
-        rows[AXES : AXES + 9] = _axes_along(normal).ravel()
+        rows[AXES : AXES + 9] = _axes_along(*map(float, self.normal))
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ class Capsule(Collider):
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         rows[POINT : POINT + 3] = self.center
-        rows[AXES : AXES + 9] = _axes_along(np.asarray(self.axis) / np.linalg.norm(self.axis)).ravel()
+        rows[AXES : AXES + 9] = _axes_along(*map(float, self.axis))
         rows[HALF + 2] = self.height / 2 - self.radius
         rows[RADIUS] = self.radius + self.thickness
 
@@ -165,7 +167,7 @@ class Box(Collider):
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         rows[POINT : POINT + 3] = self.center
         about_z = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
-        rows[AXES : AXES + 9] = (about_z @ turned("rotation", self.rotation)).ravel()
+        rows[AXES : AXES + 9] = (about_z @ _axes_of(*map(float, self.rotation))).ravel()
         rows[HALF : HALF + 3] = self.half_sides
 
 
@@ -188,11 +190,19 @@ def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def _axes_along(z: NDArray) -> NDArray[np.float64]:
-    """Axes of which the third is the given unit vector, (3, 3), an axis a row."""
+@lru_cache
+def _axes_of(*quaternion: float) -> NDArray[np.float64]:
+    """The same; not to be written to."""
+    return turned("rotation", quaternion)
+
+
+@lru_cache
+def _axes_along(*direction: float) -> NDArray[np.float64]:
+    """Axes of which the third has the given direction, x axis, y axis, z axis, (9,); not to be written to."""
+    z = np.array(direction) / np.linalg.norm(direction)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    return np.concatenate([x, np.cross(z, x), z])
 
 
 def check_index(colliders: Sequence[Collider], index: int) -> None:
