@@ -193,14 +193,19 @@ class Hands:
         bending: Bending,
         fabric: Fabric,
         threads: int,
+        blocks: NDArray | None = None,
     ) -> NDArray:
-        """Force of the cloth on each hand [N], (blocks, hands, 3, lanes)."""
+        """Force of the cloth on each hand [N], (blocks, hands, 3, lanes); in these blocks, or in all of them."""
         out, add = np.empty_like(self.x), _pulls_with(bending, self.layout.by_particle)
 
         def work(first: int, last: int) -> None:
             add(first, last, x, v, free_w, weave, fabric, self.holder, out)
 
-        run_spans(work, self.layout.blocks, threads)
+        if blocks is None:
+            run_spans(work, self.layout.blocks, threads)
+            return out
+        for block in set(blocks.tolist()):
+            work(block, block + 1)
         return out
 
     def slip(self, pull: NDArray, w: NDArray, free_w: NDArray) -> None:

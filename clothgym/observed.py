@@ -97,11 +97,13 @@ class Observed:
     def pulls(self, envs: ArrayLike | None = None) -> NDArray:
         """Force with which the cloth pulls at each anchor and then each gripper [N], (len(envs), hands, 3): the springs',
         the weight's and the air's on the particles that it holds; not what accelerates these."""
-        pulls = self.layout.to_public(self._pulls())
-        return pulls if envs is None else pulls[self.layout.chosen(envs)]
+        if envs is None:
+            return self.layout.to_public(self._pulls())
+        chosen = self.layout.chosen(envs)
+        return self.layout.to_public(self._pulls(self.layout.place(chosen)[0]))[chosen]
 
-    def _pulls(self) -> NDArray:
-        return self._hands.pulls(self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads)
+    def _pulls(self, blocks: NDArray | None = None) -> NDArray:
+        return self._hands.pulls(self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks)
 
     def strain(self) -> NDArray:
         """Stretch over rest length, minus one, of the structural springs (threads or edges), (num_envs, those springs)."""

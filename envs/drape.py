@@ -159,10 +159,6 @@ class DrapeTask(Task):
     judgement = (("coverage", float), ("coverage_reference", float), ("off_center", float), ("rms_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
 
-    def __init__(self, num_envs: int, **kwargs: Any) -> None:
-        super().__init__(num_envs, **kwargs)
-        self.targets: list[Target] = [Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0))] * num_envs
-
     def _colliders(self) -> list:
         floor = Plane(friction=FRICTION, thickness=THICKNESS)
         return [floor, Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
@@ -210,27 +206,27 @@ class DrapeTask(Task):
         unknown = set(wanted) - set(known)
         if unknown:
             raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
-        drawn = Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape"))
-        figures: dict[str, Any] = drawn.describe() | dict(wanted)
-        if "height" not in wanted and drawn.shape != "post":
-            figures["height"] = 2 * figures["radius"]
-        return Target(**figures)
+        return Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape")).changed(wanted)
 
     def _place_target(self, env: int, target: Target) -> None:
-        self.targets[env] = target
         own = self.episode[env]
         own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
         own["top"] = own["origin"] = target.top
         own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
         own["reference"] = reference_coverage(target, SIDE)
-        self.simulation.set_collider(1, [target.collider(FRICTION, THICKNESS)], np.array([env]))
 
-    def set_state(self, state: Any) -> None:
-        super().set_state(state)
-        for env, own in enumerate(self.episode):
-            *center, height = own["top"].tolist()
-            target = Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
-            self._place_target(env, target)
+    @property
+    def targets(self) -> list[Target]:
+        """Those of the episodes."""
+        return [self._target(env) for env in range(self.num_envs)]
+
+    def _target(self, env: int) -> Target:
+        own = self.episode[env]
+        *center, height = own["top"].tolist()
+        return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
+
+    def _furnish(self, envs: NDArray) -> None:
+        self.simulation.set_collider(1, [self._target(env).collider(FRICTION, THICKNESS) for env in envs], envs)
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
@@ -256,7 +252,7 @@ class DrapeTask(Task):
         return actions.reshape(self.num_envs, -1)
 
     def solids(self, env: int) -> list[Solid]:
-        return [self.targets[env].solid()]
+        return [self._target(env).solid()]
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

@@ -14,7 +14,7 @@ from clothgym._jit import inlined
 from clothgym.checks import number, positive
 from clothgym.collisions import Capsule
 from clothgym.envs import carriers
-from clothgym.envs.episode import FINE, Fields
+from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, key_particles, largest_strain, length_of, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
@@ -41,6 +41,7 @@ def _clip(columns: range) -> tuple[int, ...]:
 
 
 CLIPS = (_clip(range(3)), _clip(range(ROWS - 1, ROWS - 4, -1)))
+CLIPPED = np.array(CLIPS).ravel()
 
 POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
 FRICTION = 0.3
@@ -182,7 +183,6 @@ class StrainTask(Task):
             raise ValueError(f"threshold={threshold!r}: must be at most 1, at which the sheet tears; usual are 0.05 to 0.2")
         super().__init__(num_envs, integrator=integrator, **kwargs)
         self.cost_penalty = cost_penalty
-        self.posts: list[Capsule] = [_post(0.0, 0.0)] * num_envs
 
     @property
     def cost_penalty(self) -> float:
@@ -228,28 +228,29 @@ class StrainTask(Task):
         )
         yaws = np.array([0.0, 0.0, *rng.uniform(-MOST_YAW, MOST_YAW, 2)])
         # the held edge lies across the way; between the corners it is as long as at rest
-        half = SIDE / 2 * np.stack([-np.sin(yaws), np.cos(yaws), np.zeros(4)], axis=1)
-        clips = np.stack([middles + half, middles - half], axis=1)
-        self._place_post(env, post)
+        half = SIDE / 2 * np.array([-np.sin(yaws), np.cos(yaws), np.zeros(4)]).T
+        clips = np.array([middles + half, middles - half]).swapaxes(0, 1)
         own = self.episode[env]
+        own["post"] = post
         own["places"], own["next"], own["episode_cost"] = clips[1:], 0, 0
-        legs = np.linalg.norm(np.diff(clips, axis=0), axis=2).mean(axis=1)
-        own["after"], own["way"] = legs.sum() - np.cumsum(legs), legs.sum()
+        legs = length(clips[1:] - clips[:-1]).mean(axis=1)
+        own["after"], own["way"] = legs.sum() - legs.cumsum(), legs.sum()
         ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
-        ripple[[particle for clip in CLIPS for particle in clip]] = 0
+        ripple[CLIPPED] = 0
         x = middles[0] + hanging()
         x[:, 0] += ripple
         return x
 
-    def _place_post(self, env: int, post: NDArray) -> None:
-        self.posts[env] = _post(*post.tolist())
-        self.episode["post"][env] = post
-        self.simulation.set_collider(0, [self.posts[env]], np.array([env]))
+    def _furnish(self, envs: NDArray) -> None:
+        self.simulation.set_collider(0, [self._post(env) for env in envs], envs)
 
-    def set_state(self, state: Any) -> None:
-        super().set_state(state)
-        for env, post in enumerate(self.episode["post"]):
-            self._place_post(env, post)
+    @property
+    def posts(self) -> list[Capsule]:
+        """What the sheets are carried past."""
+        return [self._post(env) for env in range(self.num_envs)]
+
+    def _post(self, env: int) -> Capsule:
+        return _post(*self.episode["post"][env].tolist())
 
     # --- experts and picture --------------------------------------------------------------------------------------------
 
@@ -273,7 +274,7 @@ class StrainTask(Task):
     def solids(self, env: int) -> list[Solid]:
         from clothgym.render import Solid  # imported here: training draws nothing
 
-        post = self.posts[env]
+        post = self._post(env)
         return [Solid(kind="capsule", center=post.center, radius=post.radius, height=post.height)]
 
     def markers(self, env: int) -> list[Any]:

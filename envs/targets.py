@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,8 @@ class Target:
         for name in ("radius", "height"):
             if positive(f"target {name}", getattr(self, name)) > LARGEST:
                 raise ValueError(f"target {name}={getattr(self, name)!r}: must be at most {LARGEST} m, to stand in the arena")
-        if np.shape(self.center) != (2,) or np.max(np.abs(finite("target center", self.center))) > LARGEST:
+        center = finite("target center", self.center)
+        if center.shape != (2,) or max(map(abs, center.tolist())) > LARGEST:
             raise ValueError(f"target center={self.center!r}: must be two numbers within {LARGEST} m of the origin")
         if abs(number("target yaw", self.yaw)) > math.pi / 4 + 1e-9:
             raise ValueError(f"target yaw={self.yaw!r}: must be within 45 degrees (pi/4); a box looks the same every 90")
@@ -110,8 +112,11 @@ class Target:
         turn = np.array([math.cos(self.yaw), math.sin(self.yaw)])
         return placed(unit_surface(self.shape, count), np.array(self.top), self.radius, turn)
 
-    def describe(self) -> dict[str, object]:
-        return asdict(self)
+    def changed(self, figures: Mapping[str, Any]) -> Target:
+        """The same but for some figures; its height follows from its radius unless it is among them, or a post's."""
+        if "radius" in figures and "height" not in figures and self.shape != "post":
+            figures = {**figures, "height": 2 * figures["radius"]}
+        return replace(self, **figures) if figures else self
 
 
 @lru_cache
@@ -159,7 +164,5 @@ def reference_coverage(target: Target, side: float) -> float:
     Bilinear in the committed table over width and height (in sheet sides); beyond the table its edge holds.
     """
     widths, heights, coverage = _reference_table()[target.shape]
-    if len(heights) == 1:
-        return float(np.interp(target.radius / side, widths, coverage[:, 0]))
     by_width = [float(np.interp(target.radius / side, widths, column)) for column in coverage.T]
-    return float(np.interp(target.height / side, heights, by_width))
+    return by_width[0] if len(heights) == 1 else float(np.interp(target.height / side, heights, by_width))

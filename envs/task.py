@@ -193,6 +193,9 @@ class Task(ABC):
     def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         """Draw one environment's scene; the sheet's particles at the start [m], (particles, 3)."""
 
+    def _furnish(self, envs: NDArray) -> None:  # noqa: B027 - some have none
+        """Put solids where ``_begin`` has drawn them, or a state has them."""
+
     def _place_hands(self, envs: NDArray) -> None:  # noqa: B027 - anchors need nothing
         """Put grippers where an episode begins with them; anchors hold their particles."""
 
@@ -235,6 +238,7 @@ class Task(ABC):
         simulation.reset(envs, positions=starts)
         if self.wind is not None:
             simulation.set_wind(self.air[envs, 0], envs)
+        self._furnish(envs)
         self._place_hands(envs)
         self._look(envs, begins=True)
 
@@ -289,7 +293,7 @@ class Task(ABC):
         view, lanes, mesh = self.simulation.view, self.simulation.layout.lanes, self._mesh
         pulls = self.simulation.pulls(envs if begins else None) if self.feels_pulls else self._no_pulls
         if not begins:
-            self.info = np.zeros_like(self.info)
+            self.info = np.zeros(self.num_envs, self.info.dtype)
 
         def work(first: int, last: int) -> None:
             self._conclude(
@@ -365,6 +369,7 @@ class Task(ABC):
         self.simulation.set_state(state.simulation)
         for name, value in memory.items():
             value[...] = state.episode[name]
+        self._furnish(self._everyone)
         for env, text in enumerate(state.generators):
             self.generators[env] = np.random.default_rng()
             self.generators[env].bit_generator.state = json.loads(text)
