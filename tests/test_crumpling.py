@@ -33,7 +33,7 @@ def test_a_manoeuvre_starts_without_intersections_above_the_floor(name, mesh):
 
 @pytest.mark.parametrize("name", MANOEUVRES)
 def test_without_self_collision_a_manoeuvre_intersects(name):
-    manoeuvre = MANOEUVRES[name](GRID, seeds=[0])
+    manoeuvre = MANOEUVRES[name](GRID, seeds=range(4))
     counts = run(manoeuvre, 4.5)
     assert np.mean(counts > 0) > 0.2
     assert not manoeuvre.simulation.diverged.any()
@@ -106,7 +106,7 @@ def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
 
 def test_a_start_does_not_depend_on_the_others():
     mesh = grid(9, 9, 0.8, 0.8)
-    np.testing.assert_array_equal(starts(mesh, kind="folded", count=3, seed=1)[1:2], starts(mesh, kind="folded", seed=2))
+    np.testing.assert_array_equal(starts(mesh, kind="folded", count=3, seed=5)[1:2], starts(mesh, kind="folded", seed=6))
 
 
 def test_starts_that_intersect_are_refused():
