@@ -62,78 +62,39 @@ def _press(x, v, w, pressed, carried, nothing):
 @apart
 def repel(x, v, w, sheet, block, h, carried):
     """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
-    memory, setting = sheet.memory, sheet.setting
-    particles_count = x.shape[1]
-    place, motion = np.empty((particles_count, 3), x.dtype), np.empty((particles_count, 3), x.dtype)
-    mobility = np.empty(particles_count, x.dtype)
+    memory, number, lanes = sheet.memory, x.shape[1], x.shape[2]
     for l in range(memory.used[block]):
-        count = memory.contacts[block, l]
-        if count == 0:
+        if memory.contacts[block, l] == 0:
             continue
         memory.waited[block, l] += 1
         memory.aged[block, l] += 1
-        waited = memory.waited[block, l]
-        if waited < memory.span[block, l]:
+        if memory.waited[block, l] < memory.span[block, l]:
             continue
-        particles, figures = memory.particles[block, l], memory.figures[block, l]
-        impulses, chosen, pressing = memory.impulses[block, l], memory.chosen[block, l], memory.pressing[block, l]
-        pressed = memory.pressed[block, :, :, l]
-        if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-            memory.choices[block, l] = _choose(x[:, :, l].T, v[:, :, l].T, particles, figures, impulses, chosen, count, h)
-            memory.pressers[block, l] = _list_particles(particles, chosen, memory.choices[block, l], pressing, x.shape[1])
-            memory.aged[block, l] = 0
-            pressed[:] = 0
-        choices, pressing = memory.choices[block, l], pressing[: memory.pressers[block, l]]
-        _take(x, v, w, l, pressing, place, motion, mobility)
-        touching, most = _correct(
-            place, motion, mobility, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h,
-            waited,
-        )  # fmt: skip
-        _put_back(x, v, l, pressing, place, motion)
-        _add_up(mobility, particles, figures, impulses, chosen, choices, pressing, motion)
-        for m in range(pressing.shape[0]):
-            p = pressing[m]
-            for c in range(3):
-                pressed[c, p] = motion[p, c]
-        memory.report[block, l, TOUCHING] = touching
-        memory.waited[block, l] = 0
-        memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
+        if lanes == 1:
+            _sweep(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
+        else:  # lanes lie far apart, and contacts read each particle many times
+            place, motion, mobility = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
+            _sweep(place, motion, mobility, sheet, block, l, h, carried)
+            x[:, :, l], v[:, :, l] = place, motion
 
 
 @kernel
-def _list_particles(particles, chosen, choices, pressing, number):
-    """List the particles of the chosen contacts, in their order; returns how many."""
-    some = np.zeros(number, np.bool_)
-    for c in range(choices):
-        for m in range(4):
-            some[particles[chosen[c], m]] = True
-    count = 0
-    for p in range(number):
-        if some[p]:
-            pressing[count] = p
-            count += 1
-    return count
-
-
-@kernel
-def _take(x, v, w, l, pressing, place, motion, mobility):
-    """Copy the particles of one lane that contacts press to where they lie side by side: contacts read each of them many times."""
-    for m in range(pressing.shape[0]):
-        p = pressing[m]
-        mobility[p] = w[p, l]
-        for c in range(3):
-            place[p, c] = x[c, p, l]
-            motion[p, c] = v[c, p, l]
-
-
-@kernel
-def _put_back(x, v, l, pressing, place, motion):
-    """And back."""
-    for m in range(pressing.shape[0]):
-        p = pressing[m]
-        for c in range(3):
-            x[c, p, l] = place[p, c]
-            v[c, p, l] = motion[p, c]
+def _sweep(x, v, w, sheet, block, l, h, carried):
+    """Sweep over one sheet's contacts; x, v: (3, particles), w: (particles,)."""
+    memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]
+    particles, figures, impulses = memory.particles[block, l], memory.figures[block, l], memory.impulses[block, l]
+    chosen = memory.chosen[block, l]
+    if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
+        memory.choices[block, l] = _choose(x, v, particles, figures, impulses, chosen, count, h)
+        memory.aged[block, l] = 0
+    choices = memory.choices[block, l]
+    touching, most = _correct(
+        x, v, w, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
+    )
+    _add_up(w, particles, figures, impulses, chosen, choices, memory.pressed[block, :, :, l])
+    memory.report[block, l, TOUCHING] = touching
+    memory.waited[block, l] = 0
+    memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
 
 
 @inlined
@@ -141,9 +102,9 @@ def _along(a, particles, figures, k, nx, ny, nz):
     """n.(sum of weights times positions or velocities) of contact k."""
     i, j, m, n = particles[k, 0], particles[k, 1], particles[k, 2], particles[k, 3]
     wi, wj, wm, wn = figures[k, 0], figures[k, 1], figures[k, 2], figures[k, 3]
-    ax = wi * a[i, 0] + wj * a[j, 0] + wm * a[m, 0] + wn * a[n, 0]
-    ay = wi * a[i, 1] + wj * a[j, 1] + wm * a[m, 1] + wn * a[n, 1]
-    az = wi * a[i, 2] + wj * a[j, 2] + wm * a[m, 2] + wn * a[n, 2]
+    ax = wi * a[0, i] + wj * a[0, j] + wm * a[0, m] + wn * a[0, n]
+    ay = wi * a[1, i] + wj * a[1, j] + wm * a[1, m] + wn * a[1, n]
+    az = wi * a[2, i] + wj * a[2, j] + wm * a[2, m] + wn * a[2, n]
     return nx * ax + ny * ay + nz * az, ax, ay, az
 
 
@@ -153,12 +114,12 @@ def _push(x, v, w, particles, figures, k, jx, jy, jz, carried, qx, qy, qz):
     for c in range(4):
         p = particles[k, c]
         share = w[p] * figures[k, c]
-        v[p, 0] += share * jx
-        v[p, 1] += share * jy
-        v[p, 2] += share * jz
-        x[p, 0] += share * (carried * jx + qx)
-        x[p, 1] += share * (carried * jy + qy)
-        x[p, 2] += share * (carried * jz + qz)
+        v[0, p] += share * jx
+        v[1, p] += share * jy
+        v[2, p] += share * jz
+        x[0, p] += share * (carried * jx + qx)
+        x[1, p] += share * (carried * jy + qy)
+        x[2, p] += share * (carried * jz + qz)
 
 
 @kernel
@@ -181,11 +142,10 @@ def _choose(x, v, particles, figures, impulses, chosen, count, h):
 
 
 @kernel
-def _add_up(w, particles, figures, impulses, chosen, choices, pressing, pressed):
-    """What the impulses of a substep change each particle's velocity by [m/s], (particles, 3)."""
+def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
+    """What the impulses of a substep change each particle's velocity by [m/s], (3, particles)."""
     zero = pressed.dtype.type(0)
-    for m in range(pressing.shape[0]):
-        pressed[pressing[m]] = zero
+    pressed[:] = zero
     for c in range(choices):
         k = chosen[c]
         jx, jy, jz = impulses[k, 0], impulses[k, 1], impulses[k, 2]
@@ -193,9 +153,9 @@ def _add_up(w, particles, figures, impulses, chosen, choices, pressing, pressed)
             for m in range(4):
                 p = particles[k, m]
                 share = w[p] * figures[k, m]
-                pressed[p, 0] += share * jx
-                pressed[p, 1] += share * jy
-                pressed[p, 2] += share * jz
+                pressed[0, p] += share * jx
+                pressed[1, p] += share * jy
+                pressed[2, p] += share * jz
 
 
 @kernel

@@ -46,7 +46,7 @@ class Memory(NamedTuple):
     impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
     contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  tight: how many
     tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4); looks: at these since the last query.
-    chosen: contacts that may act soon, ``choices`` of them; pressing: the particles of these, ``pressers`` of them.
+    chosen: contacts that may act soon, ``choices`` of them.
     used: lanes that are no padding, (blocks,).  report: see ``proximity``, (blocks, lanes, REPORT).
     """
 
@@ -70,8 +70,6 @@ class Memory(NamedTuple):
     looks: NDArray
     chosen: NDArray
     choices: NDArray
-    pressing: NDArray
-    pressers: NDArray
     used: NDArray
     report: NDArray
 

@@ -362,8 +362,6 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         aged=np.zeros(shape, np.int32),
         chosen=np.empty((*shape, room), np.int32),
         choices=np.zeros(shape, np.int32),
-        pressing=np.empty((*shape, particles), np.int32),
-        pressers=np.zeros(shape, np.int32),
         used=used,
         report=np.zeros((*shape, REPORT)),
     )
