@@ -31,7 +31,7 @@ import numpy as np
 from bits_scenes import Digest, Row, core
 from tqdm import tqdm
 
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
 from clothgym.registration import ENVIRONMENTS
 
 ENVS, STEPS, LATER = 20, 30, 40  # environments of an id, steps of a row, and how many go before the later row

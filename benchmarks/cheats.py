@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
 from clothgym.registration import ENVIRONMENTS
 
 RESULTS = Path(__file__).parent / "results" / "cheats.json"

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import Box, Capsule, Material, MeshCollider, Plane, Simulation, Sphere, grid
-from clothgym.bench import machine
 from clothgym.collisions import Collider
 from clothgym.envs.drape import DrapeTask
+from clothgym.lab.bench import machine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import solids  # the truths that the tests use

@@ -36,8 +36,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import Material, Simulation, grid
-from clothgym.bench import machine
 from clothgym.envs.drape import DrapeTask
+from clothgym.lab.bench import machine
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

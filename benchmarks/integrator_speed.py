@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from clothgym import Material, Simulation, grid
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
 
 Row = dict[str, Any]
 RESULT = Path(__file__).parent / "results" / "integrator_speed.json"

@@ -25,8 +25,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from clothgym.bench import machine
 from clothgym.envs.drape import DrapeTask
+from clothgym.lab.bench import machine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "training"))
 import evaluate

@@ -15,10 +15,10 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
+from clothgym.lab.scenes import Drape, bending_length, cantilever, cusick_drape
 from clothgym.material import PRESETS, Material
 from clothgym.render import Camera, Renderer, Solid
-from clothgym.scenes import Drape, bending_length, cantilever, cusick_drape
 
 RESULT = Path(__file__).parent / "results" / "materials.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "materials.png"

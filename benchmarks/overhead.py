@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from clothgym.adapters.sb3 import make_sb3_vec_env
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
 from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from playwright.sync_api import sync_playwright
 
-from clothgym.bench import machine
+from clothgym.lab.bench import machine
 from clothgym.playground.server import Playground, serve
 from clothgym.playground.stage import SceneStage
 

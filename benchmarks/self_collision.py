@@ -6,13 +6,13 @@
 
 Sections of ``results/self_collision.json``:
 
-* manoeuvres: those of ``clothgym.crumpling`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
+* manoeuvres: those of ``clothgym.starts`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
   intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation told.  Modes:
   "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
 * drape: steps of random actions in ClothDrape-v0 with ``self_collision="strict"``, by target.
 
-What is counted is said in ``clothgym.collisions.intersections``, which knows nothing of self-collision.
+What is counted is said in ``clothgym.geometry.intersections``, which knows nothing of self-collision.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from tqdm import tqdm
 
 from clothgym import ClothMesh, Simulation, disc, grid
 from clothgym._jit import kernel
-from clothgym.bench import machine
-from clothgym.collisions.intersections import count_intersections
-from clothgym.crumpling import MANOEUVRES, Manoeuvre
+from clothgym.geometry.intersections import count_intersections
+from clothgym.lab.bench import machine
+from clothgym.starts import MANOEUVRES, Manoeuvre
 
 Row = dict[str, Any]
 Case = tuple[Callable[..., Row], Row]

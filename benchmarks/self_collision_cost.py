@@ -33,9 +33,9 @@ from self_collision import Case, Row, fill, table
 from tqdm import tqdm
 
 from clothgym import ClothMesh, Plane, Simulation, grid
-from clothgym.bench_mujoco import COTTON, DROP, FRAME, ROWS, SECONDS, SIDE, THIN, mujoco_model, start_of
-from clothgym.collisions.intersections import count_intersections
-from clothgym.crumpling import FRICTION, Drag, EdgeDrop, Fold, Heap, Manoeuvre, ZFold
+from clothgym.geometry.intersections import count_intersections
+from clothgym.lab.bench_mujoco import COTTON, DROP, FRAME, ROWS, SECONDS, SIDE, THIN, mujoco_model, start_of
+from clothgym.starts import FRICTION, Drag, EdgeDrop, Fold, Heap, Manoeuvre, ZFold
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

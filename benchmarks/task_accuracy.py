@@ -28,11 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import INTEGRATORS, Simulation
-from clothgym.bench import machine
 from clothgym.envs.drape import DrapeTask
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ReachTask
 from clothgym.envs.strain import StrainTask
+from clothgym.lab.bench import machine
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -119,7 +119,7 @@ def _warm_up(everything: bool) -> None:
 
 
 def _bench(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    from clothgym import bench, bench_table
+    from clothgym.lab import bench, bench_table
 
     if options.table:
         try:
@@ -136,7 +136,7 @@ def _bench(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None
 
 
 def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    from clothgym import compare
+    from clothgym.lab import compare
 
     if options.list:
         print(compare.scene_list())

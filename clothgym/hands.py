@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym._jit import apart, kernel, run_spans, specialize
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
-from clothgym.collisions import DESK, ROWS, Solids, keep_out, stop_at_solids
+from clothgym.collisions import COLLIDER_ROWS, SCRATCH_ROWS, Solids, keep_out, stop_at_solids
 from clothgym.elements import Elastic, Weave, room_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
@@ -350,7 +350,7 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
     Where nothing is in its way that is its target.  (In ``steer`` it would be compiled once more with each caller.)
     """
     one = x.dtype.type(1)
-    point, rows, desk = np.empty((3, 1, 1), x.dtype), np.empty((ROWS, 1), x.dtype), np.empty((DESK, 1), x.dtype)
+    point, rows, scratch = np.empty((3, 1, 1), x.dtype), np.empty((COLLIDER_ROWS, 1), x.dtype), np.empty((SCRATCH_ROWS, 1), x.dtype)
     tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
     for b in range(first, last):
         for k in range(hand.shape[1]):
@@ -365,12 +365,12 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
                 slow = one / max(np.sqrt(length2) / (time_step * limits[k, SPEED]), one)
                 for c in range(3):
                     way[c] *= slow
-                changed = stop_at_solids(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
+                changed = stop_at_solids(tip, way, colliders[b], shapes, l, time_step, point, rows, scratch)
                 for p in range(x.shape[2]):
                     if holder[b, p, l] == k:
                         for c in range(3):
                             tip[c] = x[b, c, p, l]
-                        changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, desk)
+                        changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, scratch)
                 blocked[b, k, l] = changed
                 if changed:
                     for c in range(3):

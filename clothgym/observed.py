@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.bending import Bending
-from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids, count_intersections
+from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids
 from clothgym.elements import Elements, SurfaceArrays, Weave
 from clothgym.forces import Energy, energy, structural_strain
+from clothgym.geometry.intersections import count_intersections
 from clothgym.hands import Hands
 from clothgym.limiting import Limiting
 from clothgym.mesh import ClothMesh

@@ -17,9 +17,9 @@ from clothgym._jit import specialize, uncounted
 from clothgym.bending import Bending, model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
-from clothgym.collisions.response import kernels_of as contact_kernels
-from clothgym.collisions.response import needed
-from clothgym.collisions.self_collision import KERNELS as SELF_COLLISION
+from clothgym.collisions.self.step import KERNELS as SELF_COLLISION
+from clothgym.collisions.solids.particle_contact import kernels_of as contact_kernels
+from clothgym.collisions.solids.particle_contact import needed
 from clothgym.elements import Elastic, digest_of, element_arrays, is_regular, surface_arrays, weave_of
 from clothgym.forces import Oscillators
 from clothgym.grid_forces import kernels_of

@@ -166,11 +166,12 @@ class State:
             (num_envs, particles, 3), and the squares of how far it may go from there, see ``collisions.proximity`` [m^2],
             (num_envs, particles), negative where it has not looked; no particles without self-collision.
         contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
-        contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_figures: see
+        contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_coefficients: see
             ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
         contact_pressed: what these change velocities by in a substep [m/s], (num_envs, particles, 3); contact_waited, contact_span:
             substeps since they were last corrected, and after which they are again, (num_envs,).
-        contact_tight: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,); contact_ties,
+        contact_constraints: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,);
+            contact_members,
             contact_planes: see there, (num_envs, pairs, ...).
         steps: control steps since the environment's reset, (num_envs,).
         diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
@@ -202,14 +203,14 @@ class State:
     contact_lag: NDArray
     contact_count: NDArray
     contact_particles: NDArray
-    contact_figures: NDArray
+    contact_coefficients: NDArray
     contact_impulses: NDArray
-    contact_tight: NDArray
+    contact_constraints: NDArray
     contact_looks: NDArray
     contact_pressed: NDArray
     contact_waited: NDArray
     contact_span: NDArray
-    contact_ties: NDArray
+    contact_members: NDArray
     contact_planes: NDArray
     steps: NDArray
     diverged: NDArray

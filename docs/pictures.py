@@ -17,11 +17,11 @@ import imageio.v3 as iio
 import numpy as np
 
 from clothgym import Box, MeshCollider, Plane, Simulation, grid
-from clothgym.crumpling import MANOEUVRES
 from clothgym.envs.pictures import draw, renderer_of
 from clothgym.render.camera import Camera
 from clothgym.render.renderer import Renderer
 from clothgym.render.solids import Solid
+from clothgym.starts import MANOEUVRES
 
 HERE = Path(__file__).parent
 SIZE = 300

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import INTEGRATORS, Material, Simulation, grid
+from clothgym.lab.scenes import bending_length, cantilever, elastica_droop
 from clothgym.mesh import SHEAR, STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
-from clothgym.scenes import bending_length, cantilever, elastica_droop
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -1,6 +1,6 @@
 """Which triangles of a sheet intersect, for tests: rational clipping of one triangle by the other, of all pairs whose boxes touch.
 
-Shares no code and no method with ``clothgym.collisions.intersections``.
+Shares no code and no method with ``clothgym.geometry.intersections``.
 """
 
 from fractions import Fraction

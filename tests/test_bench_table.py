@@ -5,9 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from clothgym import bench_cases, bench_episodes, bench_limits, bench_table, cli, grid
-from clothgym.bench_limits import PARTICLE, SPRING, PlainSheet, Work, stand
-from clothgym.bench_table import Case, in_turns, row_of, with_what_they_need
+from clothgym import cli, grid
+from clothgym.lab import bench_cases, bench_episodes, bench_limits, bench_table
+from clothgym.lab.bench_limits import PARTICLE, SPRING, PlainSheet, Work, stand
+from clothgym.lab.bench_table import Case, in_turns, row_of, with_what_they_need
 
 LIMITS = {
     "operations/s": 1e11,

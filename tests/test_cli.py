@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from clothgym import INTEGRATORS, bench
+from clothgym import INTEGRATORS
 from clothgym.cli import main
+from clothgym.lab import bench
 from clothgym.registration import ENVIRONMENTS
 
 

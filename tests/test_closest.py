@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clothgym.collisions.closest import closest_on_segments, closest_on_triangle
+from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle
 
 SHARES = np.linspace(0, 1, 41)
 

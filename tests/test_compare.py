@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from clothgym import INTEGRATORS, Material, compare, compare_pictures
+from clothgym import INTEGRATORS, Material
 from clothgym.cli import main
-from clothgym.compare_scenes import FRAME, SCENES, Scene
+from clothgym.lab import compare, compare_pictures
+from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 
 THREE = ("explicit_euler", "verlet", "xpbd")
 TINY = Scene(

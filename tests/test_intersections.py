@@ -5,8 +5,8 @@ import pytest
 from exact_intersections import intersecting_pairs
 
 from clothgym import disc, grid
-from clothgym.collisions import exact
-from clothgym.collisions.intersections import count_intersections, find_intersections, first_intersection
+from clothgym.geometry import exact_predicates
+from clothgym.geometry.intersections import count_intersections, find_intersections, first_intersection
 
 ONE_MORE, ONE_LESS = np.nextafter(1.0, 2.0), np.nextafter(1.0, 0.0)
 FLOOR = [(0, 0, 0), (4, 0, 0), (0, 4, 0)]  # the first triangle of the pairs below
@@ -140,7 +140,7 @@ def test_smooth_sheets_are_cleared_without_exact_arithmetic(place, monkeypatch):
     def refuse(*args):
         raise AssertionError("a pair of a smooth sheet was not decided by floating point")
 
-    monkeypatch.setattr(exact, "intersecting", refuse)
+    monkeypatch.setattr(exact_predicates, "intersecting", refuse)
     for mesh in (grid(25, 25, 1, 1), disc(0.5, 12)):
         for turn in (np.eye(3), np.roll(np.eye(3), 1, axis=1), turned(0), turned(1)):
             x = (mesh.rest_positions @ turn + place).astype(np.float32)

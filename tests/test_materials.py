@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from clothgym import Material, disc
+from clothgym.lab.scenes import bending_length, cantilever, cusick_drape, elastica_droop, projected_area
 from clothgym.material import PRESETS
-from clothgym.scenes import bending_length, cantilever, cusick_drape, elastica_droop, projected_area
 
 # chord angle of the heavy elastica [deg], solved independently, by G = rho g L^3/B
 ELASTICA = {0.1: 0.716, 1: 7.100, 4: 25.531, 8: 41.487, 15: 56.031, 30: 68.566, 100: 80.361}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from stages import advanced, page
 
-from clothgym.collisions.shapes import FRICTION
+from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.playground import server
 from clothgym.playground.episode import EpisodeStage, Replay
 from clothgym.playground.recording import Recording, strains, tensions, threads
@@ -145,7 +145,7 @@ def test_friction_reaches_the_solids_where_they_are():
     stage.change(friction=0.9)
     s = stage.sheets[0].simulation
     assert np.array_equal(s.collider_positions, places)
-    assert np.all(s.get_state().colliders[0, :, FRICTION] == np.float32(0.9))
+    assert np.all(s.get_state().colliders[0, :, R_FRICTION] == np.float32(0.9))
 
 
 def test_a_strain_limit_shows_the_sheet_before_and_after():

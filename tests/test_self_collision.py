@@ -6,12 +6,12 @@ from exact_intersections import intersecting_pairs
 from folded import SIDE, sheet, three_layers
 
 import clothgym
-from clothgym.collisions import self_contact
-from clothgym.collisions.candidates import Reach, enclose, far_leaves
-from clothgym.collisions.pairs import pairs_of
-from clothgym.collisions.proximity import FIGURES, REPORT, TIE, query
-from clothgym.collisions.repulsion import MOST, _correct
-from clothgym.crumpling import MANOEUVRES
+from clothgym.collisions.self import owner
+from clothgym.collisions.self.broad_phase import Reach, enclose, far_leaves
+from clothgym.collisions.self.impulses import FASTEST, _correct
+from clothgym.collisions.self.narrow_phase import C_SIZE, G_SIZE, REPORT_SIZE, query
+from clothgym.collisions.self.topology import pairs_of
+from clothgym.starts import MANOEUVRES
 
 
 def count_intersections(triangles, x):
@@ -70,13 +70,15 @@ def pairs_by_sampling(mesh, x, points=25):
                 yield np.array([p]), triangles[t], np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
 
 
-def looked_around(mesh, x, extra, ties):
+def looked_around(mesh, x, extra, members):
     """Bounds and limits of a query with a reach of 6 cm."""
-    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT)
-    room = np.empty((900, 4), np.int32), np.empty((900, FIGURES)), np.empty((ties, TIE), np.int32), np.empty((ties, 4))
+    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT_SIZE)
+    room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((members, G_SIZE), np.int32), np.empty((members, 4))
     held = np.zeros(len(x), bool)
-    _, tight = query(x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0), extra, held, bounds, limits, *room, report)
-    return bounds, limits, room[2][:tight]
+    _, constraints = query(
+        x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0), extra, held, bounds, limits, *room, report
+    )
+    return bounds, limits, room[2][:constraints]
 
 
 def crumpled_strip(seed):
@@ -99,18 +101,18 @@ def test_a_bound_is_no_larger_than_its_share_of_the_true_distance(seed):
     assert np.all(bounds <= 0.45 * truth)
     # and not much smaller than it could be
     assert np.median(bounds[near] / (0.45 * truth[near])) > 0.55
-    assert np.array_equal(bounds, limits)  # nothing is tied
+    assert np.array_equal(bounds, limits)  # nothing is constrained
 
 
-@pytest.mark.parametrize("ties", [0, 4000])
-def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(ties):
-    """Some vertices are fast and may go farther: what they may go in all is less than the distance, but for tied pairs."""
+@pytest.mark.parametrize("members", [0, 4000])
+def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(members):
+    """Some vertices are fast and may go farther: what they may go in all is less than the distance, but for gap constraints."""
     mesh, x = crumpled_strip(0)
     random = np.random.default_rng(1)
     extra = np.where(random.random(len(x)) < 0.3, random.uniform(0, 0.06, len(x)), 0.0)
-    bounds, limits, tied = looked_around(mesh, x, extra, ties)
-    assert len(tied) < max(ties, 1)  # there was room
-    known = {frozenset(row[3 : 3 + row[1]].tolist()) for row in tied}
+    bounds, limits, constrained = looked_around(mesh, x, extra, members)
+    assert len(constrained) < max(members, 1)  # there was room
+    known = {frozenset(row[3 : 3 + row[1]].tolist()) for row in constrained}
     checked = 0
     for one, other, gap in pairs_by_sampling(mesh, x, 13):
         members = frozenset([*one.tolist(), *other.tolist()])
@@ -119,7 +121,7 @@ def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(ties):
             checked += gap < 0.12
         assert bounds[one].max() + bounds[other].max() <= 0.9 * gap
     assert checked > 100
-    assert ties == 0 or limits.max() > 0.05  # those that are fast gain by it
+    assert members == 0 or limits.max() > 0.05  # those that are fast gain by it
 
 
 # --- nothing passes through itself ------------------------------------------------------------------------------------------
@@ -163,9 +165,9 @@ def test_a_thin_sheet_that_is_wrung_does_not_intersect_with_it():
     assert bad == 0
 
 
-def test_a_jam_without_room_for_ties_does_not_creep(monkeypatch):
+def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
     """What may not move at all stays to the bit: if it crept by rounding, it would come through in time."""
-    monkeypatch.setattr(self_contact, "TIGHT", 0)
+    monkeypatch.setattr(owner, "CONSTRAINTS", 0)
     mesh = sheet(9)
     option = {"mode": "strict", "thickness": 0.012}
     wring = MANOEUVRES["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)
@@ -262,7 +264,7 @@ def test_three_layers_on_a_table_rest_at_their_thickness():
     mesh = sheet(17)
     simulation = clothgym.Simulation(mesh, colliders=[clothgym.Plane(friction=0.5)], self_collision="strict")
     thickness = 0.28 * SIDE / 16 / np.sqrt(2)
-    simulation.set_parameters(air_drag=1.0)  # this fabric does not calm its folds itself
+    simulation.set_parameters(air_drag=1.0)  # this fabric does not tolerance its folds itself
     simulation.reset(positions=three_layers(mesh, 1.6 * thickness))
     simulation.step(180)
     x, v = simulation.positions[0], simulation.velocities[0]
@@ -346,9 +348,9 @@ def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
     real = np.float32
     x, v = np.zeros((3, 4), real), np.zeros((3, 4), real)
     x[:2, 1:], x[2, 0], v[2, 0] = [[1, -1, -1], [0, 1, -1]], 0.001, -1000.0
-    figures, impulses = np.array([[1, -1 / 3, -1 / 3, -1 / 3, 0, 0, 1, 0.008]], real), np.zeros((1, 3), real)
+    coefficients, impulses = np.array([[1, -1 / 3, -1 / 3, -1 / 3, 0, 0, 1, 0.008]], real), np.zeros((1, 3), real)
     mobility, chosen = np.full(4, 2.0, real), np.zeros(1, np.int32)
     h = real(1e-3)
-    _correct(x, v, mobility, np.arange(4, dtype=np.int32)[None], figures, impulses, chosen, 1, h, real(0), real(0), h, 1)
-    np.testing.assert_allclose(impulses[0], [0, 0, MOST / (2 * (1 + 3 / 9))], rtol=1e-6)
+    _correct(x, v, mobility, np.arange(4, dtype=np.int32)[None], coefficients, impulses, chosen, 1, h, real(0), real(0), h, 1)
+    np.testing.assert_allclose(impulses[0], [0, 0, FASTEST / (2 * (1 + 3 / 9))], rtol=1e-6)
     np.testing.assert_allclose(v.sum(axis=1), [0, 0, -1000], rtol=1e-6)

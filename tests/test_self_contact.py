@@ -7,7 +7,7 @@ from exact_intersections import intersecting_pairs
 from folded import SIDE, sheet, three_layers
 
 import clothgym
-from clothgym.crumpling import MANOEUVRES
+from clothgym.starts import MANOEUVRES
 
 
 def test_a_restored_state_goes_on_to_the_bit(tmp_path):
@@ -18,7 +18,7 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     first = made.simulation
     assert first.self_contacts.rows.min() > 10
     state = first.get_state()
-    assert not state.contact_ties[state.contact_ties[:, :, 1] == 4][:, 7:].any()
+    assert not state.contact_members[state.contact_members[:, :, 1] == 4][:, 7:].any()
     state.save(tmp_path / "state.npz")
     first.step(20)
     other = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
@@ -31,8 +31,8 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     ("name", "spoil", "message"),
     [
         ("contact_particles", lambda a: a + 169, "name particles beyond the 169"),
-        ("contact_ties", lambda a: np.where(np.arange(11) == 1, 9, a), "more vertices than a pair has"),
-        ("contact_figures", lambda a: a[:, :1], r"contact_figures has shape \(1, 1, 8\)"),
+        ("contact_members", lambda a: np.where(np.arange(11) == 1, 9, a), "more vertices than a pair has"),
+        ("contact_coefficients", lambda a: a[:, :1], r"contact_coefficients has shape \(1, 1, 8\)"),
         ("contact_impulses", lambda a: np.tile(a, (1, 999, 1)), "contact_impulses has shape"),
         ("contact_count", lambda a: a + 1000, "contact_particles has shape"),
         ("contact_count", lambda a: a + 0.5, "contact_count is no array of int32"),

@@ -1,15 +1,43 @@
-"""Floor 4: what the cloth touches, solids and itself, and what happens there."""
+"""Floor 4: what the cloth touches, solids and itself.
 
-from clothgym.collisions.blocking import keep_out, stop_at_solids
-from clothgym.collisions.distance import DESK
-from clothgym.collisions.intersections import count_intersections
-from clothgym.collisions.mesh_collider import MeshCollider
-from clothgym.collisions.response import Contacts
-from clothgym.collisions.self_contact import SelfCollision, SelfContacts
-from clothgym.collisions.shapes import ROWS, Box, Capsule, Collider, Plane, Sphere
-from clothgym.collisions.solids import Solids
+The contact work of one substep, in the order of the main loop (``clothgym/simulation.py``):
+
+1. ``press`` (``self/step.py``): contacts of the sheet with itself press as at the end of the substep before.
+2. ``resolve`` (``solids/particle_contact.py``, for a grid ``solids/grid_contact.py``): solids move on and push out what is in them:
+   every particle, and with ``contact="sheet"`` the points between particles, too (``solids/triangle_contact.py``).  One contact
+   takes the inward velocity and Coulomb friction (``solids/contact_law.py``).
+3. ``keep_apart`` (``self/step.py``): impulses between what is closer than the cloth's thickness (``self/impulses.py``), then the
+   displacement bounds (``self/displacement_bounds.py``).  A vertex beyond its bound causes a query: which pairs are close
+   (``self/broad_phase.py``), and how far each vertex may go from here (``self/narrow_phase.py``).
+
+Once a control step anchors and grippers are stopped at solids (``solids/attachment_contact.py``).
+
+The guarantee of ``self_collision="strict"``: a sheet that starts without intersections has none at the end of any substep.  It
+holds for whatever the forces, the strain limiter, the solids and the grippers do; in float32 within 16 m of the origin.  A least
+thickness is not promised, nor that a start with intersections is untangled.
+"""
+
+from clothgym.collisions.self.owner import SelfCollision, SelfContacts
+from clothgym.collisions.solids.attachment_contact import keep_out, stop_at_solids
+from clothgym.collisions.solids.mesh_collider import MeshCollider
+from clothgym.collisions.solids.owner import Solids
+from clothgym.collisions.solids.particle_contact import Contacts
+from clothgym.collisions.solids.shapes import COLLIDER_ROWS, Box, Capsule, Collider, Plane, Sphere
+from clothgym.collisions.solids.signed_distance import SCRATCH_ROWS
 
 __all__ = [
-    "DESK", "ROWS", "Box", "Capsule", "Collider", "Contacts", "MeshCollider", "Plane", "SelfCollision", "SelfContacts", "Solids",
-    "Sphere", "count_intersections", "keep_out", "stop_at_solids",
+    "COLLIDER_ROWS",
+    "SCRATCH_ROWS",
+    "Box",
+    "Capsule",
+    "Collider",
+    "Contacts",
+    "MeshCollider",
+    "Plane",
+    "SelfCollision",
+    "SelfContacts",
+    "Solids",
+    "Sphere",
+    "keep_out",
+    "stop_at_solids",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices, vector
-from clothgym.collisions.shapes import FRICTION
+from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.envs.episode import within_ball
 from clothgym.envs.task import HELD
 from clothgym.material import PRESETS
@@ -287,7 +287,7 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
         gust=0.0 if wind is None else float(wind.gust),
         fabric=next(name for name, preset in PRESETS.items() if preset.source == material.source),
         **{name: getattr(material, name) for name in SLIDERS},
-        friction=round(float(state.colliders[0, 0, FRICTION]), 6) if simulation.colliders else 0.4,
+        friction=round(float(state.colliders[0, 0, R_FRICTION]), 6) if simulation.colliders else 0.4,
         integrator=simulation.integrator.name,
         bending=simulation.bending.name,
         strain_limit=simulation.strain_limit,

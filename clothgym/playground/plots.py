@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from clothgym.compare_pictures import INK
+from clothgym.lab.compare_pictures import INK
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.show import own_colour
 from clothgym.render.shading import CORAL

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.compare_pictures import COLOURS
+from clothgym.lab.compare_pictures import COLOURS
 from clothgym.mesh import EDGE, STRUCTURAL_X
 from clothgym.playground.recording import Frame, Recording, strains, tensions, threads
 from clothgym.playground.stage import UNLIMITED, Hand

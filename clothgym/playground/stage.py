@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym import integrators
 from clothgym.checks import indices, vector
-from clothgym.collisions.shapes import FRICTION
-from clothgym.compare import BURST
+from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.guards import refusal
+from clothgym.lab.compare import BURST
 from clothgym.parameters import FIGURES, of_material
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.scenes import scene_named
@@ -398,7 +398,7 @@ def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> s
         simulation.set_parameters(warn=False, **figures)
     if after.friction != before.friction:
         state = simulation.get_state()
-        state.colliders[:, :, FRICTION] = state.collider_homes[:, :, FRICTION] = after.friction
+        state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction
         simulation.set_state(state)
     if after.substeps != "auto":
         simulation.substeps = after.substeps
@@ -421,7 +421,7 @@ def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Si
     state = new.get_state()
     for name in ("holder", "hand_positions", "hand_targets", "colliders", "collider_homes", "steps", "diverged"):
         setattr(state, name, getattr(old, name))
-    state.colliders[:, :, FRICTION] = state.collider_homes[:, :, FRICTION] = settings.friction
+    state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = settings.friction
     new.set_state(state)
     new.set_wind(old.wind)
     return new

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.collisions.shapes import UNTURNED, Quaternion, turned
+from clothgym.collisions.solids.shapes import UNTURNED, Quaternion, turned
 
 KINDS = {"sphere": ("radius",), "box": ("half_sides",), "capsule": ("radius", "height"), "mesh": ("vertices", "triangles")}
 WARM_GREY = (196, 189, 178)

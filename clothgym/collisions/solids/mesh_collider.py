@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import count, finite, not_negative, positive, vector
-from clothgym.collisions.closed import checked_solid
-from clothgym.collisions.distance_grid import DistanceGrid, distance_grid
-from clothgym.collisions.shapes import AXES, HALF, MESH, POINT, UNTURNED, Collider, Quaternion, Vector, turned
+from clothgym.collisions.solids.distance_grid import DistanceGrid, distance_grid
+from clothgym.collisions.solids.shapes import KIND_MESH, R_AXES, R_HALF, R_POINT, UNTURNED, Collider, Quaternion, Vector, turned
+from clothgym.geometry.closed_mesh import checked_solid
 from clothgym.triangles import read_triangles
 
 
@@ -39,7 +39,7 @@ class MeshCollider(Collider):
         ValueError: what ``Collider`` refuses, neither or both of path and arrays, or no closed surface (see ``checked_solid``).
     """
 
-    kind: ClassVar[int] = MESH
+    kind: ClassVar[int] = KIND_MESH
     path: str | Path | None = None
     vertices: ArrayLike | None = None
     triangles: ArrayLike | None = None
@@ -104,9 +104,9 @@ class MeshCollider(Collider):
         return isinstance(other, MeshCollider) and other.grid is self.grid
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        rows[POINT : POINT + 3] = self.center
-        rows[AXES : AXES + 9] = turned("rotation", self.rotation).ravel()
-        rows[HALF : HALF + 3] = np.abs(self.surface[0]).max(axis=0)
+        rows[R_POINT : R_POINT + 3] = self.center
+        rows[R_AXES : R_AXES + 9] = turned("rotation", self.rotation).ravel()
+        rows[R_HALF : R_HALF + 3] = np.abs(self.surface[0]).max(axis=0)
 
 
 class _Bytes:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from clothgym.bench_table import beat
-from clothgym.crumpling import EdgeDrop
+from clothgym.lab.bench_table import beat
 from clothgym.material import Material
 from clothgym.mesh import grid
+from clothgym.starts import EdgeDrop
 
 FRAME, ROWS, SIDE, SECONDS, DROP, THIN = 1 / 60, 25, 0.5, 2.0, 0.05, 0.004
 COTTON = Material.preset("cotton")

@@ -22,8 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym._jit import apart, kernel
 from clothgym.checks import finite
-from clothgym.collisions import exact
-from clothgym.collisions.exact import UNSURE
+from clothgym.geometry import exact_predicates
+from clothgym.geometry.exact_predicates import UNSURE
 
 # rounding errors, as shares of what is summed: of orientations (7 units of 2^-53 would do), of the difference of two projections,
 # of the product of two normals; and what underflow may add to them
@@ -56,7 +56,7 @@ def find_intersections(triangles: ArrayLike, positions: ArrayLike) -> NDArray[np
     intersecting = pairs[:, 3] == 1
     for row in np.flatnonzero(pairs[:, 3] == UNSURE):
         env, first, second = pairs[row, :3].tolist()
-        intersecting[row] = exact.intersecting(corners[first].tolist(), corners[second].tolist(), x[env])
+        intersecting[row] = exact_predicates.intersecting(corners[first].tolist(), corners[second].tolist(), x[env])
     pairs = pairs[intersecting, :3]
     return pairs[np.lexsort(pairs.T[::-1])]
 

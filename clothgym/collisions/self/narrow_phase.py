@@ -10,9 +10,10 @@ the largest ``n.b`` of the other is a lower bound of the distance for any n at a
 being right.  (Closest points of slivers in float32 overestimate by half a millimetre.)
 
 Where layers touch, their distance is small, and bounds that are a share of it would call for a query with every step that
-they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are tied: once one of their vertices has left its
-bound, their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits, follows from
-the other pairs alone.  So each pair is certified in every state: by the bounds of its vertices, or by their limits, or by its tie.
+they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are constrained: once one of their vertices has
+left its bound, their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits,
+follows from the other pairs alone.  So each pair is certified in every state: by the bounds of its vertices, or by their limits, or
+by its constraint.
 
 Per-vertex bounds instead of continuous collision detection: Chen, Hsu, Liu, Macklin, Yang and Yuksel, Offset Geometric
 Contact, ACM Transactions on Graphics 44(4), 2025.
@@ -23,25 +24,35 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.candidates import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
-from clothgym.collisions.closest import closest_on_segments, closest_on_triangle, segments_apart
+from clothgym.collisions.self.broad_phase import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
+from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle, segments_apart
 
 LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
-LOOSE = 0.8  # of the reach below which pairs are tied
+LOOSE = 0.8  # of the reach below which pairs are constrained
 SHARE = 0.45  # of a pair's distance that each side may use; below a half
 SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
-# what is told of each environment, see ``self_contact.SelfContacts``
-ROWS, TOUCHING, CLAMPED, QUERIES, DROPPED, GAP, LAG, UNCERTAIN = 0, 1, 2, 3, 4, 5, 6, 7
-REPORT = 8
+# what is told of each environment, see ``owner.SelfContacts``
+REPORT_CONTACTS, REPORT_TOUCHING, REPORT_CLAMPED, REPORT_QUERIES, REPORT_DROPPED, REPORT_GAP, REPORT_LAG, REPORT_UNCERTAIN = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+)
+REPORT_SIZE = 8
 # what is kept of a contact beside its four particles, (room, 4): the gap is n.(sum of weights times positions), with n a unit
 # vector from the second primitive to the first; the thickness is the gap at which it acts [m]
-NORMAL, THICKNESS = 4, 7  # after the weights
-FIGURES = 8
-# of a tight pair: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
-KEPT = 3
-# and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or JAMMED, and the vertices, (room, TIE)
-OWN, NUMBER, GROUP, VERTICES, TIE = 0, 1, 2, 3, 11
-JAMMED = -2
+C_NORMAL, C_THICKNESS = 4, 7  # after the weights
+C_SIZE = 8
+# of a gap constraint: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
+G_KEPT = 3
+# and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or GROUP_JAMMED, and the vertices,
+# (room, G_SIZE)
+G_OWN, G_NUMBER, G_GROUP, G_VERTICES, G_SIZE = 0, 1, 2, 3, 11
+GROUP_JAMMED = -2
 MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
 
 
@@ -71,36 +82,41 @@ def gap_of_edges(p, i, j, k, l):
 
 
 @inlined
-def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, figures):
+def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, coefficients):
     """Write a contact down."""
     particles[count, 0], particles[count, 1], particles[count, 2], particles[count, 3] = i, j, k, l
-    figures[count, 0], figures[count, 1], figures[count, 2], figures[count, 3] = wi, wj, wk, wl
-    figures[count, NORMAL], figures[count, NORMAL + 1], figures[count, NORMAL + 2] = nx, ny, nz
-    figures[count, THICKNESS] = thickness
+    coefficients[count, 0], coefficients[count, 1], coefficients[count, 2], coefficients[count, 3] = wi, wj, wk, wl
+    coefficients[count, C_NORMAL], coefficients[count, C_NORMAL + 1], coefficients[count, C_NORMAL + 2] = nx, ny, nz
+    coefficients[count, C_THICKNESS] = thickness
 
 
 @kernel
 def distance_to_keep(gap, held, stop, standoff):
-    """What a tied pair may come no closer than; a direction along which it is not apart certifies nothing: it stays as it is."""
+    """Distance that a gap constraint keeps [m]; a direction along which it is not apart certifies nothing: it stays as it is."""
     return min(gap, standoff if held else stop) if gap > 0.0 else np.inf
 
 
 @inlined
-def tie(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, tight, ties, planes):
+def constrain(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, constraints, members, planes):
     """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
     direction, or than ``standoff`` if a hand holds any."""
-    ties[tight, OWN], ties[tight, NUMBER], ties[tight, GROUP] = own, 4, group
-    ties[tight, VERTICES], ties[tight, VERTICES + 1], ties[tight, VERTICES + 2], ties[tight, VERTICES + 3] = i, j, k, l
+    members[constraints, G_OWN], members[constraints, G_NUMBER], members[constraints, G_GROUP] = own, 4, group
+    (
+        members[constraints, G_VERTICES],
+        members[constraints, G_VERTICES + 1],
+        members[constraints, G_VERTICES + 2],
+        members[constraints, G_VERTICES + 3],
+    ) = i, j, k, l
     keep = distance_to_keep(gap, held[i] | held[j] | held[k] | held[l], stop, standoff)
-    planes[tight, 0], planes[tight, 1], planes[tight, 2], planes[tight, KEPT] = nx, ny, nz, keep
+    planes[constraints, 0], planes[constraints, 1], planes[constraints, 2], planes[constraints, G_KEPT] = nx, ny, nz, keep
 
 
 @inlined
 def set_free(i, j, k, l, certified, left, loose, extra, free):
-    """Lower the room that a pair which is not tied leaves its four vertices.
+    """Lower the room that a pair which is not constrained leaves its four vertices.
 
-    left: of its certified distance, after what its vertices have beyond their shares.  Where there was no room to tie a pair that
-    is too close for that, they have nothing.
+    left: of its certified distance, after what its vertices have beyond their shares.  Where there was no room to constrain a pair
+    that is too close for that, they have nothing.
     """
     for v in (i, j, k, l):
         free[v] = min(free[v], left if left >= loose else certified - 2.0 * extra[v])
@@ -109,15 +125,15 @@ def set_free(i, j, k, l, certified, left, loose, extra, free):
 @apart
 def vertex_contacts(
     p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, kept, margin, loose, stop,
-    standoff, held, room, free, closest, count, particles, figures, tight, ties, planes, report,
+    standoff, held, room, free, closest, count, particles, coefficients, constraints, members, planes, report,
 ):  # fmt: skip
     """Certify vertices and triangles, lower the room of their vertices, and write the contacts down.  Returns the
-    numbers of contacts and of tight pairs.
+    numbers of contacts and of gap constraints.
 
     extra: how much farther than ``reach`` is looked for each vertex, and how much more than its share it may go [m], (particles,).
-    Pairs closer than ``loose``, and what their vertices have of that, are tied, as far as there is room; ``free`` is the room that
-    the others leave.  kept: the least thickness of a contact: one that is closer than ``thickness`` is pushed apart only so far,
-    and beyond it only kept from coming closer.
+    Pairs closer than ``loose``, and what their vertices have of that, are constrained, as far as there is room; ``free`` is the
+    room that the others leave.  kept: the least thickness of a contact: one that is closer than ``thickness`` is pushed apart only
+    so far, and beyond it only kept from coming closer.
 
     One contact for each closest feature: a face's inside, or a border that this triangle stands for; of two vertices, which meet
     twice, the one of the lower number has it.  closest: becomes the smallest distance
@@ -139,12 +155,12 @@ def vertex_contacts(
         )  # fmt: skip
         group = candidates[m, 2]
         left = certified - more
-        if left < loose and tight < ties.shape[0]:
-            tie(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
-            tight += 1
+        if left < loose and constraints < members.shape[0]:
+            constrain(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, constraints, members, planes)
+            constraints += 1
         else:
             set_free(v, i, j, k, certified, left, loose, extra, free)
-            report[DROPPED] += left < loose
+            report[REPORT_DROPPED] += left < loose
         if certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
         if certified <= 0.0 or certified > thickness + margin:
@@ -167,17 +183,17 @@ def vertex_contacts(
             continue
         if count < particles.shape[0]:
             own = min(thickness, max(kept, certified / (1.0 - SLOP)))
-            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, own, count, particles, figures)
+            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, own, count, particles, coefficients)
             count += 1
         else:
-            report[DROPPED] += 1
-    return count, tight
+            report[REPORT_DROPPED] += 1
+    return count, constraints
 
 
 @apart
 def edge_contacts(
     p, candidates, edges, ridges, reach, extra, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles,
-    figures, tight, ties, planes, report,
+    coefficients, constraints, members, planes, report,
 ):  # fmt: skip
     """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same.
 
@@ -204,29 +220,29 @@ def edge_contacts(
             min(room[i], certified), min(room[j], certified), min(room[k], certified), min(room[l], certified)
         )  # fmt: skip
         left = certified - more
-        if left < loose and tight < ties.shape[0]:
-            tie(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, tight, ties, planes)
-            tight += 1
+        if left < loose and constraints < members.shape[0]:
+            constrain(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, constraints, members, planes)
+            constraints += 1
         else:
             set_free(i, j, k, l, certified, left, loose, extra, free)
-            report[DROPPED] += left < loose
+            report[REPORT_DROPPED] += left < loose
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
             if count < particles.shape[0]:
                 own = min(thickness, max(kept, certified / (1.0 - SLOP)))
-                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, own, count, particles, figures)
+                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, own, count, particles, coefficients)
                 count += 1
             else:
-                report[DROPPED] += 1
-    return count, tight
+                report[REPORT_DROPPED] += 1
+    return count, constraints
 
 
 @apart
-def tie_layers(
-    p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, tight, ties, planes, report
+def constrain_layers(
+    p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, constraints, members, planes, report
 ):
     """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
-    triangles.  Returns the number of tied pairs.
+    triangles.  Returns the number of gap constraints.
 
     gaps: what planes of the leaves show [m], and their normals; the plane across the closest vertex' way may show more.
     layered: becomes which they are.
@@ -245,12 +261,12 @@ def tie_layers(
                     closest[pair, 3],
                 )
     kept = 0
-    for t in range(tight):
-        if ties[t, GROUP] >= 0 and layered[ties[t, GROUP]]:
+    for t in range(constraints):
+        if members[t, G_GROUP] >= 0 and layered[members[t, G_GROUP]]:
             continue
         if kept < t:
-            for c in range(TIE):
-                ties[kept, c] = ties[t, c]
+            for c in range(G_SIZE):
+                members[kept, c] = members[t, c]
             for c in range(4):
                 planes[kept, c] = planes[t, c]
         kept += 1
@@ -262,37 +278,37 @@ def tie_layers(
         for m in range(4):
             own, others = max(own, extra[corners[leaf, m]]), max(others, extra[corners[other, m]])
         left = gap - own - others
-        tied = left < loose and kept < ties.shape[0]
-        report[DROPPED] += left < loose and not tied
+        constrained = left < loose and kept < members.shape[0]
+        report[REPORT_DROPPED] += left < loose and not constrained
         some = False
         for m in range(4):
             for v in (corners[leaf, m], corners[other, m]):
                 room[v] = min(room[v], gap)
                 some |= held[v]
-                if not tied:
+                if not constrained:
                     free[v] = min(free[v], left if left >= loose else gap - 2.0 * extra[v])
-        if tied:
+        if constrained:
             nx, ny, nz = gaps[pair, 1], gaps[pair, 2], gaps[pair, 3]
             # the direction is from the second leaf to the first
             way = along(p, corners[leaf, 0], nx, ny, nz) - along(p, corners[other, 0], nx, ny, nz)
             sign = 1.0 if way > 0.0 else -1.0
-            ties[kept, OWN], ties[kept, NUMBER], ties[kept, GROUP] = 4, 8, -1
+            members[kept, G_OWN], members[kept, G_NUMBER], members[kept, G_GROUP] = 4, 8, -1
             for m in range(4):
-                ties[kept, VERTICES + m], ties[kept, VERTICES + 4 + m] = corners[leaf, m], corners[other, m]
+                members[kept, G_VERTICES + m], members[kept, G_VERTICES + 4 + m] = corners[leaf, m], corners[other, m]
             planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
-            planes[kept, KEPT] = min(gap, standoff if some else stop)
+            planes[kept, G_KEPT] = min(gap, standoff if some else stop)
             kept += 1
     return kept
 
 
 @inlined
-def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties, planes, report):
-    """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``figures``, and of
-    tied pairs, which are in ``ties`` and ``planes``.
+def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients, members, planes, report):
+    """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``coefficients``, and
+    of gap constraints, which are in ``members`` and ``planes``.
 
     p: positions in float64 [m], (particles, 3).  extra: how much farther than the reach is looked for each vertex [m],
-    (particles,).  held: particles that hands hold, (particles,).  bounds: becomes how far each vertex may go before a tied pair
-    must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT,).
+    (particles,).  held: particles that hands hold, (particles,).  bounds: becomes how far each vertex may go before a gap
+    constraint must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT_SIZE,).
     """
     triangles, edges, triangle_edges = pairs.triangles, pairs.edges, pairs.triangle_edges
     vertex_owner, edge_owner = pairs.vertex_owner, pairs.edge_owner
@@ -309,32 +325,32 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
     closest[0, 0] = near
     # a literal would have a type, and so a version of the kernel, of its own
     none = np.int64(0)
-    count, tight = vertex_contacts(
+    count, constraints = vertex_contacts(
         p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, loose, stop, standoff,
-        held, bounds, limits, closest, none, particles, figures, none, ties, planes, report,
+        held, bounds, limits, closest, none, particles, coefficients, none, members, planes, report,
     )  # fmt: skip
     # these belong to no pair of leaves
-    ties[:tight, GROUP] = -1
-    count, tight = edge_contacts(
+    members[:constraints, G_GROUP] = -1
+    count, constraints = edge_contacts(
         p, sides, edges, ridges, near, extra, thin, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
-        figures, tight, ties, planes, report,
+        coefficients, constraints, members, planes, report,
     )  # fmt: skip
     leaves, gaps, corners = far_pairs(p, pairs, far, extra, faces)
     closest = np.zeros((leaves.shape[0], 4))
     closest[:, 0] = far
-    count, tight = vertex_contacts(
+    count, constraints = vertex_contacts(
         p, corners, triangles, triangle_edges, vertex_owner, edge_owner, far, extra, thick, thick, margin, loose, stop, standoff,
-        held, bounds, limits, closest, count, particles, figures, tight, ties, planes, report,
+        held, bounds, limits, closest, count, particles, coefficients, constraints, members, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
-    tight = tie_layers(
-        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, tight, ties, planes,
-        report,
+    constraints = constrain_layers(
+        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, constraints, members,
+        planes, report,
     )  # fmt: skip
     sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
-    count, tight = edge_contacts(
+    count, constraints = edge_contacts(
         p, sides, edges, ridges, far, extra, thick, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
-        figures, tight, ties, planes, report,
+        coefficients, constraints, members, planes, report,
     )  # fmt: skip
     least = unlisted
     for v in range(p.shape[0]):
@@ -342,5 +358,5 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, figures, ties
         bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
         limits[v] = SHARE * max(limits[v] - MARGIN + 2.0 * extra[v], 0.0)
     if least < unlisted:
-        report[GAP] = min(report[GAP], max(least, 0.0))
-    return count, tight
+        report[REPORT_GAP] = min(report[REPORT_GAP], max(least, 0.0))
+    return count, constraints

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from clothgym.mesh import ClothMesh
 
-LEAVES = 8  # in a node that is not halved any more, but for the last one: a vector of float64
-BEGIN, END, NEXT = 0, 1, 2  # of a node: its leaves, and where the tree goes on after all that is in it
+NODE_LEAVES = 8  # in a node that is not halved any more, but for the last one: a vector of float64
+NODE_BEGIN, NODE_END, NODE_NEXT = 0, 1, 2  # of a node: its leaves, and where the tree goes on after all that is in it
 SAMPLES = 16  # vertices whose mean displacement stands for that of the sheet
 
 Int = NDArray[np.int32]
@@ -40,10 +40,10 @@ class Pairs(NamedTuple):
     vertex_owner, edge_owner: the triangle that stands for each in contacts with a triangle's border, (particles,), (edges,).
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
-    nodes: of the tree, each before its halves, the first of which follows it: see ``BEGIN``, (nodes, 3).
+    nodes: of the tree, each before its halves, the first of which follows it: see ``NODE_BEGIN``, (nodes, 3).
     beside: where the nodes that hold leaves beside those of each node that is not halved begin, itself and some after it,
     (nodes + 1,); ``beside_nodes`` says which, and ``beside_leaves`` which pairs of theirs are none to search: a leaf k of the first
-    and m of the second, which share a vertex or come in this order elsewhere, are bit ``LEAVES * k + m``.
+    and m of the second, which share a vertex or come in this order elsewhere, are bit ``NODE_LEAVES * k + m``.
     partners: where near pairs of vertices of each first begin, (particles + 1,); partner: the second, and slack: of the primitive
     pairs they are in, at rest [m^2], (near,).
     near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
@@ -181,11 +181,11 @@ def _compact(centres: NDArray) -> tuple[list[int], list[list[int]]]:
     def halve(part: NDArray) -> None:
         begin, node = len(order), len(nodes)
         nodes.append([])
-        if len(part) <= LEAVES:
+        if len(part) <= NODE_LEAVES:
             order.extend(part.tolist())
         else:
             along = part[np.argsort(centres[part, np.ptp(centres[part], axis=0).argmax()], kind="stable")]
-            half = -(-len(part) // (2 * LEAVES)) * LEAVES
+            half = -(-len(part) // (2 * NODE_LEAVES)) * NODE_LEAVES
             halve(along[:half])
             halve(along[half:])
         nodes[node] = [begin, len(order), len(nodes)]
@@ -196,15 +196,15 @@ def _compact(centres: NDArray) -> tuple[list[int], list[list[int]]]:
 
 def _beside(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
     """Pairs of leaves that are not searched, by the nodes that hold them: see ``Pairs.beside``."""
-    whole = np.flatnonzero(nodes[:, NEXT] == np.arange(len(nodes)) + 1).tolist()
-    node_of = {leaf: k for k in whole for leaf in range(nodes[k, BEGIN], nodes[k, END])}
+    whole = np.flatnonzero(nodes[:, NODE_NEXT] == np.arange(len(nodes)) + 1).tolist()
+    node_of = {leaf: k for k in whole for leaf in range(nodes[k, NODE_BEGIN], nodes[k, NODE_END])}
     counts, others, bits = np.zeros(len(nodes), np.int64), [], []
     for node in whole:
-        begin, end = nodes[node, [BEGIN, END]].tolist()
+        begin, end = nodes[node, [NODE_BEGIN, NODE_END]].tolist()
         found = {node: 0}
         for leaf in range(begin, end):
             for other in {*range(begin, leaf + 1), *(other for other in beside[leaf] if other > leaf)}:
-                bit = LEAVES * (leaf - begin) + other - int(nodes[node_of[other], BEGIN])
+                bit = NODE_LEAVES * (leaf - begin) + other - int(nodes[node_of[other], NODE_BEGIN])
                 found[node_of[other]] = found.get(node_of[other], 0) | 1 << bit
         counts[node] = len(found)
         others += sorted(found)

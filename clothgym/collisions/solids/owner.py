@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import vectors
-from clothgym.collisions.distance import Shapes
-from clothgym.collisions.mesh_collider import MeshCollider
-from clothgym.collisions.penetration import deepest
-from clothgym.collisions.response import Contacts, contacts
-from clothgym.collisions.shapes import AFTER, POINT, ROWS, VELOCITY, Collider, check_index, check_replacement
+from clothgym.collisions.solids.mesh_collider import MeshCollider
+from clothgym.collisions.solids.particle_contact import Contacts, contacts
+from clothgym.collisions.solids.penetration import deepest
+from clothgym.collisions.solids.shapes import COLLIDER_ROWS, R_AFTER, R_POINT, R_VELOCITY, Collider, check_index, check_replacement
+from clothgym.collisions.solids.signed_distance import Shapes
 from clothgym.elements import SurfaceArrays
 from clothgym.state import Layout, State
 
@@ -23,7 +23,7 @@ class Solids:
     Attributes:
         colliders: as they were given.
         shapes: what all environments share.
-        rows, homes: what the kernels know of each now, and at a reset, (block, colliders, ROWS, lane).
+        rows, homes: what the kernels know of each now, and at a reset, (block, colliders, COLLIDER_ROWS, lane).
     """
 
     def __init__(self, layout: Layout, colliders: Sequence[Collider], time_step: float, dtype: np.dtype) -> None:
@@ -33,8 +33,8 @@ class Solids:
         self.homes: NDArray
 
     def described(self) -> NDArray[np.float64]:
-        """The rows of the colliders as they were given, (colliders, ROWS)."""
-        return np.array([c.rows() for c in self.colliders]).reshape(-1, ROWS)
+        """The rows of the colliders as they were given, (colliders, COLLIDER_ROWS)."""
+        return np.array([c.rows() for c in self.colliders]).reshape(-1, COLLIDER_ROWS)
 
     def restore(self, state: State) -> None:
         """Take over a state's part."""
@@ -64,17 +64,17 @@ class Solids:
         now = after
         if targets is not None:
             x = vectors("targets", targets, len(env))
-            now = (x - self.rows[block, index, POINT : POINT + 3, lane]) / self.time_step
-        self.rows[block, index, VELOCITY : VELOCITY + 3, lane] = now
-        self.rows[block, index, AFTER : AFTER + 3, lane] = after
+            now = (x - self.rows[block, index, R_POINT : R_POINT + 3, lane]) / self.time_step
+        self.rows[block, index, R_VELOCITY : R_VELOCITY + 3, lane] = now
+        self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 
     def end_step(self) -> None:
         """What was on its way to a target has arrived, and goes on as it was told."""
-        self.rows[:, :, VELOCITY : VELOCITY + 3] = self.rows[:, :, AFTER : AFTER + 3]
+        self.rows[:, :, R_VELOCITY : R_VELOCITY + 3] = self.rows[:, :, R_AFTER : R_AFTER + 3]
 
     def positions(self) -> NDArray:
         """Where each is [m]: the centre, or a plane's point, (num_envs, colliders, 3)."""
-        return self.layout.to_public(self.rows[:, :, POINT : POINT + 3])
+        return self.layout.to_public(self.rows[:, :, R_POINT : R_POINT + 3])
 
     def contacts(self, x: NDArray) -> Contacts:
         """Signed distance of each particle to the nearest collider [m], and which it is; x in blocks."""

@@ -1,7 +1,7 @@
 """Contact of sheets with solids: no penetration, no inward velocity, Coulomb friction (see ``contact_law``).
 
 Applied after each substep to the positions and velocities that the integrator left, of the particles and of the sheet between them
-(``surface``).  For one sheet whose particles lie side by side the same is in ``sheet_response``.
+(``triangle_contact``).  For one sheet whose particles lie side by side the same is in ``grid_contact``.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel, specialize
-from clothgym.collisions.contact_law import TINY, contact_change
-from clothgym.collisions.distance import (
-    CONTACT,
-    DESK,
-    MOTION,
-    SPOT,
-    YIELDING,
+from clothgym.collisions.solids.contact_law import TINY, contact_change
+from clothgym.collisions.solids.grid_contact import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
+from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_POINT, R_VELOCITY
+from clothgym.collisions.solids.signed_distance import (
+    S_CONTACT,
+    S_MOTION,
+    S_SPOT,
+    S_YIELDING,
+    SCRATCH_ROWS,
     Shapes,
     lay_out,
     may_touch_plane,
@@ -30,52 +32,50 @@ from clothgym.collisions.distance import (
     normal_to_world,
     to_axes,
 )
-from clothgym.collisions.shapes import FRICTION, PLANE, POINT, ROUNDED_BOX, VELOCITY
-from clothgym.collisions.sheet_response import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
-from clothgym.collisions.surface import any_near, find_touches, press, room_for_touches
+from clothgym.collisions.solids.triangle_contact import any_near, find_touches, press_touches, room_for_touches
 from clothgym.state import Layout
 
 
 @inlined
-def _push_out(x, v, w, p, carried, desk):
-    """Correct the position and velocity of particle ``p``, for the contact on the desk."""
+def _push_particle_out(x, v, w, p, carried, scratch):
+    """Correct the position and velocity of particle ``p``, for the contact on the scratch."""
     zero = x.dtype.type(0)
     one = x.dtype.type(1)
     tiny = x.dtype.type(TINY)
     for c in range(3):
         for l in range(x.shape[2]):
-            desk[MOTION + c, l] = v[c, p, l]
+            scratch[S_MOTION + c, l] = v[c, p, l]
     for l in range(x.shape[2]):
-        desk[YIELDING, l] = w[p, l]
+        scratch[S_YIELDING, l] = w[p, l]
     for l in range(x.shape[2]):
-        nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
-        ux = desk[MOTION, l] - desk[VELOCITY, l]
-        uy = desk[MOTION + 1, l] - desk[VELOCITY + 1, l]
-        uz = desk[MOTION + 2, l] - desk[VELOCITY + 2, l]
+        nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
+        ux = scratch[S_MOTION, l] - scratch[R_VELOCITY, l]
+        uy = scratch[S_MOTION + 1, l] - scratch[R_VELOCITY + 1, l]
+        uz = scratch[S_MOTION + 2, l] - scratch[R_VELOCITY + 2, l]
         mx, my, mz, cx, cy, cz = contact_change(
-            desk[CONTACT, l], nx, ny, nz, ux, uy, uz, desk[YIELDING, l], desk[FRICTION, l], carried, zero, one, tiny
+            scratch[S_CONTACT, l], nx, ny, nz, ux, uy, uz, scratch[S_YIELDING, l], scratch[R_FRICTION, l], carried, zero, one, tiny
         )
-        desk[SPOT, l] = mx
-        desk[SPOT + 1, l] = my
-        desk[SPOT + 2, l] = mz
-        desk[MOTION, l] = cx
-        desk[MOTION + 1, l] = cy
-        desk[MOTION + 2, l] = cz
+        scratch[S_SPOT, l] = mx
+        scratch[S_SPOT + 1, l] = my
+        scratch[S_SPOT + 2, l] = mz
+        scratch[S_MOTION, l] = cx
+        scratch[S_MOTION + 1, l] = cy
+        scratch[S_MOTION + 2, l] = cz
     for c in range(3):
         for l in range(x.shape[2]):
-            x[c, p, l] += desk[SPOT + c, l]
+            x[c, p, l] += scratch[S_SPOT + c, l]
         for l in range(x.shape[2]):
-            v[c, p, l] += desk[MOTION + c, l]
+            v[c, p, l] += scratch[S_MOTION + c, l]
 
 
-def _resolve_solid(x, v, w, collider, shapes, k, carried, desk):
-    """Resolve the contacts of one block's particles with the solid on the desk."""
+def _resolve_solid(x, v, w, collider, shapes, k, carried, scratch):
+    """Resolve the contacts of one block's particles with the solid on the scratch."""
     for p in range(x.shape[1]):
         if may_touch(x, p, collider):  # noqa: F821
-            to_axes(x, p, desk, SPOT)
-            measure_solid(desk, SPOT, shapes, k, x.dtype.type(0))  # noqa: F821
-            normal_to_world(desk)
-            _push_out(x, v, w, p, carried, desk)
+            to_axes(x, p, scratch, S_SPOT)
+            measure_solid(scratch, S_SPOT, shapes, k, x.dtype.type(0))  # noqa: F821
+            normal_to_world(scratch)
+            _push_particle_out(x, v, w, p, carried, scratch)
 
 
 # one for each family: a branch inside the loop costs a single environment as much as the contact itself
@@ -91,22 +91,23 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, r
     """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
     x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
-    ``shapes``, (colliders, ROWS, lanes); carried: how long the velocity that friction takes has moved the positions already [s];
+    ``shapes``, (colliders, COLLIDER_ROWS, lanes); carried: how long the velocity that friction takes has moved the positions
+    already [s];
     room: of ``room_in_lanes``.  The others are for ``resolve``.
     """
-    kinds, desk = shapes.kinds, room[1]
+    kinds, scratch = shapes.kinds, room[1]
     for k in range(kinds.shape[0]):
         collider = colliders[k]
         for c in range(3):
             for l in range(x.shape[2]):
-                collider[POINT + c, l] += h * collider[VELOCITY + c, l]
-        lay_out(collider, desk)
-        if kinds[k] == PLANE:
-            _resolve_plane(x, v, w, collider, shapes, k, carried, desk)
-        elif kinds[k] == ROUNDED_BOX:
-            _resolve_rounded_box(x, v, w, collider, shapes, k, carried, desk)
+                collider[R_POINT + c, l] += h * collider[R_VELOCITY + c, l]
+        lay_out(collider, scratch)
+        if kinds[k] == KIND_PLANE:
+            _resolve_plane(x, v, w, collider, shapes, k, carried, scratch)
+        elif kinds[k] == KIND_ROUNDED_BOX:
+            _resolve_rounded_box(x, v, w, collider, shapes, k, carried, scratch)
         else:
-            _resolve_mesh(x, v, w, collider, shapes, k, carried, desk)
+            _resolve_mesh(x, v, w, collider, shapes, k, carried, scratch)
 
 
 @apart
@@ -116,15 +117,15 @@ def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, room):
     triangles: of the sheet; look: whether to look anew where it touches between its particles.
     """
     resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room)
-    touches, desk = room
+    touches, scratch = room
     kinds = shapes.kinds
     if look:
         touches[2][0] = 0
         for k in range(kinds.shape[0]):
-            if kinds[k] != PLANE and any_near(x, colliders[k], desk):
-                lay_out(colliders[k], desk)
-                find_touches(x, triangles, shapes, k, touches, desk)
-    press(x, v, w, triangles, colliders, touches, h, carried, desk)
+            if kinds[k] != KIND_PLANE and any_near(x, colliders[k], scratch):
+                lay_out(colliders[k], scratch)
+                find_touches(x, triangles, shapes, k, touches, scratch)
+    press_touches(x, v, w, triangles, colliders, touches, h, carried, scratch)
 
 
 @kernel
@@ -134,8 +135,8 @@ def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, roo
 
 @kernel
 def room_in_lanes(x, triangles, shapes):
-    """Room for contact of one block, in lanes: touches, and a desk."""
-    return room_for_touches(x, triangles, shapes), np.empty((DESK, x.shape[2]), x.dtype)
+    """Room for contact of one block, in lanes: touches, and a scratch."""
+    return room_for_touches(x, triangles, shapes), np.empty((SCRATCH_ROWS, x.shape[2]), x.dtype)
 
 
 # the names that the main loop calls, for contact with the sheet, with its particles alone, and with nothing: in lanes, and for one
@@ -156,19 +157,19 @@ def needed(contact: str, kinds: NDArray) -> str:
     """The least of ``KERNELS`` that does for solids of these kinds: less is to be compiled.  A plane touches particles first."""
     if not len(kinds):
         return "nothing"
-    return contact if np.any(kinds != PLANE) else "particles"
+    return contact if np.any(kinds != KIND_PLANE) else "particles"
 
 
 @kernel
 def signed_distances(first, last, x, shapes, colliders, out):
     """Signed distance of every particle to every collider [m], (blocks, colliders, particles, lanes)."""
     for b in range(first, last):
-        desk = np.empty((DESK, x.shape[3]), x.dtype)
+        scratch = np.empty((SCRATCH_ROWS, x.shape[3]), x.dtype)
         for k in range(colliders.shape[1]):
-            lay_out(colliders[b, k], desk)
+            lay_out(colliders[b, k], scratch)
             for p in range(x.shape[2]):
-                measure_in_world(x[b], p, desk, shapes, k)
-                out[b, k, p] = desk[CONTACT]
+                measure_in_world(x[b], p, scratch, shapes, k)
+                out[b, k, p] = scratch[S_CONTACT]
 
 
 class Contacts(NamedTuple):

@@ -16,15 +16,15 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, disjoint, inlined, kernel
-from clothgym.collisions.proximity import NORMAL, SLOP, THICKNESS, TOUCHING
+from clothgym.collisions.self.narrow_phase import C_NORMAL, C_THICKNESS, REPORT_TOUCHING, SLOP
 
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
-SPAN = 4  # substeps between two sweeps over contacts that are calm; over others a sweep goes in each
-CALM = 0.005  # thicknesses by which a calm contact's correction moves it in the longest span, at most
+SPAN = 4  # substeps between two sweeps over contacts that have converged; over others a sweep goes in each
+TOLERANCE = 0.005  # thicknesses by which a converged contact's correction moves it in the longest span, at most
 CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act soon
 # velocity of approach that a contact takes in a substep, at most [m/s]: in a jam, which takes all motion away, what is kept from
 # substep to substep would grow for ever
-MOST = 10.0
+FASTEST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
 
 
@@ -82,26 +82,26 @@ def repel(x, v, w, sheet, block, h, carried):
 def _sweep(x, v, w, sheet, block, l, h, carried):
     """Sweep over one sheet's contacts; x, v: (3, particles), w: (particles,)."""
     memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]
-    particles, figures, impulses = memory.particles[block, l], memory.figures[block, l], memory.impulses[block, l]
+    particles, coefficients, impulses = memory.particles[block, l], memory.coefficients[block, l], memory.impulses[block, l]
     chosen = memory.chosen[block, l]
     if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-        memory.choices[block, l] = _choose(x, v, particles, figures, impulses, chosen, count, h)
+        memory.choices[block, l] = _choose(x, v, particles, coefficients, impulses, chosen, count, h)
         memory.aged[block, l] = 0
     choices = memory.choices[block, l]
     touching, most = _correct(
-        x, v, w, particles, figures, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
+        x, v, w, particles, coefficients, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
     )
-    _add_up(w, particles, figures, impulses, chosen, choices, memory.pressed[block, :, :, l])
-    memory.report[block, l, TOUCHING] = touching
+    _add_up(w, particles, coefficients, impulses, chosen, choices, memory.pressed[block, :, :, l])
+    memory.report[block, l, REPORT_TOUCHING] = touching
     memory.waited[block, l] = 0
-    memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.calm else 1
+    memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.tolerance else 1
 
 
 @inlined
-def _along(a, particles, figures, k, nx, ny, nz):
+def _along(a, particles, coefficients, k, nx, ny, nz):
     """n.(sum of weights times positions or velocities) of contact k."""
     i, j, m, n = particles[k, 0], particles[k, 1], particles[k, 2], particles[k, 3]
-    wi, wj, wm, wn = figures[k, 0], figures[k, 1], figures[k, 2], figures[k, 3]
+    wi, wj, wm, wn = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2], coefficients[k, 3]
     ax = wi * a[0, i] + wj * a[0, j] + wm * a[0, m] + wn * a[0, n]
     ay = wi * a[1, i] + wj * a[1, j] + wm * a[1, m] + wn * a[1, n]
     az = wi * a[2, i] + wj * a[2, j] + wm * a[2, m] + wn * a[2, n]
@@ -109,11 +109,11 @@ def _along(a, particles, figures, k, nx, ny, nz):
 
 
 @inlined
-def _push(x, v, w, particles, figures, k, jx, jy, jz, carried, qx, qy, qz):
+def _push(x, v, w, particles, coefficients, k, jx, jy, jz, carried, qx, qy, qz):
     """Add an impulse j [N s] to contact k's velocities, what of it has been carried on to its positions, and a push q to these."""
     for c in range(4):
         p = particles[k, c]
-        share = w[p] * figures[k, c]
+        share = w[p] * coefficients[k, c]
         v[0, p] += share * jx
         v[1, p] += share * jy
         v[2, p] += share * jz
@@ -123,17 +123,17 @@ def _push(x, v, w, particles, figures, k, jx, jy, jz, carried, qx, qy, qz):
 
 
 @kernel
-def _choose(x, v, particles, figures, impulses, chosen, count, h):
+def _choose(x, v, particles, coefficients, impulses, chosen, count, h):
     """List the contacts that may act soon; returns how many.  The others lose their impulses."""
     zero = x.dtype.type(0)
     ahead = x.dtype.type(CHOSEN_EVERY) * h
     beyond = x.dtype.type(1 + SOON)
     number = 0
     for k in range(count):
-        nx, ny, nz = figures[k, NORMAL], figures[k, NORMAL + 1], figures[k, NORMAL + 2]
-        gap, _, _, _ = _along(x, particles, figures, k, nx, ny, nz)
-        speed, _, _, _ = _along(v, particles, figures, k, nx, ny, nz)
-        if gap + ahead * min(speed, zero) < beyond * figures[k, THICKNESS]:
+        nx, ny, nz = coefficients[k, C_NORMAL], coefficients[k, C_NORMAL + 1], coefficients[k, C_NORMAL + 2]
+        gap, _, _, _ = _along(x, particles, coefficients, k, nx, ny, nz)
+        speed, _, _, _ = _along(v, particles, coefficients, k, nx, ny, nz)
+        if gap + ahead * min(speed, zero) < beyond * coefficients[k, C_THICKNESS]:
             chosen[number] = k
             number += 1
         else:
@@ -142,7 +142,7 @@ def _choose(x, v, particles, figures, impulses, chosen, count, h):
 
 
 @kernel
-def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
+def _add_up(w, particles, coefficients, impulses, chosen, choices, pressed):
     """What the impulses of a substep change each particle's velocity by [m/s], (3, particles)."""
     zero = pressed.dtype.type(0)
     pressed[:] = zero
@@ -152,14 +152,14 @@ def _add_up(w, particles, figures, impulses, chosen, choices, pressed):
         if jx != zero or jy != zero or jz != zero:
             for m in range(4):
                 p = particles[k, m]
-                share = w[p] * figures[k, m]
+                share = w[p] * coefficients[k, m]
                 pressed[0, p] += share * jx
                 pressed[1, p] += share * jy
                 pressed[2, p] += share * jz
 
 
 @kernel
-def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, friction, push, h, waited):
+def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carried, friction, push, h, waited):
     """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.
 
     Returns how many contacts acted, and the most that the velocity along one's normal had to be corrected by [m/s].
@@ -167,16 +167,21 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)
-    since, most_speed = x.dtype.type(waited), x.dtype.type(MOST)
+    since, most_speed = x.dtype.type(waited), x.dtype.type(FASTEST)
     reach = x.dtype.type(SPAN) * h + carried
     touching, largest = 0, zero
     for c in range(choices):
         k = chosen[c]
-        nx, ny, nz, thickness = figures[k, NORMAL], figures[k, NORMAL + 1], figures[k, NORMAL + 2], figures[k, THICKNESS]
+        nx, ny, nz, thickness = (
+            coefficients[k, C_NORMAL],
+            coefficients[k, C_NORMAL + 1],
+            coefficients[k, C_NORMAL + 2],
+            coefficients[k, C_THICKNESS],
+        )
         jx, jy, jz = since * impulses[k, 0], since * impulses[k, 1], since * impulses[k, 2]
         before = nx * jx + ny * jy + nz * jz
-        gap, _, _, _ = _along(x, particles, figures, k, nx, ny, nz)
-        un, ux, uy, uz = _along(v, particles, figures, k, nx, ny, nz)
+        gap, _, _, _ = _along(x, particles, coefficients, k, nx, ny, nz)
+        un, ux, uy, uz = _along(v, particles, coefficients, k, nx, ny, nz)
         # the velocity of approach that closes the gap by the end of the longest span, and no sooner; what has been carried on is
         # taken back
         wanted = -max(gap - carried * un - sunk * thickness, zero) / reach
@@ -184,7 +189,7 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
             continue
         mobile = zero
         for m in range(4):
-            mobile += w[particles[k, m]] * figures[k, m] * figures[k, m]
+            mobile += w[particles[k, m]] * coefficients[k, m] * coefficients[k, m]
         if mobile <= zero:
             continue
         mass = one / mobile
@@ -201,6 +206,6 @@ def _correct(x, v, w, particles, figures, impulses, chosen, choices, carried, fr
         # only what the impulse has not mended already is pushed
         lack = sunk * thickness - (gap + carried * (now - before) * mobile)
         out = since * min(relaxed * max(lack, zero), push) * mass
-        _push(x, v, w, particles, figures, k, px - jx, py - jy, pz - jz, carried, out * nx, out * ny, out * nz)
+        _push(x, v, w, particles, coefficients, k, px - jx, py - jy, pz - jz, carried, out * nx, out * ny, out * nz)
         touching += 1
     return touching, largest

@@ -1,7 +1,7 @@
 """Which primitives of one sheet may be close: the broad phase of self-collision's query.
 
-Near pairs (see ``pairs``) by the distances of their vertices; all others by the boxes of a tree, boxes, balls and planes of leaves,
-and boxes of primitives.  What is left out is surely farther apart than the query's reach.
+Near pairs (see ``topology``) by the distances of their vertices; all others by the boxes of a tree, boxes, balls and planes of
+leaves, and boxes of primitives.  What is left out is surely farther apart than the query's reach.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import NamedTuple
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.pairs import BEGIN, END, LEAVES, NEXT
+from clothgym.collisions.self.topology import NODE_BEGIN, NODE_END, NODE_LEAVES, NODE_NEXT
 
 TINY = 1e-300
-ALL = 2**LEAVES - 1  # a bit for each leaf of a node
-WIDE, STRETCH = 3, 4  # in a row of ``near_rows``
+ALL_LEAVES = 2**NODE_LEAVES - 1  # a bit for each leaf of a node
+V_WIDE, V_STRETCH = 3, 4  # in a row of ``near_rows``
 FLAT = 0.2  # angle [rad] up to which neighbouring faces are taken for flat: there vertices alone keep layers apart
 
 
@@ -23,7 +23,7 @@ class Reach(NamedTuple):
     """Distances of a query [m].
 
     near, far: within which near pairs, and all others, are found.  near_thickness, far_thickness: of the cloth there.
-    margin: beyond the thickness within which a pair becomes a contact.  stop: at which tied pairs are held.
+    margin: beyond the thickness within which a pair becomes a contact.  stop: at which gap constraints are held.
     standoff: distance at which what is held stops.
     """
 
@@ -54,13 +54,13 @@ def near_rows(p, pairs, extra, rows):
         dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         ratio[e] = max((dx * dx + dy * dy + dz * dz) * pairs.rest_edges[e], 1.0)
     for v in range(p.shape[0]):
-        rows[v, 0], rows[v, 1], rows[v, 2], rows[v, WIDE], rows[v, STRETCH] = p[v, 0], p[v, 1], p[v, 2], 0.0, 1.0
+        rows[v, 0], rows[v, 1], rows[v, 2], rows[v, V_WIDE], rows[v, V_STRETCH] = p[v, 0], p[v, 1], p[v, 2], 0.0, 1.0
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         wide = max(extra[i], max(extra[j], extra[k]))
         stretch = max(ratio[triangle_edges[t, 0]], max(ratio[triangle_edges[t, 1]], ratio[triangle_edges[t, 2]]))
         for v in (i, j, k):
-            rows[v, WIDE], rows[v, STRETCH] = max(rows[v, WIDE], wide), max(rows[v, STRETCH], stretch)
+            rows[v, V_WIDE], rows[v, V_STRETCH] = max(rows[v, V_WIDE], wide), max(rows[v, V_STRETCH], stretch)
 
 
 @kernel
@@ -68,12 +68,12 @@ def come_close(rows, partners, partner, slack, near, out):
     """Near pairs of vertices that are so close that some of their primitives may be within reach; returns how many."""
     count = 0
     for i in range(rows.shape[0]):
-        x, y, z, wide, stretch = rows[i, 0], rows[i, 1], rows[i, 2], near + rows[i, WIDE], rows[i, STRETCH]
+        x, y, z, wide, stretch = rows[i, 0], rows[i, 1], rows[i, 2], near + rows[i, V_WIDE], rows[i, V_STRETCH]
         for q in range(partners[i], partners[i + 1]):
             j = partner[q]
-            dx, dy, dz, within = rows[j, 0] - x, rows[j, 1] - y, rows[j, 2] - z, wide + rows[j, WIDE]
+            dx, dy, dz, within = rows[j, 0] - x, rows[j, 1] - y, rows[j, 2] - z, wide + rows[j, V_WIDE]
             out[count] = q
-            count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch, rows[j, STRETCH])
+            count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch, rows[j, V_STRETCH])
     return count
 
 
@@ -125,10 +125,10 @@ def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
             square = max(square, dx * dx + dy * dy + dz * dz)
         ball[3, leaf] = np.sqrt(square) + wide[leaf]
     for k in range(nodes.shape[0] - 1, -1, -1):
-        one, begin, end = k + 1, nodes[k, BEGIN], nodes[k, END]
+        one, begin, end = k + 1, nodes[k, NODE_BEGIN], nodes[k, NODE_END]
         for c in range(3):
-            if one < nodes[k, NEXT]:
-                two = nodes[one, NEXT]
+            if one < nodes[k, NODE_NEXT]:
+                two = nodes[one, NODE_NEXT]
                 low, high = min(hulls[c, one], hulls[c, two]), max(hulls[3 + c, one], hulls[3 + c, two])
             else:
                 low, high = box[c, begin], box[3 + c, begin]
@@ -178,14 +178,14 @@ def far_leaves(pairs, far, ball, box, hulls, out):
     nodes, beside, beside_nodes, beside_leaves = pairs.nodes, pairs.beside, pairs.beside_nodes, pairs.beside_leaves
     count, last = 0, out.shape[0] - 1
     for one in range(nodes.shape[0]):
-        if nodes[one, NEXT] > one + 1:
+        if nodes[one, NODE_NEXT] > one + 1:
             continue
-        begin, number = nodes[one, BEGIN], nodes[one, END] - nodes[one, BEGIN]
+        begin, number = nodes[one, NODE_BEGIN], nodes[one, NODE_END] - nodes[one, NODE_BEGIN]
         # what comes after it in the tree, and of that, in the same order, what is beside it; a node that is out of reach is passed
         # over with all that is in it
         two, next_beside = one, beside[one]
         while two < nodes.shape[0]:
-            inside, two = two, nodes[two, NEXT]
+            inside, two = two, nodes[two, NODE_NEXT]
             if out_of_reach(hulls, one, hulls, inside, far):
                 continue
             if two > inside + 1:
@@ -196,17 +196,17 @@ def far_leaves(pairs, far, ball, box, hulls, out):
             known = 0
             if next_beside < beside[one + 1] and beside_nodes[next_beside] == inside:
                 known = beside_leaves[next_beside]
-            first, others = nodes[inside, BEGIN], nodes[inside, END] - nodes[inside, BEGIN]
+            first, others = nodes[inside, NODE_BEGIN], nodes[inside, NODE_END] - nodes[inside, NODE_BEGIN]
             some = leaves_within(box, begin, number, hulls, inside, far)
             for k in range(number):
-                searched = ~(known >> (LEAVES * k)) & ALL
+                searched = ~(known >> (NODE_LEAVES * k)) & ALL_LEAVES
                 if not (some >> k) & 1 or searched == 0:
                     continue
                 bits = within(box, ball, begin + k, first, others, far) & searched
                 if bits == 0:
                     continue
                 # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
-                for m in range(LEAVES):
+                for m in range(NODE_LEAVES):
                     place = min(count, last)
                     out[place, 0], out[place, 1] = begin + k, first + m
                     count += (bits >> m) & 1

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import finite
-from clothgym.collisions.intersections import first_intersection
+from clothgym.geometry.intersections import first_intersection
 from clothgym.triangles import corners_of, directed_edges, refuse_degenerate
 
 

@@ -1,7 +1,8 @@
-"""Contact of one sheet with solids, where its particles lie side by side: the same as ``response`` and ``surface`` in lanes.
+"""Contact of one sheet with solids, where its particles lie side by side: the same as ``particle_contact`` and ``triangle_contact``
+in lanes.
 
 Particles are measured all at once, from the first that a solid may touch to the last.  Triangles are chosen by the cells of the
-grid: those that may touch are put on desks of ``COLUMNS`` triangles, where lanes have one triangle each (see ``distance``).
+grid: those that may touch are gathered ``COLUMNS`` at a time, where lanes have one triangle each (see ``signed_distance``).
 """
 
 from __future__ import annotations
@@ -9,60 +10,53 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import disjoint, inlined, kernel, uncounted
-from clothgym.collisions.contact_law import RELAXED, TINY, contact_change, touch_change
-from clothgym.collisions.distance import (
-    CLEAR,
-    CONTACT,
-    CORNERS,
-    DESK,
-    SPOT,
-    WEIGHTS,
+from clothgym.collisions.solids.contact_law import RELAXED, TINY, contact_change, touch_change
+from clothgym.collisions.solids.deepest_point import NONE, find_deepest, turn_normal
+from clothgym.collisions.solids.shapes import (
+    KIND_MESH,
+    KIND_PLANE,
+    KIND_ROUNDED_BOX,
+    R_AXES,
+    R_FRICTION,
+    R_HALF,
+    R_POINT,
+    R_RADIUS,
+    R_REACH2,
+    R_THICKNESS,
+    R_VELOCITY,
+)
+from clothgym.collisions.solids.signed_distance import (
+    S_CLEAR,
+    S_CONTACT,
+    S_CORNERS,
+    S_SPOT,
+    S_WEIGHTS,
+    SCRATCH_ROWS,
     lay_out,
     measure_mesh,
     normal_to_world,
     rounded_box,
 )
-from clothgym.collisions.shapes import (
-    AXES,
-    FRICTION,
-    HALF,
-    MESH,
-    PLANE,
-    POINT,
-    RADIUS,
-    REACH2,
-    ROUNDED_BOX,
-    THICKNESS,
-    VELOCITY,
-)
-from clothgym.collisions.surface import (
-    NONE,
-    SINKS,
-    TOUCH,
-    find_deepest,
-    may_touch_triangle,
-    near_in_grid,
-    turn_normal,
-)
+from clothgym.collisions.solids.triangle_contact import SINKS, TOUCH_ROWS, may_touch_triangle, near_in_grid
 
-COLUMNS = 32  # triangles on a desk
-ROWS = 9  # of scratch: places in the solid's axes, its distance and normal, how near cells are
-LOCAL, GAP, NORMAL, NEAR = 0, 3, 4, 7
+COLUMNS = 32  # triangles on a scratch
+PARTICLE_ROWS = 9  # of scratch: places in the solid's axes, its distance and normal, how near cells are
+P_LOCAL, P_GAP, P_NORMAL, P_NEAR = 0, 3, 4, 7
 NEAREST = 0.58  # of its longest side: no point of a triangle is farther from all its corners (1/sqrt(3) where that is equilateral)
 
 
 @kernel
 def room_on_sheet(x, triangles, shapes):
-    """Room for contact of one sheet: touches, (most, TOUCH), their triangles and solids, (most, 2), how many, (1,); scratch, (ROWS,
-    particles) and (triangles,); and a desk, (DESK, COLUMNS)."""
+    """Room for contact of one sheet: touches, (most, TOUCH_ROWS), their triangles and solids, (most, 2), how many, (1,); scratch,
+    (PARTICLE_ROWS, particles) and (triangles,); and a scratch, (SCRATCH_ROWS, COLUMNS)."""
     solids = 0
     for k in range(shapes.kinds.shape[0]):
-        solids += shapes.kinds[k] != PLANE
+        solids += shapes.kinds[k] != KIND_PLANE
     most = triangles.shape[0] * solids
     return (
-        np.empty((most, TOUCH), x.dtype), np.empty((most, 2), np.int64), np.zeros(1, np.int64),
-        np.empty((ROWS, x.shape[1]), x.dtype), np.empty(triangles.shape[0], np.int64), np.empty((DESK, COLUMNS), x.dtype),
-    )  # fmt: skip
+        np.empty((most, TOUCH_ROWS), x.dtype), np.empty((most, 2), np.int64), np.zeros(1, np.int64),
+        np.empty((PARTICLE_ROWS, x.shape[1]), x.dtype), np.empty(triangles.shape[0], np.int64), np.empty((SCRATCH_ROWS, COLUMNS),
+    x.dtype), )  # fmt: skip
 
 
 # --- particles ----------------------------------------------------------------------------------------------------------
@@ -161,44 +155,44 @@ def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, frict
 def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
     """Resolve the contacts of one sheet's particles after a substep of ``h`` [s], and move the solids on by their velocity.
 
-    x [m], v [m/s]: (3, particles, 1); w [1/kg]: (particles, 1); colliders: rows of ``shapes``, (colliders, ROWS, 1); room: of
-    ``room_on_sheet``.  See ``response.resolve_particles``.
+    x [m], v [m/s]: (3, particles, 1); w [1/kg]: (particles, 1); colliders: rows of ``shapes``, (colliders, PARTICLE_ROWS, 1); room:
+    of ``room_on_sheet``.  See ``response.resolve_particles``.
     """
-    _, _, _, rows, _, desk = room
+    _, _, _, rows, _, scratch = room
     kinds, n = shapes.kinds, x.shape[1]
     r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
     for k in range(kinds.shape[0]):
         c = colliders[k].reshape(colliders.shape[1])
         for e in range(3):
-            c[POINT + e] += h * c[VELOCITY + e]
-        px, py, pz = c[POINT], c[POINT + 1], c[POINT + 2]
-        sx, sy, sz, friction = c[VELOCITY], c[VELOCITY + 1], c[VELOCITY + 2], c[FRICTION]
-        if kinds[k] == PLANE:
-            nx, ny, nz = c[AXES + 6], c[AXES + 7], c[AXES + 8]
-            if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[RADIUS], rows[GAP]) > 0:
-                a, b = _span(rows[GAP])
+            c[R_POINT + e] += h * c[R_VELOCITY + e]
+        px, py, pz = c[R_POINT], c[R_POINT + 1], c[R_POINT + 2]
+        sx, sy, sz, friction = c[R_VELOCITY], c[R_VELOCITY + 1], c[R_VELOCITY + 2], c[R_FRICTION]
+        if kinds[k] == KIND_PLANE:
+            nx, ny, nz = c[R_AXES + 6], c[R_AXES + 7], c[R_AXES + 8]
+            if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[R_RADIUS], rows[P_GAP]) > 0:
+                a, b = _span(rows[P_GAP])
                 _respond_to_plane(
-                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[GAP, a:b], nx, ny, nz, sx, sy,
+                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[P_GAP, a:b], nx, ny, nz, sx, sy,
                     sz, friction, carried,
                 )  # fmt: skip
             continue
-        if _squares(r[0], r[1], r[2], px, py, pz, c[REACH2], rows[GAP]) == 0:
+        if _squares(r[0], r[1], r[2], px, py, pz, c[R_REACH2], rows[P_GAP]) == 0:
             continue
-        a, b = _span(rows[GAP])
+        a, b = _span(rows[P_GAP])
         for e in range(3):
-            q = AXES + 3 * e
-            _to_axis(r[0, a:b], r[1, a:b], r[2, a:b], px, py, pz, c[q], c[q + 1], c[q + 2], rows[LOCAL + e, a:b])
-        gap, nx, ny, nz = rows[GAP, a:b], rows[NORMAL, a:b], rows[NORMAL + 1, a:b], rows[NORMAL + 2, a:b]
-        if kinds[k] == ROUNDED_BOX:
+            q = R_AXES + 3 * e
+            _to_axis(r[0, a:b], r[1, a:b], r[2, a:b], px, py, pz, c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e, a:b])
+        gap, nx, ny, nz = rows[P_GAP, a:b], rows[P_NORMAL, a:b], rows[P_NORMAL + 1, a:b], rows[P_NORMAL + 2, a:b]
+        if kinds[k] == KIND_ROUNDED_BOX:
             _measure_boxes(
-                rows[LOCAL, a:b], rows[LOCAL + 1, a:b], rows[LOCAL + 2, a:b], c[HALF], c[HALF + 1], c[HALF + 2], c[RADIUS], gap, nx,
-                ny, nz,
+                rows[P_LOCAL, a:b], rows[P_LOCAL + 1, a:b], rows[P_LOCAL + 2, a:b], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2],
+                c[R_RADIUS], gap, nx, ny, nz,
             )  # fmt: skip
         else:
-            _measure_on_desk(rows, a, b, colliders[k], shapes, k, desk)
+            _measure_in_scratch(rows, a, b, colliders[k], shapes, k, scratch)
         _to_world(
-            nx, ny, nz, c[AXES], c[AXES + 1], c[AXES + 2], c[AXES + 3], c[AXES + 4], c[AXES + 5], c[AXES + 6], c[AXES + 7],
-            c[AXES + 8],
+            nx, ny, nz, c[R_AXES], c[R_AXES + 1], c[R_AXES + 2], c[R_AXES + 3], c[R_AXES + 4], c[R_AXES + 5], c[R_AXES + 6],
+            c[R_AXES + 7], c[R_AXES + 8],
         )  # fmt: skip
         _respond(
             r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried
@@ -206,18 +200,18 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
 
 
 @uncounted
-def _measure_on_desk(rows, first, last, collider, shapes, k, desk):
-    """Distance and normal of particles, whose places are in rows LOCAL, to a mesh, ``COLUMNS`` at a time."""
-    lay_out(collider, desk)
-    for begin in range(first, last, desk.shape[1]):
-        count = min(desk.shape[1], last - begin)
+def _measure_in_scratch(rows, first, last, collider, shapes, k, scratch):
+    """Distance and normal of particles, whose places are in rows P_LOCAL, to a mesh, ``COLUMNS`` at a time."""
+    lay_out(collider, scratch)
+    for begin in range(first, last, scratch.shape[1]):
+        count = min(scratch.shape[1], last - begin)
         for e in range(3):
-            for l in range(desk.shape[1]):
-                desk[SPOT + e, l] = rows[LOCAL + e, begin + min(l, count - 1)]
-        measure_mesh(desk, SPOT, shapes, k, desk.dtype.type(0))
+            for l in range(scratch.shape[1]):
+                scratch[S_SPOT + e, l] = rows[P_LOCAL + e, begin + min(l, count - 1)]
+        measure_mesh(scratch, S_SPOT, shapes, k, scratch.dtype.type(0))
         for e in range(4):
             for l in range(count):
-                rows[GAP + e, begin + l] = desk[CONTACT + e, l]
+                rows[P_GAP + e, begin + l] = scratch[S_CONTACT + e, l]
 
 
 # --- triangles ----------------------------------------------------------------------------------------------------------
@@ -258,24 +252,24 @@ def _near_cells(x, y, z, out, columns, radius, near):
 
 
 @inlined
-def _put_on_desk(rows, triangles, chosen, begin, count, desk):
-    """Copy the corners of chosen triangles to the desk; the last fills what is left of it."""
-    for l in range(desk.shape[1]):
+def _gather_corners(rows, triangles, chosen, begin, count, scratch):
+    """Copy the corners of chosen triangles to the scratch; the last fills what is left of it."""
+    for l in range(scratch.shape[1]):
         t = chosen[begin + min(l, count - 1)]
         for c in range(3):
             p = triangles[t, c]
-            desk[CORNERS + 3 * c, l] = rows[LOCAL, p]
-            desk[CORNERS + 3 * c + 1, l] = rows[LOCAL + 1, p]
-            desk[CORNERS + 3 * c + 2, l] = rows[LOCAL + 2, p]
+            scratch[S_CORNERS + 3 * c, l] = rows[P_LOCAL, p]
+            scratch[S_CORNERS + 3 * c + 1, l] = rows[P_LOCAL + 1, p]
+            scratch[S_CORNERS + 3 * c + 2, l] = rows[P_LOCAL + 2, p]
 
 
 @inlined
-def _choose_triangles(rows, triangles, columns, radius, chosen, desk):
-    """List the triangles that may touch the solid on the desk, by their cells, and of these by themselves; returns how many."""
+def _choose_triangles(rows, triangles, columns, radius, chosen, scratch):
+    """List the triangles that may touch the solid on the scratch, by their cells, and of these by themselves; returns how many."""
     number, last = 0, rows.shape[1] - columns - 1
-    near = rows[NEAR, :last]
-    out = rows[GAP]
-    if _near_cells(rows[LOCAL], rows[LOCAL + 1], rows[LOCAL + 2], out, columns, radius, near) == 0:
+    near = rows[P_NEAR, :last]
+    out = rows[P_GAP]
+    if _near_cells(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], out, columns, radius, near) == 0:
         return 0
     for p in range(last):
         # a cell at the end of a row is none
@@ -284,13 +278,13 @@ def _choose_triangles(rows, triangles, columns, radius, chosen, desk):
             chosen[number], chosen[number + 1] = t, t + 1
             number += 2
     kept = 0
-    for begin in range(0, number, desk.shape[1]):
-        count = min(desk.shape[1], number - begin)
-        _put_on_desk(rows, triangles, chosen, begin, count, desk)
-        may_touch_triangle(desk)
+    for begin in range(0, number, scratch.shape[1]):
+        count = min(scratch.shape[1], number - begin)
+        _gather_corners(rows, triangles, chosen, begin, count, scratch)
+        may_touch_triangle(scratch)
         for l in range(count):
             chosen[kept] = chosen[begin + l]
-            kept += desk[CLEAR, l] == 0
+            kept += scratch[S_CLEAR, l] == 0
     return kept
 
 
@@ -300,40 +294,40 @@ def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
 
     A grid's triangles come two a cell, row by row.
     """
-    touches, which, count, rows, chosen, desk = room
+    touches, which, count, rows, chosen, scratch = room
     n, c = x.shape[1], collider.reshape(collider.shape[0])
     r = x.reshape((3, n))
-    lay_out(collider, desk)
-    least = min(c[HALF], min(c[HALF + 1], c[HALF + 2])) + c[RADIUS]
-    radius = c[RADIUS] - (c[THICKNESS] + x.dtype.type(2 * SINKS) * least)
-    desk[RADIUS] = radius
+    lay_out(collider, scratch)
+    least = min(c[R_HALF], min(c[R_HALF + 1], c[R_HALF + 2])) + c[R_RADIUS]
+    radius = c[R_RADIUS] - (c[R_THICKNESS] + x.dtype.type(2 * SINKS) * least)
+    scratch[R_RADIUS] = radius
     for e in range(3):
-        q = AXES + 3 * e
-        _to_axis(r[0], r[1], r[2], c[POINT], c[POINT + 1], c[POINT + 2], c[q], c[q + 1], c[q + 2], rows[LOCAL + e])
-    _distances(rows[LOCAL], rows[LOCAL + 1], rows[LOCAL + 2], c[HALF], c[HALF + 1], c[HALF + 2], rows[GAP])
+        q = R_AXES + 3 * e
+        _to_axis(r[0], r[1], r[2], c[R_POINT], c[R_POINT + 1], c[R_POINT + 2], c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e])
+    _distances(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2], rows[P_GAP])
     # the first triangle of the second row of cells begins at the second row of particles
     columns = triangles[0, 2] - 1
-    number = _choose_triangles(rows, triangles, columns, radius, chosen, desk)
-    for begin in range(0, number, desk.shape[1]):
-        some = min(desk.shape[1], number - begin)
-        _put_on_desk(rows, triangles, chosen, begin, some, desk)
-        if not may_touch_triangle(desk) or (shapes.kinds[k] == MESH and not near_in_grid(desk, shapes, k)):
+    number = _choose_triangles(rows, triangles, columns, radius, chosen, scratch)
+    for begin in range(0, number, scratch.shape[1]):
+        some = min(scratch.shape[1], number - begin)
+        _gather_corners(rows, triangles, chosen, begin, some, scratch)
+        if not may_touch_triangle(scratch) or (shapes.kinds[k] == KIND_MESH and not near_in_grid(scratch, shapes, k)):
             continue
-        if not find_deepest(desk, shapes, k) or not turn_normal(desk):
+        if not find_deepest(scratch, shapes, k) or not turn_normal(scratch):
             continue
         # the plane, as how far it is from the solid's point along the normal
-        for l in range(desk.shape[1]):
-            nx, ny, nz = desk[CONTACT + 1, l], desk[CONTACT + 2, l], desk[CONTACT + 3, l]
-            if desk[CONTACT, l] < desk.dtype.type(NONE):
-                desk[CONTACT, l] -= nx * desk[SPOT, l] + ny * desk[SPOT + 1, l] + nz * desk[SPOT + 2, l]
-        normal_to_world(desk)
+        for l in range(scratch.shape[1]):
+            nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
+            if scratch[S_CONTACT, l] < scratch.dtype.type(NONE):
+                scratch[S_CONTACT, l] -= nx * scratch[S_SPOT, l] + ny * scratch[S_SPOT + 1, l] + nz * scratch[S_SPOT + 2, l]
+        normal_to_world(scratch)
         for l in range(some):
-            if desk[CONTACT, l] >= desk.dtype.type(NONE):
+            if scratch[S_CONTACT, l] >= scratch.dtype.type(NONE):
                 continue
             for e in range(3):
-                touches[count[0], e] = desk[WEIGHTS + e, l]
+                touches[count[0], e] = scratch[S_WEIGHTS + e, l]
             for e in range(4):
-                touches[count[0], 3 + e] = desk[CONTACT + e, l]
+                touches[count[0], 3 + e] = scratch[S_CONTACT + e, l]
             which[count[0], 0], which[count[0], 1] = chosen[begin + l], k
             count[0] += 1
 
@@ -351,17 +345,17 @@ def press_on_sheet(x, v, w, triangles, colliders, room, h, carried):
         i, j, k = triangles[which[t, 0], 0], triangles[which[t, 0], 1], triangles[which[t, 0], 2]
         a, b, d = touches[t, 0], touches[t, 1], touches[t, 2]
         gap, nx, ny, nz = touches[t, 3], touches[t, 4], touches[t, 5], touches[t, 6]
-        gap += nx * (a * r[0, i] + b * r[0, j] + d * r[0, k] - c[POINT, 0])
-        gap += ny * (a * r[1, i] + b * r[1, j] + d * r[1, k] - c[POINT + 1, 0])
-        gap += nz * (a * r[2, i] + b * r[2, j] + d * r[2, k] - c[POINT + 2, 0])
+        gap += nx * (a * r[0, i] + b * r[0, j] + d * r[0, k] - c[R_POINT, 0])
+        gap += ny * (a * r[1, i] + b * r[1, j] + d * r[1, k] - c[R_POINT + 1, 0])
+        gap += nz * (a * r[2, i] + b * r[2, j] + d * r[2, k] - c[R_POINT + 2, 0])
         if not gap < zero:
             continue
-        ux = a * s[0, i] + b * s[0, j] + d * s[0, k] - c[VELOCITY, 0]
-        uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[VELOCITY + 1, 0]
-        uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[VELOCITY + 2, 0]
+        ux = a * s[0, i] + b * s[0, j] + d * s[0, k] - c[R_VELOCITY, 0]
+        uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[R_VELOCITY + 1, 0]
+        uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[R_VELOCITY + 2, 0]
         yielding = m[i] * a * a + m[j] * b * b + m[k] * d * d
         mx, my, mz, cx, cy, cz = touch_change(
-            gap, nx, ny, nz, ux, uy, uz, yielding, c[FRICTION, 0], h, carried, zero, one, tiny, relaxed
+            gap, nx, ny, nz, ux, uy, uz, yielding, c[R_FRICTION, 0], h, carried, zero, one, tiny, relaxed
         )
         for p, weight in ((i, a), (j, b), (k, d)):
             share = m[p] * weight
@@ -384,6 +378,6 @@ def resolve_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, ro
     if look:
         count[0] = 0
         for k in range(kinds.shape[0]):
-            if kinds[k] != PLANE:
+            if kinds[k] != KIND_PLANE:
                 find_touches_on_sheet(x, triangles, shapes, k, colliders[k], room)
     press_on_sheet(x, v, w, triangles, colliders, room, h, carried)

@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.checks import not_negative, positive
-from clothgym.collisions.candidates import Reach, far_pairs, far_sides
-from clothgym.collisions.confinement import FARTHEST
-from clothgym.collisions.intersections import first_intersection
-from clothgym.collisions.pairs import Pairs, pairs_of
-from clothgym.collisions.proximity import (
-    FIGURES,
-    GAP,
-    LAG,
+from clothgym.collisions.self.broad_phase import Reach, far_pairs, far_sides
+from clothgym.collisions.self.displacement_bounds import FARTHEST
+from clothgym.collisions.self.impulses import TOLERANCE
+from clothgym.collisions.self.narrow_phase import (
+    C_SIZE,
+    G_NUMBER,
+    G_OWN,
+    G_SIZE,
+    G_VERTICES,
     MARGIN,
-    NUMBER,
-    OWN,
-    REPORT,
-    TIE,
-    UNCERTAIN,
-    VERTICES,
+    REPORT_GAP,
+    REPORT_LAG,
+    REPORT_SIZE,
+    REPORT_UNCERTAIN,
     edge_contacts,
     gap_of_edges,
     gap_of_vertex,
     vertex_contacts,
 )
-from clothgym.collisions.repulsion import CALM
-from clothgym.collisions.self_collision import PUSH, Memory, Setting, Sheet
+from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
+from clothgym.collisions.self.topology import Pairs, pairs_of
+from clothgym.geometry.intersections import first_intersection
 from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
 
@@ -40,8 +40,8 @@ MODES = ("fast", "strict")
 REACH = 1.4  # how far a query sees, in thicknesses
 CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a contact
 ROOM = 12  # contacts for each vertex; more are counted as dropped
-TIGHT = 24  # tied pairs for each vertex; more bound their vertices instead
-STOP = 0.125  # thicknesses at which tied pairs are held
+CONSTRAINTS = 24  # gap constraints for each vertex; more bound their vertices instead
+STOP = 0.125  # thicknesses at which gap constraints are held
 STANDOFF = 0.25  # thicknesses at which what is held stops
 USUAL = 0.28  # thickness where none is given, over the shortest distance at rest of what does not hang together
 NEAR_MOST, FAR_MOST = (
@@ -55,8 +55,8 @@ BEYOND = (
     f"within {FARTHEST:g} m float32 can certify that a sheet does not intersect itself; move the scene to the origin, or take "
     "dtype='float64'"
 )
-# what ``Memory`` and ``State`` keep of each contact or tight pair, and what counts them
-ROW_ARRAYS = {"particles": "count", "figures": "count", "impulses": "count", "ties": "tight", "planes": "tight"}
+# what ``Memory`` and ``State`` keep of each contact or gap constraint, and what counts them
+ROW_ARRAYS = {"particles": "count", "coefficients": "count", "impulses": "count", "members": "constraints", "planes": "constraints"}
 
 
 class SelfContacts(NamedTuple):
@@ -64,8 +64,8 @@ class SelfContacts(NamedTuple):
 
     rows: contacts within reach; touching: those at which something acted in the last substep.
     clamped: moves of a vertex in a substep that were cut short.  queries: made.
-    dropped: contacts for which there was no room (they still bound their vertices), and pairs that found none to be tied (what they
-    have left is shared out with each query, and less of it each time).
+    dropped: contacts for which there was no room (they still bound their vertices), and pairs that found none to be constrained
+    (what they have left is shared out with each query, and less of it each time).
     gap: smallest certified distance at a query [m], 0 where the directions that were tried certify none, inf if nothing was within
     reach or no query made.
     lag: how far the slowest held particle is behind its hand [m].  uncertified: whether the sheet went farther from the origin than
@@ -143,8 +143,8 @@ class SelfCollision:
             )
         self.thickness = reach.far_thickness
         real = dtype.type
-        friction, push, calm = real(self.options.friction), real(PUSH), real(CALM * self.thickness)
-        setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, calm)
+        friction, push, tolerance = real(self.options.friction), real(PUSH), real(TOLERANCE * self.thickness)
+        setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, tolerance)
         self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
         self.check(mesh.rest_positions[None], np.zeros(1, np.int64))
 
@@ -176,7 +176,7 @@ class SelfCollision:
             which, one, two = found
             raise ValueError(
                 f"positions: in environment {envs[which]} triangles {one} and {two} intersect: self_collision='strict' keeps apart "
-                "what is apart, and does not untangle; start from another sheet (clothgym.crumpling.starts makes some), or take "
+                "what is apart, and does not untangle; start from another sheet (clothgym.starts.make makes some), or take "
                 "self_collision='fast'"
             )
 
@@ -191,7 +191,7 @@ class SelfCollision:
         memory.lag[block, :, :, lane] = 0
         memory.behind[block, lane] = 0
         memory.contacts[block, lane] = 0
-        memory.tight[block, lane] = 0
+        memory.constraints[block, lane] = 0
         memory.looks[block, lane] = memory.waited[block, lane] = memory.span[block, lane] = 0
         memory.pressed[block, :, :, lane] = 0
         memory.report[block, lane] = 0
@@ -207,14 +207,14 @@ class SelfCollision:
             "contact_lag": np.zeros((num_envs, particles, 3)),
             "contact_count": np.zeros(num_envs, np.int32),
             "contact_particles": np.zeros((num_envs, 0, 4), np.int32),
-            "contact_figures": np.zeros((num_envs, 0, FIGURES)),
+            "contact_coefficients": np.zeros((num_envs, 0, C_SIZE)),
             "contact_impulses": np.zeros((num_envs, 0, 3)),
-            "contact_tight": np.zeros(num_envs, np.int32),
+            "contact_constraints": np.zeros(num_envs, np.int32),
             "contact_looks": np.zeros(num_envs, np.int32),
             "contact_pressed": np.zeros((num_envs, particles, 3)),
             "contact_waited": np.zeros(num_envs, np.int32),
             "contact_span": np.zeros(num_envs, np.int32),
-            "contact_ties": np.zeros((num_envs, 0, TIE), np.int32),
+            "contact_members": np.zeros((num_envs, 0, G_SIZE), np.int32),
             "contact_planes": np.zeros((num_envs, 0, 4)),
         }
 
@@ -229,7 +229,7 @@ class SelfCollision:
             "contact_limits": public(memory.limits),
             "contact_lag": vectors(memory.lag),
             "contact_count": public(memory.contacts),
-            "contact_tight": public(memory.tight),
+            "contact_constraints": public(memory.constraints),
             "contact_looks": public(memory.looks),
             "contact_pressed": vectors(memory.pressed),
             "contact_waited": public(memory.waited),
@@ -241,8 +241,8 @@ class SelfCollision:
             there = np.arange(used.shape[1]) < count[:, None]
             state[f"contact_{name}"] = np.where(there[:, :, None], used, 0)
         # nothing has written what lies behind a pair's vertices
-        ties = state["contact_ties"]
-        ties[np.arange(TIE) >= VERTICES + ties[:, :, NUMBER, None]] = 0
+        members = state["contact_members"]
+        members[np.arange(G_SIZE) >= G_VERTICES + members[:, :, G_NUMBER, None]] = 0
         return state
 
     def check_memory(self, state: State) -> None:
@@ -273,12 +273,12 @@ class SelfCollision:
         for name in ("contact_looks", "contact_waited", "contact_span"):
             if getattr(state, name).min() < 0:
                 raise ValueError(f"the state's {name} holds {getattr(state, name).min()}, and counts: {advice}")
-        for name, vertices in (("particles", state.contact_particles), ("ties", state.contact_ties[:, :, VERTICES:])):
+        for name, vertices in (("particles", state.contact_particles), ("members", state.contact_members[:, :, G_VERTICES:])):
             if np.any((vertices < 0) | (vertices >= particles)):
                 raise ValueError(f"the state's contact_{name} name particles beyond the {particles} of the sheet: {advice}")
-        own, number = state.contact_ties[:, :, OWN], state.contact_ties[:, :, NUMBER]
-        if np.any((own < 0) | (number < own) | (number > TIE - VERTICES)):
-            raise ValueError(f"the state's contact_ties count more vertices than a pair has: {advice}")
+        own, number = state.contact_members[:, :, G_OWN], state.contact_members[:, :, G_NUMBER]
+        if np.any((own < 0) | (number < own) | (number > G_SIZE - G_VERTICES)):
+            raise ValueError(f"the state's contact_members count more vertices than a pair has: {advice}")
 
     def restore(self, state: State, x: NDArray) -> None:
         """Take over from a state, with positions x in blocks [m]."""
@@ -296,7 +296,7 @@ class SelfCollision:
         memory.bounds[:] = blocks(state.contact_bounds, self.dtype)
         memory.limits[:] = blocks(state.contact_limits, self.dtype)
         memory.contacts[block, lane] = state.contact_count
-        memory.tight[block, lane] = state.contact_tight
+        memory.constraints[block, lane] = state.contact_constraints
         memory.looks[block, lane] = state.contact_looks
         memory.pressed[:] = vectors(state.contact_pressed, self.dtype)
         memory.waited[block, lane] = state.contact_waited
@@ -313,9 +313,9 @@ class SelfCollision:
 
     def warn(self, steps: NDArray) -> None:
         """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""
-        if not self.strict or not self.sheet.memory.report[:, :, UNCERTAIN].any():
+        if not self.strict or not self.sheet.memory.report[:, :, REPORT_UNCERTAIN].any():
             return
-        uncertain = self.sheet.memory.report[:, :, UNCERTAIN].ravel() == 1
+        uncertain = self.sheet.memory.report[:, :, REPORT_UNCERTAIN].ravel() == 1
         new = np.flatnonzero(uncertain & ~self._reported)
         if len(new):
             self._reported[new] = True
@@ -330,10 +330,12 @@ class SelfCollision:
         """What happened in the last control step."""
         if self.options is None:
             return None
-        report = self.sheet.memory.report.reshape(-1, REPORT)[: self.layout.num_envs]
+        report = self.sheet.memory.report.reshape(-1, REPORT_SIZE)[: self.layout.num_envs]
         numbers = report.T.copy()
-        rows, touching, clamped, queries, dropped = numbers[:GAP].astype(np.int64)
-        return SelfContacts(rows, touching, clamped, queries, dropped, numbers[GAP], numbers[LAG], numbers[UNCERTAIN] > 0)
+        rows, touching, clamped, queries, dropped = numbers[:REPORT_GAP].astype(np.int64)
+        return SelfContacts(
+            rows, touching, clamped, queries, dropped, numbers[REPORT_GAP], numbers[REPORT_LAG], numbers[REPORT_UNCERTAIN] > 0
+        )
 
 
 def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
@@ -350,10 +352,10 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         contacts=np.zeros(shape, np.int32),
         # contacts are written where they are needed only: an operating system gives no memory to what has never been touched
         particles=np.empty((*shape, room, 4), np.int32),
-        figures=np.empty((*shape, room, FIGURES), dtype),
-        tight=np.zeros(shape, np.int32),
-        ties=np.empty((*shape, TIGHT * particles, TIE), np.int32),
-        planes=np.empty((*shape, TIGHT * particles, 4)),
+        coefficients=np.empty((*shape, room, C_SIZE), dtype),
+        constraints=np.zeros(shape, np.int32),
+        members=np.empty((*shape, CONSTRAINTS * particles, G_SIZE), np.int32),
+        planes=np.empty((*shape, CONSTRAINTS * particles, 4)),
         looks=np.zeros(shape, np.int32),
         impulses=np.zeros((*shape, room, 3), dtype),
         pressed=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
@@ -363,7 +365,7 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
         chosen=np.empty((*shape, room), np.int32),
         choices=np.zeros(shape, np.int32),
         used=used,
-        report=np.zeros((*shape, REPORT)),
+        report=np.zeros((*shape, REPORT_SIZE)),
     )
 
 
@@ -394,12 +396,12 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     extra = np.zeros(mesh.num_particles)
     leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
     sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), reach, extra)
-    figures = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
-    no_contacts = np.empty((0, 4), np.int32), np.empty((0, FIGURES), dtype)
-    none = *no_contacts, 0, np.empty((0, TIE), np.int32), np.empty((0, 4)), np.empty(REPORT)
+    coefficients = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    no_contacts = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype)
+    none = *no_contacts, 0, np.empty((0, G_SIZE), np.int32), np.empty((0, 4)), np.empty(REPORT_SIZE)
     owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
-    vertex_contacts(p, corners, *owners, *figures, np.empty((len(leaves), 4)), 0, *none)
-    edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *figures, 0, *none)
+    vertex_contacts(p, corners, *owners, *coefficients, np.empty((len(leaves), 4)), 0, *none)
+    edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *coefficients, 0, *none)
     apart = float(room.min())
     # of single triangles nothing is near, and of one alone nothing else
     shortest = np.sqrt(1 / pairs.rest_edges.max())

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from exact_intersections import intersecting_pairs
 
-from clothgym import disc, grid
-from clothgym.collisions.intersections import count_intersections
-from clothgym.crumpling import MANOEUVRES, STARTS, starts
+from clothgym import disc, grid, starts
+from clothgym.geometry.intersections import count_intersections
+from clothgym.starts import MANOEUVRES, STARTS
 
 GRID, DISC = grid(13, 13, 0.8, 0.8), disc(0.4, 6)
 
@@ -95,7 +95,7 @@ def test_a_corner_is_dragged_at_its_speed():
 @pytest.mark.parametrize("kind", STARTS)
 def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
     mesh = grid(10, 10, 0.8, 0.8)
-    x = starts(mesh, kind=kind, count=2, seed=5)
+    x = starts.make(mesh, kind=kind, count=2, seed=5)
     assert x.shape == (2, mesh.num_particles, 3)
     assert not np.array_equal(x[0], x[1])
     for sheet in x:
@@ -106,28 +106,28 @@ def test_starts_rest_on_the_floor_and_do_not_intersect(kind):
 
 def test_a_start_does_not_depend_on_the_others():
     mesh = grid(9, 9, 0.8, 0.8)
-    np.testing.assert_array_equal(starts(mesh, kind="folded", count=3, seed=5)[1:2], starts(mesh, kind="folded", seed=6))
+    np.testing.assert_array_equal(starts.make(mesh, kind="folded", count=3, seed=5)[1:2], starts.make(mesh, kind="folded", seed=6))
 
 
 def test_starts_that_intersect_are_refused():
     with pytest.raises(RuntimeError, match="folded sheet of seed 3 intersects itself .* times, at triangles"):
-        starts(GRID, kind="folded", seed=3, self_collision=False)
+        starts.make(GRID, kind="folded", seed=3, self_collision=False)
 
 
 def test_what_cannot_be_started():
     with pytest.raises(ValueError, match="crumpled"):
-        starts(GRID, kind="ironed")
+        starts.make(GRID, kind="ironed")
     with pytest.raises(ValueError, match="3 times at most"):
         MANOEUVRES["fold"](GRID, times=4)
     with pytest.raises(ValueError, match="count=0: must be an integer of at least 1"):
-        starts(GRID, count=0)
+        starts.make(GRID, count=0)
     with pytest.raises(ValueError, match="mesh=None: must be a ClothMesh"):
-        starts(None)
+        starts.make(None)
     with pytest.raises(ValueError, match="thickness=True: must be a finite number"):
-        starts(grid(5, 5, 1.0, 1.0), self_collision={"thickness": True})
+        starts.make(grid(5, 5, 1.0, 1.0), self_collision={"thickness": True})
     with pytest.raises(ValueError, match="seed=-1"):
-        starts(GRID, seed=-1)
+        starts.make(GRID, seed=-1)
     with pytest.raises(ValueError, match="seeds=.-1.: must be integers"):
         MANOEUVRES["heap"](GRID, seeds=[-1])
     with pytest.raises(ValueError, match="a manoeuvre has its own"):
-        starts(GRID, colliders=[])
+        starts.make(GRID, colliders=[])

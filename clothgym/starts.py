@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from clothgym import checks
 from clothgym.checks import one_of, positive
 from clothgym.collisions import Plane
-from clothgym.collisions.intersections import find_intersections
+from clothgym.geometry.intersections import find_intersections
 from clothgym.hands import Gripper
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
@@ -374,7 +374,7 @@ STARTS: dict[str, Callable[..., Manoeuvre]] = {
 }
 
 
-def starts(
+def make(
     mesh: ClothMesh,
     material: Material | None = None,
     kind: str = "crumpled",

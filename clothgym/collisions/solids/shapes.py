@@ -20,10 +20,10 @@ from clothgym.checks import finite, members, number, vector
 # rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r with the thickness in it, friction,
 # velocity, the square of the distance from the point beyond which nothing can touch it, thickness, and the velocity that it will
 # have after the next control step
-POINT, AXES, HALF, RADIUS, FRICTION, VELOCITY, REACH2, THICKNESS, AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
-ROWS = 25
+R_POINT, R_AXES, R_HALF, R_RADIUS, R_FRICTION, R_VELOCITY, R_REACH2, R_THICKNESS, R_AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
+COLLIDER_ROWS = 25
 
-PLANE, ROUNDED_BOX, MESH = 0, 1, 2
+KIND_PLANE, KIND_ROUNDED_BOX, KIND_MESH = 0, 1, 2
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -67,14 +67,14 @@ class Collider:
                 raise ValueError(f"{type(self).__name__} {name}={size!r}: must be positive")
 
     def rows(self) -> NDArray[np.float64]:
-        """The numbers the kernel reads, (ROWS,)."""
-        rows = np.zeros(ROWS)
-        rows[AXES], rows[AXES + 4], rows[AXES + 8] = 1, 1, 1
-        rows[FRICTION] = self.friction
-        rows[VELOCITY : VELOCITY + 3] = rows[AFTER : AFTER + 3] = self.velocity
-        rows[RADIUS] = rows[THICKNESS] = self.thickness
+        """The numbers the kernel reads, (COLLIDER_ROWS,)."""
+        rows = np.zeros(COLLIDER_ROWS)
+        rows[R_AXES], rows[R_AXES + 4], rows[R_AXES + 8] = 1, 1, 1
+        rows[R_FRICTION] = self.friction
+        rows[R_VELOCITY : R_VELOCITY + 3] = rows[R_AFTER : R_AFTER + 3] = self.velocity
+        rows[R_RADIUS] = rows[R_THICKNESS] = self.thickness
         self._shape(rows)
-        rows[REACH2] = (np.linalg.norm(rows[HALF : HALF + 3]) + rows[RADIUS]) ** 2
+        rows[R_REACH2] = (np.linalg.norm(rows[R_HALF : R_HALF + 3]) + rows[R_RADIUS]) ** 2
         return rows
 
     def fits(self, other: Collider) -> bool:
@@ -90,7 +90,7 @@ class Collider:
 class Plane(Collider):
     """A half-space: the solid lies below ``point`` against ``normal``."""
 
-    kind: ClassVar[int] = PLANE
+    kind: ClassVar[int] = KIND_PLANE
     point: Vector = (0.0, 0.0, 0.0)
     normal: Vector = (0.0, 0.0, 1.0)
 
@@ -100,15 +100,15 @@ class Plane(Collider):
             raise ValueError(f"Plane normal={self.normal!r}: must have a length")
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        rows[POINT : POINT + 3] = self.point
-        rows[AXES : AXES + 9] = _axes_along(*map(float, self.normal))
+        rows[R_POINT : R_POINT + 3] = self.point
+        rows[R_AXES : R_AXES + 9] = _axes_along(*map(float, self.normal))
 
 
 @dataclass(frozen=True)
 class Sphere(Collider):
     """A ball."""
 
-    kind: ClassVar[int] = ROUNDED_BOX
+    kind: ClassVar[int] = KIND_ROUNDED_BOX
     center: Vector = (0.0, 0.0, 0.0)
     radius: float = 0.1
 
@@ -117,15 +117,15 @@ class Sphere(Collider):
         self._positive(radius=self.radius)
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        rows[POINT : POINT + 3] = self.center
-        rows[RADIUS] = self.radius + self.thickness
+        rows[R_POINT : R_POINT + 3] = self.center
+        rows[R_RADIUS] = self.radius + self.thickness
 
 
 @dataclass(frozen=True)
 class Capsule(Collider):
     """A cylinder with round ends, upright unless ``axis`` says otherwise; ``height`` is from end to end [m]."""
 
-    kind: ClassVar[int] = ROUNDED_BOX
+    kind: ClassVar[int] = KIND_ROUNDED_BOX
     center: Vector = (0.0, 0.0, 0.0)
     radius: float = 0.1
     height: float = 0.4
@@ -140,10 +140,10 @@ class Capsule(Collider):
             raise ValueError(f"Capsule axis={self.axis!r}: must have a length")
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        rows[POINT : POINT + 3] = self.center
-        rows[AXES : AXES + 9] = _axes_along(*map(float, self.axis))
-        rows[HALF + 2] = self.height / 2 - self.radius
-        rows[RADIUS] = self.radius + self.thickness
+        rows[R_POINT : R_POINT + 3] = self.center
+        rows[R_AXES : R_AXES + 9] = _axes_along(*map(float, self.axis))
+        rows[R_HALF + 2] = self.height / 2 - self.radius
+        rows[R_RADIUS] = self.radius + self.thickness
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Box(Collider):
     It is turned by ``yaw`` about z [rad], and then by ``rotation``, a quaternion (w, x, y, z) of any length.
     """
 
-    kind: ClassVar[int] = ROUNDED_BOX
+    kind: ClassVar[int] = KIND_ROUNDED_BOX
     center: Vector = (0.0, 0.0, 0.0)
     half_sides: Vector = (0.1, 0.1, 0.1)
     yaw: float = 0.0
@@ -165,10 +165,10 @@ class Box(Collider):
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
-        rows[POINT : POINT + 3] = self.center
+        rows[R_POINT : R_POINT + 3] = self.center
         about_z = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
-        rows[AXES : AXES + 9] = (about_z @ _axes_of(*map(float, self.rotation))).ravel()
-        rows[HALF : HALF + 3] = self.half_sides
+        rows[R_AXES : R_AXES + 9] = (about_z @ _axes_of(*map(float, self.rotation))).ravel()
+        rows[R_HALF : R_HALF + 3] = self.half_sides
 
 
 def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.compare_scenes import Scene
+from clothgym.lab.compare_scenes import Scene
 from clothgym.render import Camera, Renderer
 
 if TYPE_CHECKING:
-    from clothgym.compare import Row, Setting
+    from clothgym.lab.compare import Row, Setting
 
 INK, QUIET = "#2b2d42", "#8d99ae"
 COLOURS = {
@@ -50,7 +50,7 @@ def pyplot() -> Any:
 
 def draw_work_precision(results: Row, path: Path) -> None:
     """Error over cost: a colour for each integrator, a line for each choice of its options."""
-    from clothgym.compare import LANES, told
+    from clothgym.lab.compare import LANES, told
 
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(9.6, 5.0), layout="constrained")

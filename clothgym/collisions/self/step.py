@@ -5,10 +5,10 @@ After each substep of any integrator, whose name it does not know:
 1. ``press_again``: contacts press as they did at the end of the substep before.  Then the solids have their say, which so bear
    what lies on them.
 2. ``repel``: those impulses are corrected, so that what is closer than the cloth's thickness no longer approaches, and slides no
-   more than friction allows; what is too close is pushed apart (see ``repulsion``).
-3. ``confine``: where a vertex has left its bound (see ``proximity``), the query is made anew at the last positions that are
+   more than friction allows; what is too close is pushed apart (see ``impulses``).
+3. ``confine``: where a vertex has left its bound (see ``narrow_phase``), the query is made anew at the last positions that are
    certified to be free of intersections, and in strict mode vertices that are beyond even their new bounds are drawn back to
-   them, and tied pairs are held (see ``confinement``).
+   them, and gap constraints are held (see ``displacement_bounds``).
 
 So in strict mode: if a sheet starts without intersections, then in every substep every vertex and triangle, and every two edges,
 without a common vertex are at a positive distance all the way, so none has passed through another.  That holds for what hands
@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, kernel
-from clothgym.collisions.candidates import Reach
-from clothgym.collisions.confinement import confine, note_uncertain
-from clothgym.collisions.pairs import Pairs
-from clothgym.collisions.proximity import GAP, LAG, ROWS
-from clothgym.collisions.repulsion import press_again, repel
+from clothgym.collisions.self.broad_phase import Reach
+from clothgym.collisions.self.displacement_bounds import confine, note_uncertain
+from clothgym.collisions.self.impulses import press_again, repel
+from clothgym.collisions.self.narrow_phase import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
+from clothgym.collisions.self.topology import Pairs
 
 PUSH = 0.5  # speed at which what is too close is pushed apart [m/s]
 
@@ -39,15 +39,16 @@ PUSH = 0.5  # speed at which what is too close is pushed apart [m/s]
 class Memory(NamedTuple):
     """What contact remembers, in blocks; all of it belongs to the state, or follows from it.
 
-    start: positions at the last query [m]; bounds, limits: squares of how far each vertex may go from there before tied pairs are
-    looked at, and before a query is due [m^2], or -1; old: the last certified positions [m]; lag: how far what is held is
+    start: positions at the last query [m]; bounds, limits: squares of how far each vertex may go from there before gap constraints
+    are looked at, and before a query is due [m^2], or -1; old: the last certified positions [m]; lag: how far what is held is
     behind its hand [m]; behind: the largest, (blocks, lanes).
-    contacts: how many, (blocks, lanes); particles, figures: see ``proximity``, (blocks, lanes, room, 4) and (..., FIGURES);
+    contacts: how many, (blocks, lanes); particles, coefficients: see ``narrow_phase``, (blocks, lanes, room, 4) and (..., C_SIZE);
     impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
-    contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  tight: how many
-    tied pairs, (blocks, lanes); ties, planes: see ``proximity``, (..., 11) and (..., 4); looks: at these since the last query.
+    contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  constraints: how
+    many gap constraints, (blocks, lanes); members, planes: see ``narrow_phase``, (..., 11) and (..., 4); looks: at these since the
+    last query.
     chosen: contacts that may act soon, ``choices`` of them.
-    used: lanes that are no padding, (blocks,).  report: see ``proximity``, (blocks, lanes, REPORT).
+    used: lanes that are no padding, (blocks,).  report: see ``narrow_phase``, (blocks, lanes, REPORT_SIZE).
     """
 
     start: NDArray
@@ -58,14 +59,14 @@ class Memory(NamedTuple):
     behind: NDArray
     contacts: NDArray
     particles: NDArray
-    figures: NDArray
+    coefficients: NDArray
     impulses: NDArray
     pressed: NDArray
     waited: NDArray
     span: NDArray
     aged: NDArray
-    tight: NDArray
-    ties: NDArray
+    constraints: NDArray
+    members: NDArray
     planes: NDArray
     looks: NDArray
     chosen: NDArray
@@ -75,13 +76,14 @@ class Memory(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Options as kernels see them: friction, push speed [m/s], and by how much contacts may move and be calm [m] in their dtype."""
+    """Options as kernels see them: friction, push speed [m/s], and by how much contacts may move and count as converged [m] in
+    their dtype."""
 
     strict: bool
     single: bool
     friction: Any
     push: Any
-    calm: Any
+    tolerance: Any
 
 
 class Sheet(NamedTuple):
@@ -102,9 +104,9 @@ def press(x, v, w, sheet, block, step, h, carried):
         for l in range(memory.used[block]):
             report = memory.report[block, l]
             report[:] = 0
-            report[GAP] = np.inf
-            report[ROWS] = memory.contacts[block, l]
-            report[LAG] = memory.behind[block, l]
+            report[REPORT_GAP] = np.inf
+            report[REPORT_CONTACTS] = memory.contacts[block, l]
+            report[REPORT_LAG] = memory.behind[block, l]
         if sheet.setting.single:
             note_uncertain(x, memory.report[block], memory.used[block])
     press_again(x, v, w, sheet, block, carried)

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.collisions.closest import closest_on_triangle
+from clothgym.geometry.closest_points import closest_on_triangle
 
 BAND = 2  # cells around a triangle's bounds in which distances to it are exact
-MARGIN = 3  # cells around the mesh's bounds
+PADDING = 3  # cells around the mesh's bounds
 SWEEPS = 2  # of all eight directions
 MOST_NODES = 2e7  # making them takes some 70 bytes each
 
@@ -38,8 +38,8 @@ def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> Dis
     """
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     cell = float((high - low).max()) / resolution
-    corner = low - MARGIN * cell
-    nodes = np.ceil((high - low) / cell) + 1 + 2 * MARGIN
+    corner = low - PADDING * cell
+    nodes = np.ceil((high - low) / cell) + 1 + 2 * PADDING
     if nodes.prod() > MOST_NODES:
         raise ValueError(
             f"resolution={resolution}: a grid of {nodes.prod():.2g} nodes: at most {MOST_NODES:.0g} are kept; take fewer cells"

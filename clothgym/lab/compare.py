@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import integrators
-from clothgym.bench import machine
-from clothgym.compare_scenes import FRAME, SCENES, Scene, scene_named
+from clothgym.lab.bench import machine
+from clothgym.lab.compare_scenes import FRAME, SCENES, Scene, scene_named
 from clothgym.simulation import Simulation
 
 Row = dict[str, Any]
@@ -219,7 +219,7 @@ def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
     Raises:
         ImportError: matplotlib is missing; nothing has been measured then.
     """
-    from clothgym import compare_pictures
+    from clothgym.lab import compare_pictures
 
     compare_pictures.pyplot()
     scene, settings, shown = plan.scene, plan.settings(), plan.shown()

@@ -9,30 +9,30 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.proximity import (
-    CLAMPED,
-    GROUP,
-    JAMMED,
-    KEPT,
-    LAG,
-    NUMBER,
-    OWN,
-    QUERIES,
-    ROWS,
+from clothgym.collisions.self.narrow_phase import (
+    G_GROUP,
+    G_KEPT,
+    G_NUMBER,
+    G_OWN,
+    G_VERTICES,
+    GROUP_JAMMED,
+    REPORT_CLAMPED,
+    REPORT_CONTACTS,
+    REPORT_LAG,
+    REPORT_QUERIES,
+    REPORT_UNCERTAIN,
     SHARE,
-    UNCERTAIN,
-    VERTICES,
     query,
 )
 
 INSIDE = 0.999  # of a bound that is used, for rounding
 REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
-PATIENCE = 4  # looks at all tied pairs after which a query, which frees the vertices again, is the cheaper
+PATIENCE = 4  # looks at all gap constraints after which a query, which frees the vertices again, is the cheaper
 AHEAD = 8  # substeps for which a query shall last: for fast vertices it looks farther
 FORESEEN = 1.0  # of the reach, the most that it looks beyond it for one
-HALVES = 4  # times that the way of a tied pair is halved before it stays
-PASSING = 8  # tied pairs passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
+HALVES = 4  # times that the way of a gap constraint is halved before it stays
+PASSING = 8  # gap constraints passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
 
 
 @inlined
@@ -52,18 +52,19 @@ def confine(x, v, w, sheet, block, h):
         _leave(x, start, bounds, limits, samples, left, out, far)
     beyond = np.empty(x.shape[1], np.bool_)
     for l in range(memory.used[block]):
-        # a query if something is beyond all bounds, or if a tied pair has come close in the direction that it had at the last one
+        # a query if something is beyond all bounds, or if a gap constraint has come close in the direction that it had at the last
+        # one
         if not out[l]:
             continue
         due = far[l]
         if not due and setting.strict:
             for p in range(x.shape[1]):
                 beyond[p] = left[p, l]
-            touched = np.empty(memory.tight[block, l], np.int32)
-            number = _list_touched(memory.ties[block, l], beyond, touched)
-            due, close = _comes_close(x, memory, block, l, touched[:number])
+            affected = np.empty(memory.constraints[block, l], np.int32)
+            number = _list_affected(memory.members[block, l], beyond, affected)
+            due, close = _comes_close(x, memory, block, l, affected[:number])
             if close and not due:
-                _hold_apart(x, v, w, sheet, block, l, beyond, touched, number)
+                _hold_apart(x, v, w, sheet, block, l, beyond, affected, number)
                 # what has stayed has not shared the motion of the others
                 _, due = _mark(x, start, bounds, limits, samples, l, beyond)
         if due:
@@ -153,9 +154,9 @@ def _catch_up(x, w, lag, l, h):
 def _renew(x, v, w, sheet, block, l, h, beyond):
     """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it.
 
-    Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a tie or since it
-    may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand holds does
-    not go with the others: else a jam would carry the hands away.
+    Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a constraint or
+    since it may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand
+    holds does not go with the others: else a jam would carry the hands away.
     """
     memory, particles = sheet.memory, x.shape[1]
     place, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
@@ -172,14 +173,14 @@ def _renew(x, v, w, sheet, block, l, h, beyond):
         if not together:
             mx, my, mz = zero, zero, zero
         _draw_back(x, v, memory, block, l, h, place, limits, held, mx, my, mz)
-        ties, planes, tight, close = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l], False
-        for t in range(tight):
-            close |= _is_close(x, ties, planes, t, l)
+        members, planes, constraints, close = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l], False
+        for t in range(constraints):
+            close |= _is_close(x, members, planes, t, l)
         if close:
             _draw_back(x, v, memory, block, l, h, place, limits, held, zero, zero, zero)
             beyond[:] = True
-            touched = np.empty(tight, np.int32)
-            _hold_apart(x, v, w, sheet, block, l, beyond, touched, _list_touched(ties, beyond, touched))
+            affected = np.empty(constraints, np.int32)
+            _hold_apart(x, v, w, sheet, block, l, beyond, affected, _list_affected(members, beyond, affected))
         _note_lag(w, memory, block, l)
 
 
@@ -197,7 +198,7 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
         square = dx * dx + dy * dy + dz * dz
         if square > limits[p]:
             keep = np.sqrt(limits[p] / square)
-            report[CLAMPED] += 1
+            report[REPORT_CLAMPED] += 1
             for c, s, m, d in ((0, sx, mx, dx), (1, sy, my, dy), (2, sz, mz, dz)):
                 # from the start, so that what may not move at all does not creep by rounding
                 goal = s + (m + keep * d)
@@ -209,95 +210,100 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
 
 
 @inlined
-def _touches(ties, t, beyond):
-    """Whether a tied pair has a vertex beyond its bound: one of the first four, or of what others it has."""
-    some = beyond[ties[t, VERTICES]] | beyond[ties[t, VERTICES + 1]] | beyond[ties[t, VERTICES + 2]] | beyond[ties[t, VERTICES + 3]]
-    for m in range(4, ties[t, NUMBER]):
-        some |= beyond[ties[t, VERTICES + m]]
+def _is_affected(members, t, beyond):
+    """Whether a gap constraint has a vertex beyond its bound: one of the first four, or of what others it has."""
+    some = (
+        beyond[members[t, G_VERTICES]]
+        | beyond[members[t, G_VERTICES + 1]]
+        | beyond[members[t, G_VERTICES + 2]]
+        | beyond[members[t, G_VERTICES + 3]]
+    )
+    for m in range(4, members[t, G_NUMBER]):
+        some |= beyond[members[t, G_VERTICES + m]]
     return some
 
 
 @kernel
-def _list_touched(ties, beyond, touched):
-    """List the tied pairs with a vertex beyond its bound, all there is room for; returns how many."""
+def _list_affected(members, beyond, affected):
+    """List the gap constraints with a vertex beyond its bound, all there is room for; returns how many."""
     number = 0
-    for t in range(touched.shape[0]):
-        touched[number] = t
-        number += _touches(ties, t, beyond)
+    for t in range(affected.shape[0]):
+        affected[number] = t
+        number += _is_affected(members, t, beyond)
     return number
 
 
 @kernel
-def _is_close(x, ties, planes, t, l):
-    """Whether a tied pair of one lane is closer than it may be."""
-    own = ties[t, OWN]
+def _is_close(x, members, planes, t, l):
+    """Whether a gap constraint of one lane is closer than it may be."""
+    own = members[t, G_OWN]
     nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
     low, high = np.inf, -np.inf
-    for m in range(ties[t, NUMBER]):
-        p = ties[t, VERTICES + m]
+    for m in range(members[t, G_NUMBER]):
+        p = members[t, G_VERTICES + m]
         place = nx * x[0, p, l] + ny * x[1, p, l] + nz * x[2, p, l]
         if m < own:
             low = min(low, place)
         else:
             high = max(high, place)
     # not what is not a number: that has diverged, and is not held
-    return low - high < planes[t, KEPT]
+    return low - high < planes[t, G_KEPT]
 
 
 @kernel
-def _comes_close(x, memory, block, l, touched):
-    """Whether a query is due for tied pairs of one lane, and whether one that is touched is closer than it may be.
+def _comes_close(x, memory, block, l, affected):
+    """Whether a query is due for gap constraints of one lane, and whether one that is affected is closer than it may be.
 
     Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
     looked at than it is worth.
     """
-    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], memory.tight[block, l]
+    members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
     due, close = False, False
-    for c in range(touched.shape[0]):
-        if _is_close(x, ties, planes, touched[c], l):
+    for c in range(affected.shape[0]):
+        if _is_close(x, members, planes, affected[c], l):
             close = True
-            due |= ties[touched[c], GROUP] != JAMMED
-    memory.looks[block, l] += tight // PASSING + touched.shape[0]
-    return due or memory.looks[block, l] > PATIENCE * tight, close
+            due |= members[affected[c], G_GROUP] != GROUP_JAMMED
+    memory.looks[block, l] += constraints // PASSING + affected.shape[0]
+    return due or memory.looks[block, l] > PATIENCE * constraints, close
 
 
 @apart
-def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
-    """Where a tied pair of one lane would come closer than it may, halve the way of its vertices, and in the end leave them where
-    they were; others may follow.
+def _hold_apart(x, v, w, sheet, block, l, beyond, affected, number):
+    """Where a gap constraint of one lane would come closer than it may, halve the way of its vertices, and in the end leave them
+    where they were; others may follow.
 
-    touched: room for all tied pairs; the first ``number`` are those with a vertex beyond its bound.
+    affected: room for all gap constraints; the first ``number`` are those with a vertex beyond its bound.
     """
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
-    ties, planes, tight = memory.ties[block, l], memory.planes[block, l], touched.shape[0]
+    members, planes, constraints = memory.members[block, l], memory.planes[block, l], affected.shape[0]
     zero, half = x.dtype.type(0), x.dtype.type(0.5)
     going = False
     for c in range(number):
-        if _is_close(x, ties, planes, touched[c], l):
-            ties[touched[c], GROUP] = JAMMED
+        if _is_close(x, members, planes, affected[c], l):
+            members[affected[c], G_GROUP] = GROUP_JAMMED
             going = True
     halved = np.zeros(x.shape[1], np.int64)
     while going:
-        # in their order, round by round; once others are touched, the rest of the round looks at all
+        # in their order, round by round; once others are affected, the rest of the round looks at all
         going, spread, c, t = False, False, 0, -1
         while c < number or spread:
             if spread:
                 t += 1
-                if t == tight:
+                if t == constraints:
                     break
-                if not _touches(ties, t, beyond):
+                if not _is_affected(members, t, beyond):
                     continue
             else:
-                t = touched[c]
+                t = affected[c]
                 c += 1
-            if not _is_close(x, ties, planes, t, l):
+            if not _is_close(x, members, planes, t, l):
                 continue
-            for m in range(ties[t, NUMBER]):
-                p = ties[t, VERTICES + m]
+            for m in range(members[t, G_NUMBER]):
+                p = members[t, G_VERTICES + m]
                 if halved[p] > HALVES:
                     continue
-                report[CLAMPED] += halved[p] == 0
+                report[REPORT_CLAMPED] += halved[p] == 0
                 halved[p] += 1
                 going = True
                 spread |= not beyond[p]
@@ -313,7 +319,7 @@ def _hold_apart(x, v, w, sheet, block, l, beyond, touched, number):
                         v[k, p, l] *= share
                     x[k, p, l] = place
         if spread:
-            number = _list_touched(ties, beyond, touched)
+            number = _list_affected(members, beyond, affected)
     _note_lag(w, memory, block, l)
 
 
@@ -326,7 +332,7 @@ def _note_lag(w, memory, block, l):
         if w[p, l] <= 0:
             largest = max(largest, lag[0, p, l] * lag[0, p, l] + lag[1, p, l] * lag[1, p, l] + lag[2, p, l] * lag[2, p, l])
     memory.behind[block, l] = np.sqrt(largest)
-    memory.report[block, l, LAG] = max(memory.report[block, l, LAG], np.float64(memory.behind[block, l]))
+    memory.report[block, l, REPORT_LAG] = max(memory.report[block, l, REPORT_LAG], np.float64(memory.behind[block, l]))
 
 
 @inlined
@@ -347,14 +353,14 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
             start[c, k, l] = x[c, k, l]
             p[k, c] = x[c, k, l]
     report = memory.report[block, l]
-    report[QUERIES] += 1
+    report[REPORT_QUERIES] += 1
     before = memory.contacts[block, l]
     known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
-    count, tight = query(
-        p, sheet.pairs, sheet.reach, extra, held, room, free, memory.particles[block, l], memory.figures[block, l],
-        memory.ties[block, l], memory.planes[block, l], report,
+    count, constraints = query(
+        p, sheet.pairs, sheet.reach, extra, held, room, free, memory.particles[block, l], memory.coefficients[block, l],
+        memory.members[block, l], memory.planes[block, l], report,
     )  # fmt: skip
-    memory.tight[block, l] = tight
+    memory.constraints[block, l] = constraints
     if not setting.strict:
         room[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
         free[:] = room + 2.0 * SHARE * extra
@@ -369,7 +375,7 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
     memory.looks[block, l] = memory.span[block, l] = 0
     if count == 0:
         memory.pressed[block, :, :, l] = 0
-    report[ROWS] = count
+    report[REPORT_CONTACTS] = count
 
 
 @kernel
@@ -383,7 +389,7 @@ def note_uncertain(x, report, used):
                 farthest[l] = max(farthest[l], abs(xc[l]))
     for l in range(used):
         if farthest[l] > FARTHEST and farthest[l] < np.inf:
-            report[l, UNCERTAIN] = 1
+            report[l, REPORT_UNCERTAIN] = 1
 
 
 @kernel

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from clothgym.bench import machine
-from clothgym.bench_limits import PlainSheet, Work, measure_limits, stand
+from clothgym.lab.bench import machine
+from clothgym.lab.bench_limits import PlainSheet, Work, measure_limits, stand
 
 Row = dict[str, Any]
 ROUNDS = 15
@@ -153,8 +153,8 @@ def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]
     Raises:
         ValueError: a group that there is not.
     """
-    from clothgym.bench_cases import GROUPS as SHORT  # each looks at the other's rows
-    from clothgym.bench_episodes import GROUPS as LONG
+    from clothgym.lab.bench_cases import GROUPS as SHORT  # each looks at the other's rows
+    from clothgym.lab.bench_episodes import GROUPS as LONG
 
     known = {**SHORT, **LONG}
     for name in select:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from clothgym.bench_limits import (
+from clothgym.lab.bench_limits import (
     DAMPED_PROJECTION,
     HINGE,
     PARTICLE,
@@ -20,7 +20,7 @@ from clothgym.bench_limits import (
     PlainSheet,
     Work,
 )
-from clothgym.bench_table import Case
+from clothgym.lab.bench_table import Case
 from clothgym.material import Material
 from clothgym.mesh import SHEAR, ClothMesh, grid
 from clothgym.simulation import Simulation

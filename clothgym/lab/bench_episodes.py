@@ -19,12 +19,12 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.bench_mujoco import measure_mujoco, measure_ours
-from clothgym.bench_table import Row, beat, row_of
-from clothgym.crumpling import Fold, Manoeuvre, ZFold
+from clothgym.lab.bench_mujoco import measure_mujoco, measure_ours
+from clothgym.lab.bench_table import Row, beat, row_of
 from clothgym.mesh import grid
 from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
+from clothgym.starts import Fold, Manoeuvre, ZFold
 
 DRAPE = "ClothDrape-v0"
 MANY, STEPS = 128, 100  # environments and steps of an episode
@@ -256,7 +256,7 @@ def mujoco() -> list[Row]:
 
 FIRST_STEP = "import gymnasium as gym; e = gym.make('clothgym:{}'); e.reset(seed=0); e.step(e.action_space.sample())"
 ALL_PHYSICS = (
-    "from clothgym.bench_episodes import make; "
+    "from clothgym.lab.bench_episodes import make; "
     "e = make('{}', contact='sheet', self_collision='strict', bending='quadratic'); "
     "e.reset(seed=0); e.step(e.action_space.sample())"
 )

@@ -1,0 +1,68 @@
+"""How deep the sheet's surface is in the solids, without the thickness that contact keeps; on request only."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import kernel
+from clothgym.collisions.solids.deepest_point import find_deepest
+from clothgym.collisions.solids.shapes import KIND_PLANE, R_THICKNESS
+from clothgym.collisions.solids.signed_distance import (
+    S_CLEAR,
+    S_CONTACT,
+    S_CORE,
+    S_CORNERS,
+    S_SPOT,
+    SCRATCH_ROWS,
+    lay_out,
+    measure,
+    to_axes,
+)
+
+FINENESS = 4  # points of a triangle with weights in quarters: 15
+
+
+@kernel
+def deepest(first, last, x, triangles, shapes, colliders, out):
+    """Depth of the deepest point of each lane's triangles in any collider [m], at least 0, (blocks, lanes).
+
+    Of the triangle's points with weights in quarters, the deepest is where ``find_deepest`` begins; the deeper of both counts.
+    """
+    zero = x.dtype.type(0)
+    for b in range(first, last):
+        scratch = np.empty((SCRATCH_ROWS, x.shape[3]), x.dtype)
+        start = np.empty((4, x.shape[3]), x.dtype)
+        for k in range(colliders.shape[1]):
+            lay_out(colliders[b, k], scratch)
+            for t in range(triangles.shape[0]):
+                for c in range(3):
+                    to_axes(x[b], triangles[t, c], scratch, S_CORNERS + 3 * c)
+                scratch[S_CLEAR] = 0
+                start[:] = x.dtype.type(np.inf)
+                for i in range(FINENESS + 1):
+                    for j in range(FINENESS + 1 - i):
+                        _sample(scratch, i, j, shapes, k, start)
+                scratch[S_SPOT : S_SPOT + 3] = start[1:4]
+                if shapes.kinds[k] != KIND_PLANE and find_deepest(scratch, shapes, k):
+                    for l in range(x.shape[3]):
+                        start[0, l] = min(start[0, l], scratch[S_CONTACT, l])
+                for l in range(x.shape[3]):
+                    out[b, l] = max(out[b, l], max(-(start[0, l] + scratch[R_THICKNESS, l]), zero))
+
+
+@kernel
+def _sample(scratch, i, j, shapes, k, best):
+    """Keep the point with weights ``i`` and ``j`` quarters where it is deeper than the best: distance and place, (4, lanes)."""
+    u, v = scratch.dtype.type(i / FINENESS), scratch.dtype.type(j / FINENESS)
+    w = scratch.dtype.type((FINENESS - i - j) / FINENESS)
+    for c in range(3):
+        for l in range(scratch.shape[1]):
+            scratch[S_CORE + c, l] = (
+                w * scratch[S_CORNERS + c, l] + u * scratch[S_CORNERS + 3 + c, l] + v * scratch[S_CORNERS + 6 + c, l]
+            )
+    measure(scratch, S_CORE, shapes, k, scratch.dtype.type(0))
+    for l in range(scratch.shape[1]):
+        if scratch[S_CONTACT, l] < best[0, l]:
+            best[0, l] = scratch[S_CONTACT, l]
+            for c in range(3):
+                best[1 + c, l] = scratch[S_CORE + c, l]
