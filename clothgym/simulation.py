@@ -390,7 +390,7 @@ class Simulation(Observed):
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
             **self._solids.public(),
-            **self._contact.public(),
+            self_contact=self._contact.public(),
             steps=self._steps.copy(),
             diverged=self.diverged,
             sheet=self._sheet,

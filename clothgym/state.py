@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices
+from clothgym.contact_memory import SAVED
 from clothgym.elements import SpringArrays
 from clothgym.mesh import NUM_KINDS, ClothMesh
 
@@ -162,17 +163,7 @@ class State:
         parameters: the material figures they came from, (num_envs, figures).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
-        contact_start, contact_bounds, contact_limits: where each vertex was when self-collision last looked around it [m],
-            (num_envs, particles, 3), and the squares of how far it may go from there, see ``collisions.proximity`` [m^2],
-            (num_envs, particles), negative where it has not looked; no particles without self-collision.
-        contact_lag: how far held particles are behind their hands [m], (num_envs, particles, 3).
-        contact_count: the sheet's contacts with itself, (num_envs,); contact_particles, contact_coefficients: see
-            ``collisions.proximity``; contact_impulses: theirs [N s], (num_envs, contacts, ...).
-        contact_pressed: what these change velocities by in a substep [m/s], (num_envs, particles, 3); contact_waited, contact_span:
-            substeps since they were last corrected, and after which they are again, (num_envs,).
-        contact_constraints: its pairs that may come no closer, contact_looks: looks at these since then, (num_envs,);
-            contact_members,
-            contact_planes: see there, (num_envs, pairs, ...).
+        self_contact: what the sheet's contact with itself remembers, by the names of ``contact_memory.SAVED``.
         steps: control steps since the environment's reset, (num_envs,).
         diverged: whether something was not finite, or faster than cloth can be, since then, (num_envs,).
         sheet: digest of the mesh and of what bends, the same for all, ().
@@ -197,28 +188,19 @@ class State:
     parameters: NDArray
     colliders: NDArray
     collider_homes: NDArray
-    contact_start: NDArray
-    contact_bounds: NDArray
-    contact_limits: NDArray
-    contact_lag: NDArray
-    contact_count: NDArray
-    contact_particles: NDArray
-    contact_coefficients: NDArray
-    contact_impulses: NDArray
-    contact_constraints: NDArray
-    contact_looks: NDArray
-    contact_pressed: NDArray
-    contact_waited: NDArray
-    contact_span: NDArray
-    contact_members: NDArray
-    contact_planes: NDArray
+    self_contact: dict[str, NDArray]
     steps: NDArray
     diverged: NDArray
     sheet: NDArray
 
+    def arrays(self) -> dict[str, NDArray]:
+        """All arrays by name; those of contact are ``self_contact.start`` and so on."""
+        own = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "self_contact"}
+        return own | {f"self_contact.{name}": array for name, array in self.self_contact.items()}
+
     def save(self, path: str | Path) -> None:
         """Write as ``npz`` without pickle."""
-        np.savez(path, **{field.name: getattr(self, field.name) for field in fields(self)})
+        np.savez(path, **self.arrays())  # type: ignore[arg-type]
 
     @staticmethod
     def load(path: str | Path) -> State:
@@ -233,10 +215,12 @@ class State:
         except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
             raise ValueError(f"{str(path)!r} is not a state: give a file that State.save wrote") from error
         with loaded as file:
-            missing = [field.name for field in fields(State) if field.name not in file]
+            own = [field.name for field in fields(State) if field.name != "self_contact"]
+            missing = [name for name in [*own, *(f"self_contact.{name}" for name in SAVED)] if name not in file]
             if missing:
                 raise ValueError(f"{str(path)!r} is not a state of this version of clothgym: it lacks {', '.join(missing)}")
-            return State(**{field.name: file[field.name] for field in fields(State)})
+            contact = {name: file[f"self_contact.{name}"] for name in SAVED}
+            return State(**{name: file[name] for name in own}, self_contact=contact)
 
 
 def check_fits(state: State, own: State) -> None:
@@ -248,8 +232,11 @@ def check_fits(state: State, own: State) -> None:
     advice = "give what get_state() gave, or State.load(path)"
     if not isinstance(state, State):
         raise ValueError(f"state={state!r}: {advice}")
-    for field in fields(State):
-        name, given, kept = field.name, getattr(state, field.name), np.asarray(getattr(own, field.name))
+    if not isinstance(state.self_contact, dict) or set(state.self_contact) != set(SAVED):
+        raise ValueError(f"the state's self_contact must be a dict of {', '.join(SAVED)}: {advice}")
+    given_arrays, own_arrays = state.arrays(), own.arrays()
+    for name, given in given_arrays.items():
+        kept = np.asarray(own_arrays[name])
         if not isinstance(given, (np.ndarray, np.generic)) or given.dtype.kind not in ALIKE[kept.dtype.kind]:
             raise ValueError(f"the state's {name} is no array of {kept.dtype.name}: {advice}")
     if state.positions.shape != own.positions.shape:
@@ -265,7 +252,7 @@ def check_fits(state: State, own: State) -> None:
         raise ValueError(
             "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's"
         )
-    names = [field.name for field in fields(State) if not field.name.startswith("contact_") and field.name != "sheet"]
+    names = [field.name for field in fields(State) if field.name not in ("self_contact", "sheet")]
     for name in names:
         here, there = getattr(own, name).shape, getattr(state, name).shape
         if there != here:
@@ -298,7 +285,7 @@ def at_rest(
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
     anchors: particles, (anchors,).  hands: how many.  parameters: (figures,).  gravity, wind: (3,).  colliders: (colliders,
-    rows).  contact: arrays of self-collision.
+    rows).  contact: of self-collision, see ``contact_memory.blank``.
     """
 
     def each(value: NDArray) -> NDArray:
@@ -324,7 +311,7 @@ def at_rest(
         parameters=each(parameters),
         colliders=each(colliders),
         collider_homes=each(colliders),
-        **contact,
+        self_contact=contact,
         steps=np.zeros(num_envs, np.int64),
         diverged=np.zeros(num_envs, bool),
         sheet=sheet,

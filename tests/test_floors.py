@@ -15,6 +15,7 @@ FLOORS = {
     "clothgym.geometry": 1,
     "clothgym.wind": 1,
     "clothgym.elements": 2,
+    "clothgym.contact_memory": 2,
     "clothgym.state": 2,
     "clothgym.parameters": 2,
     "clothgym.bending": 3,

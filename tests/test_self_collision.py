@@ -6,11 +6,12 @@ from exact_intersections import intersecting_pairs
 from folded import SIDE, sheet, three_layers
 
 import clothgym
-from clothgym.collisions.self import owner
+from clothgym import contact_memory
 from clothgym.collisions.self.broad_phase import Reach, enclose, far_leaves
 from clothgym.collisions.self.impulses import FASTEST, _correct
-from clothgym.collisions.self.narrow_phase import C_SIZE, G_SIZE, REPORT_SIZE, query
+from clothgym.collisions.self.narrow_phase import query
 from clothgym.collisions.self.topology import pairs_of
+from clothgym.contact_memory import C_SIZE, G_SIZE, REPORT_SIZE
 from clothgym.starts import MANOEUVRES
 
 
@@ -70,10 +71,10 @@ def pairs_by_sampling(mesh, x, points=25):
                 yield np.array([p]), triangles[t], np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
 
 
-def looked_around(mesh, x, extra, members):
+def looked_around(mesh, x, extra, most):
     """Bounds and limits of a query with a reach of 6 cm."""
     bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT_SIZE)
-    room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((members, G_SIZE), np.int32), np.empty((members, 4))
+    room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((most, G_SIZE), np.int32), np.empty((most, 4))
     held = np.zeros(len(x), bool)
     _, constraints = query(
         x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0), extra, held, bounds, limits, *room, report
@@ -104,14 +105,14 @@ def test_a_bound_is_no_larger_than_its_share_of_the_true_distance(seed):
     assert np.array_equal(bounds, limits)  # nothing is constrained
 
 
-@pytest.mark.parametrize("members", [0, 4000])
-def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(members):
+@pytest.mark.parametrize("most", [0, 4000])
+def test_limits_of_what_looks_farther_keep_apart_what_is_not_constrained(most):
     """Some vertices are fast and may go farther: what they may go in all is less than the distance, but for gap constraints."""
     mesh, x = crumpled_strip(0)
     random = np.random.default_rng(1)
     extra = np.where(random.random(len(x)) < 0.3, random.uniform(0, 0.06, len(x)), 0.0)
-    bounds, limits, constrained = looked_around(mesh, x, extra, members)
-    assert len(constrained) < max(members, 1)  # there was room
+    bounds, limits, constrained = looked_around(mesh, x, extra, most)
+    assert len(constrained) < max(most, 1)  # there was room
     known = {frozenset(row[3 : 3 + row[1]].tolist()) for row in constrained}
     checked = 0
     for one, other, gap in pairs_by_sampling(mesh, x, 13):
@@ -121,7 +122,7 @@ def test_limits_of_what_looks_farther_keep_apart_what_is_not_tied(members):
             checked += gap < 0.12
         assert bounds[one].max() + bounds[other].max() <= 0.9 * gap
     assert checked > 100
-    assert members == 0 or limits.max() > 0.05  # those that are fast gain by it
+    assert most == 0 or limits.max() > 0.05  # those that are fast gain by it
 
 
 # --- nothing passes through itself ------------------------------------------------------------------------------------------
@@ -167,7 +168,7 @@ def test_a_thin_sheet_that_is_wrung_does_not_intersect_with_it():
 
 def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
     """What may not move at all stays to the bit: if it crept by rounding, it would come through in time."""
-    monkeypatch.setattr(owner, "CONSTRAINTS", 0)
+    monkeypatch.setitem(contact_memory.ROWS, "constraints", 0)
     mesh = sheet(9)
     option = {"mode": "strict", "thickness": 0.012}
     wring = MANOEUVRES["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)

@@ -9,20 +9,18 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.self.narrow_phase import (
+from clothgym.collisions.self.narrow_phase import GROUP_JAMMED, SHARE, query
+from clothgym.contact_memory import (
     G_GROUP,
     G_KEPT,
     G_NUMBER,
     G_OWN,
     G_VERTICES,
-    GROUP_JAMMED,
     REPORT_CLAMPED,
     REPORT_CONTACTS,
     REPORT_LAG,
     REPORT_QUERIES,
     REPORT_UNCERTAIN,
-    SHARE,
-    query,
 )
 
 INSIDE = 0.999  # of a bound that is used, for rounding

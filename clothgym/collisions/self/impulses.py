@@ -16,7 +16,8 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, disjoint, inlined, kernel
-from clothgym.collisions.self.narrow_phase import C_NORMAL, C_THICKNESS, REPORT_TOUCHING, SLOP
+from clothgym.collisions.self.narrow_phase import SLOP
+from clothgym.contact_memory import C_NORMAL, C_THICKNESS, REPORT_TOUCHING
 
 RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
 SPAN = 4  # substeps between two sweeps over contacts that have converged; over others a sweep goes in each

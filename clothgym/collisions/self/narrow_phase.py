@@ -25,34 +25,25 @@ import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.self.broad_phase import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
+from clothgym.contact_memory import (
+    C_NORMAL,
+    C_THICKNESS,
+    G_GROUP,
+    G_KEPT,
+    G_NUMBER,
+    G_OWN,
+    G_SIZE,
+    G_VERTICES,
+    REPORT_DROPPED,
+    REPORT_GAP,
+)
 from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle, segments_apart
 
 LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
 LOOSE = 0.8  # of the reach below which pairs are constrained
 SHARE = 0.45  # of a pair's distance that each side may use; below a half
 SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
-# what is told of each environment, see ``owner.SelfContacts``
-REPORT_CONTACTS, REPORT_TOUCHING, REPORT_CLAMPED, REPORT_QUERIES, REPORT_DROPPED, REPORT_GAP, REPORT_LAG, REPORT_UNCERTAIN = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-)
-REPORT_SIZE = 8
-# what is kept of a contact beside its four particles, (room, 4): the gap is n.(sum of weights times positions), with n a unit
-# vector from the second primitive to the first; the thickness is the gap at which it acts [m]
-C_NORMAL, C_THICKNESS = 4, 7  # after the weights
-C_SIZE = 8
-# of a gap constraint: a unit vector from the second primitive to the first, and the distance along it that it keeps [m], (room, 4)
-G_KEPT = 3
-# and how many vertices are the first primitive's, how many all are, the pair of leaves, -1 or GROUP_JAMMED, and the vertices,
-# (room, G_SIZE)
-G_OWN, G_NUMBER, G_GROUP, G_VERTICES, G_SIZE = 0, 1, 2, 3, 11
-GROUP_JAMMED = -2
+GROUP_JAMMED = -2  # in the place of a pair of leaves: held since the last query
 MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
 
 

@@ -9,29 +9,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym import contact_memory
 from clothgym._jit import kernel
 from clothgym.checks import not_negative, positive
 from clothgym.collisions.self.broad_phase import Reach, far_pairs, far_sides
 from clothgym.collisions.self.displacement_bounds import FARTHEST
 from clothgym.collisions.self.impulses import TOLERANCE
-from clothgym.collisions.self.narrow_phase import (
+from clothgym.collisions.self.narrow_phase import MARGIN, edge_contacts, gap_of_edges, gap_of_vertex, vertex_contacts
+from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
+from clothgym.collisions.self.topology import Pairs, pairs_of
+from clothgym.contact_memory import (
     C_SIZE,
-    G_NUMBER,
-    G_OWN,
     G_SIZE,
-    G_VERTICES,
-    MARGIN,
     REPORT_GAP,
     REPORT_LAG,
     REPORT_SIZE,
     REPORT_UNCERTAIN,
-    edge_contacts,
-    gap_of_edges,
-    gap_of_vertex,
-    vertex_contacts,
 )
-from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
-from clothgym.collisions.self.topology import Pairs, pairs_of
 from clothgym.geometry.intersections import first_intersection
 from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
@@ -39,8 +33,6 @@ from clothgym.state import Layout, State
 MODES = ("fast", "strict")
 REACH = 1.4  # how far a query sees, in thicknesses
 CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a contact
-ROOM = 12  # contacts for each vertex; more are counted as dropped
-CONSTRAINTS = 24  # gap constraints for each vertex; more bound their vertices instead
 STOP = 0.125  # thicknesses at which gap constraints are held
 STANDOFF = 0.25  # thicknesses at which what is held stops
 USUAL = 0.28  # thickness where none is given, over the shortest distance at rest of what does not hang together
@@ -55,8 +47,6 @@ BEYOND = (
     f"within {FARTHEST:g} m float32 can certify that a sheet does not intersect itself; move the scene to the origin, or take "
     "dtype='float64'"
 )
-# what ``Memory`` and ``State`` keep of each contact or gap constraint, and what counts them
-ROW_ARRAYS = {"particles": "count", "coefficients": "count", "impulses": "count", "members": "constraints", "planes": "constraints"}
 
 
 class SelfContacts(NamedTuple):
@@ -181,135 +171,43 @@ class SelfCollision:
             )
 
     def begin(self, block: NDArray, lane: NDArray, x: NDArray) -> None:
-        """Start anew, with a query due at positions x in blocks [m]."""
-        if self.options is None:
-            return
-        memory = self.sheet.memory
-        for array in (memory.start, memory.old):
-            array[block, :, :, lane] = x[block, :, :, lane]
-        memory.bounds[block, :, lane] = memory.limits[block, :, lane] = -1
-        memory.lag[block, :, :, lane] = 0
-        memory.behind[block, lane] = 0
-        memory.contacts[block, lane] = 0
-        memory.constraints[block, lane] = 0
-        memory.looks[block, lane] = memory.waited[block, lane] = memory.span[block, lane] = 0
-        memory.pressed[block, :, :, lane] = 0
-        memory.report[block, lane] = 0
-        self._reported[block * self.layout.lanes + lane] = False
+        """Forget some environments' contacts: a query is due at positions x in blocks [m]."""
+        if self.options is not None:
+            contact_memory.begin(self.sheet.memory, block, lane, x)
+            self._reported[block * self.layout.lanes + lane] = False
 
     def blank(self) -> dict[str, NDArray]:
-        """The arrays of ``State`` that are contact's where every query is due."""
-        num_envs, particles = self.layout.num_envs, 0 if self.options is None else self.sheet.memory.bounds.shape[1]
-        return {
-            "contact_start": np.zeros((num_envs, particles, 3)),
-            "contact_bounds": np.full((num_envs, particles), -1.0),
-            "contact_limits": np.full((num_envs, particles), -1.0),
-            "contact_lag": np.zeros((num_envs, particles, 3)),
-            "contact_count": np.zeros(num_envs, np.int32),
-            "contact_particles": np.zeros((num_envs, 0, 4), np.int32),
-            "contact_coefficients": np.zeros((num_envs, 0, C_SIZE)),
-            "contact_impulses": np.zeros((num_envs, 0, 3)),
-            "contact_constraints": np.zeros(num_envs, np.int32),
-            "contact_looks": np.zeros(num_envs, np.int32),
-            "contact_pressed": np.zeros((num_envs, particles, 3)),
-            "contact_waited": np.zeros(num_envs, np.int32),
-            "contact_span": np.zeros(num_envs, np.int32),
-            "contact_members": np.zeros((num_envs, 0, G_SIZE), np.int32),
-            "contact_planes": np.zeros((num_envs, 0, 4)),
-        }
+        """What a state holds where every query is due."""
+        return contact_memory.blank(self.layout.num_envs, self._particles)
 
     def public(self) -> dict[str, NDArray]:
-        """The arrays of ``State`` that are contact's; no more contacts than some environment has."""
-        if self.options is None:
-            return self.blank()
-        memory, public, vectors = self.sheet.memory, self.layout.to_public, self.layout.vectors_to_public
-        state = {
-            "contact_start": vectors(memory.start),
-            "contact_bounds": public(memory.bounds),
-            "contact_limits": public(memory.limits),
-            "contact_lag": vectors(memory.lag),
-            "contact_count": public(memory.contacts),
-            "contact_constraints": public(memory.constraints),
-            "contact_looks": public(memory.looks),
-            "contact_pressed": vectors(memory.pressed),
-            "contact_waited": public(memory.waited),
-            "contact_span": public(memory.span),
-        }
-        for name, counted in ROW_ARRAYS.items():
-            array, count = getattr(memory, name), state[f"contact_{counted}"]
-            used = array.reshape(-1, *array.shape[2:])[: self.layout.num_envs, : count.max()]
-            there = np.arange(used.shape[1]) < count[:, None]
-            state[f"contact_{name}"] = np.where(there[:, :, None], used, 0)
-        # nothing has written what lies behind a pair's vertices
-        members = state["contact_members"]
-        members[np.arange(G_SIZE) >= G_VERTICES + members[:, :, G_NUMBER, None]] = 0
-        return state
+        """What a state holds of this batch."""
+        return self.blank() if self.options is None else contact_memory.public(self.sheet.memory, self.layout)
 
     def check_memory(self, state: State) -> None:
-        """Refuse contacts that this simulation cannot have had: kernels would look for them beyond their arrays.
+        """Refuse contacts that this simulation cannot have had.
 
         Raises:
             ValueError: what is wrong.
         """
-        if self.options is None:
-            return
-        memory, particles = self.sheet.memory, self.sheet.memory.bounds.shape[1]
-        advice = "give what get_state() of such a simulation gave"
-        for name, blank in self.blank().items():
-            given, array = getattr(state, name), name.removeprefix("contact_")
-            rows = given.shape[1] if given.ndim > 1 else 0
-            if array in ROW_ARRAYS:
-                count = getattr(state, f"contact_{ROW_ARRAYS[array]}")
-                fits = given.shape[::2] == blank.shape[::2] and count.min() >= 0 and count.max() <= rows
-                fits = fits and rows <= getattr(memory, array).shape[2]
-            else:
-                fits = given.shape == blank.shape
-            if not fits:
-                raise ValueError(f"the state's {name} has shape {given.shape}, which is none of this simulation's: {advice}")
-            # what a pair may come no closer than is infinite where it may not move
-            wrong = np.isnan(given) if array == "planes" else ~np.isfinite(given)
-            if wrong[~state.diverged].any():
-                raise ValueError(f"the state's {name} holds a value that is not finite: {advice}")
-        for name in ("contact_looks", "contact_waited", "contact_span"):
-            if getattr(state, name).min() < 0:
-                raise ValueError(f"the state's {name} holds {getattr(state, name).min()}, and counts: {advice}")
-        for name, vertices in (("particles", state.contact_particles), ("members", state.contact_members[:, :, G_VERTICES:])):
-            if np.any((vertices < 0) | (vertices >= particles)):
-                raise ValueError(f"the state's contact_{name} name particles beyond the {particles} of the sheet: {advice}")
-        own, number = state.contact_members[:, :, G_OWN], state.contact_members[:, :, G_NUMBER]
-        if np.any((own < 0) | (number < own) | (number > G_SIZE - G_VERTICES)):
-            raise ValueError(f"the state's contact_members count more vertices than a pair has: {advice}")
+        contact_memory.check(state.self_contact, self.layout, self._particles, ~state.diverged)
 
     def restore(self, state: State, x: NDArray) -> None:
         """Take over from a state, with positions x in blocks [m]."""
-        if self.options is None:
-            return
-        memory, blocks, vectors = self.sheet.memory, self.layout.to_blocks, self.layout.vectors_to_blocks
-        env = np.arange(self.layout.num_envs)
-        block, lane = self.layout.place(env)
-        self.begin(block, lane, x)
-        memory.lag[:] = vectors(state.contact_lag, self.dtype)
-        memory.behind[:] = np.sqrt((memory.lag**2).sum(axis=1)).max(axis=1)
-        due = np.any(state.contact_bounds < 0, axis=1).reshape(-1)
-        start = np.where(due[:, None, None], self.layout.vectors_to_public(x), state.contact_start)
-        memory.start[block, :, :, lane] = np.swapaxes(start, 1, 2)
-        memory.bounds[:] = blocks(state.contact_bounds, self.dtype)
-        memory.limits[:] = blocks(state.contact_limits, self.dtype)
-        memory.contacts[block, lane] = state.contact_count
-        memory.constraints[block, lane] = state.contact_constraints
-        memory.looks[block, lane] = state.contact_looks
-        memory.pressed[:] = vectors(state.contact_pressed, self.dtype)
-        memory.waited[block, lane] = state.contact_waited
-        memory.span[block, lane] = state.contact_span
-        for name in ROW_ARRAYS:
-            array = getattr(state, f"contact_{name}")
-            getattr(memory, name)[block, lane, : array.shape[1]] = array
+        if self.options is not None:
+            contact_memory.restore(self.sheet.memory, state.self_contact, self.layout, x)
+            self._reported[:] = False
+
+    @property
+    def _particles(self) -> int:
+        """How many particles contact remembers."""
+        return 0 if self.options is None else self.sheet.memory.bounds.shape[1]
 
     def forgive(self, who: NDArray, blocks: slice = slice(None)) -> None:
         """Take from particles, (blocks, particles, lanes), what they lag: one that has left a hand owes the next one nothing."""
         memory = self.sheet.memory
         np.moveaxis(memory.lag[blocks], 1, 3)[who] = 0
-        memory.behind[blocks] = np.sqrt((memory.lag[blocks] ** 2).sum(axis=1)).max(axis=1)
+        memory.behind[blocks] = contact_memory.largest_lag(memory.lag[blocks])
 
     def warn(self, steps: NDArray) -> None:
         """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""
@@ -340,33 +238,8 @@ class SelfCollision:
 
 def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
     """Room for a batch."""
-    shape, room = (layout.blocks, layout.lanes), ROOM * particles
     used = np.clip(layout.num_envs - layout.lanes * np.arange(layout.blocks), 0, layout.lanes)
-    return Memory(
-        start=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
-        bounds=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
-        limits=np.full((layout.blocks, particles, layout.lanes), -1, dtype),
-        old=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
-        lag=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
-        behind=np.zeros(shape, dtype),
-        contacts=np.zeros(shape, np.int32),
-        # contacts are written where they are needed only: an operating system gives no memory to what has never been touched
-        particles=np.empty((*shape, room, 4), np.int32),
-        coefficients=np.empty((*shape, room, C_SIZE), dtype),
-        constraints=np.zeros(shape, np.int32),
-        members=np.empty((*shape, CONSTRAINTS * particles, G_SIZE), np.int32),
-        planes=np.empty((*shape, CONSTRAINTS * particles, 4)),
-        looks=np.zeros(shape, np.int32),
-        impulses=np.zeros((*shape, room, 3), dtype),
-        pressed=np.zeros((layout.blocks, 3, particles, layout.lanes), dtype),
-        waited=np.zeros(shape, np.int32),
-        span=np.zeros(shape, np.int32),
-        aged=np.zeros(shape, np.int32),
-        chosen=np.empty((*shape, room), np.int32),
-        choices=np.zeros(shape, np.int32),
-        used=used,
-        report=np.zeros((*shape, REPORT_SIZE)),
-    )
+    return Memory(**contact_memory.allocate(layout, particles, dtype), used=used)
 
 
 @kernel

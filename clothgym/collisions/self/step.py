@@ -30,8 +30,8 @@ from clothgym._jit import apart, kernel
 from clothgym.collisions.self.broad_phase import Reach
 from clothgym.collisions.self.displacement_bounds import confine, note_uncertain
 from clothgym.collisions.self.impulses import press_again, repel
-from clothgym.collisions.self.narrow_phase import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
 from clothgym.collisions.self.topology import Pairs
+from clothgym.contact_memory import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
 
 PUSH = 0.5  # speed at which what is too close is pushed apart [m/s]
 
