@@ -286,6 +286,8 @@ def process_seconds(code: str, cache: str) -> float:
     """Processor seconds of a whole process, or those on the clock where the system does not tell."""
     begun, before = time.perf_counter(), os.times()
     environment = os.environ | {"CLOTHGYM_CACHE_DIR": cache}
+    # bytecode is written as it is for most people: else each process compiles every module of Python again
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
     after = os.times()
     used = after.children_user - before.children_user + after.children_system - before.children_system
