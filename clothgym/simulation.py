@@ -1,33 +1,25 @@
-"""Floor 5: the main loop.
-
-``advance`` is all that happens in a control step; the rest of the file is the door through which people reach it.
-"""
+"""Floor 5: a batch of sheets, each in a world of its own: the door through which people reach the main loop (``main_loop``)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit, guards, integrators, limiting
-from clothgym._jit import specialize, uncounted
-from clothgym.bending import Bending, model_of
+from clothgym import _jit, guards, integrators
+from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
-from clothgym.collisions.self.step import KERNELS as SELF_COLLISION
-from clothgym.collisions.solids.particle_contact import kernels_of as contact_kernels
 from clothgym.collisions.solids.particle_contact import needed
-from clothgym.elements import Elastic, digest_of, element_arrays, is_regular, surface_arrays, weave_of
+from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
 from clothgym.forces import Oscillators
-from clothgym.grid_forces import kernels_of
-from clothgym.guards import mark_diverged
 from clothgym.hands import FREE, Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
-from clothgym.integrators.base import Preparation, room_for_work
+from clothgym.integrators.base import Preparation
 from clothgym.limiting import checked_limit
+from clothgym.main_loop import Motion, Outcome, Schedule, Solid, compiled
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.observed import Observed
@@ -37,56 +29,6 @@ from clothgym.state import Fabric, Layout, State, at_rest, check_fits
 GRAVITY = 9.81
 SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
 AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
-
-
-def advance_one(
-    x, v, w, weave, elastic, drag_rate, resistance, gravity, wind, shapes, colliders, sheet, block, h, carried, substeps, air_every,
-    look_every, options, plan, push, work, room, limit, limited,
-):  # fmt: skip
-    """All substeps of one block."""
-    for step in range(substeps):
-        if air_every > 0 and step % air_every == 0:
-            push[:] = 0
-            add_air_forces(x, v, push, weave.air, resistance, wind, work.scratch)  # noqa: F821
-        substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)  # noqa: F821
-        restrain(x, v, w, weave, limit, limited)  # noqa: F821
-        press(x, v, w, sheet, block, step, h, carried)  # noqa: F821
-        look = step % look_every == 0
-        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, room)  # noqa: F821
-        keep_apart(x, v, w, sheet, block, h, carried)  # noqa: F821
-    remeasure(x, weave, limited)  # noqa: F821
-
-
-def advance(
-    first, last, x, v, w, weave, fabric, shapes, colliders, sheet, h, carried, substeps, air_every, look_every, options, plan, room,
-    limit, limited, diverged,
-):  # fmt: skip
-    """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
-    stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind = fabric
-    work, push = room_for_work(x[first], weave.offset, room), np.zeros(x.shape[1:], x.dtype)
-    contact_room = room_for_contact(x[first], weave.triangles, shapes)  # noqa: F821
-    for b in range(first, last):
-        push[:] = 0
-        limited[b] = 0
-        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
-        advance_block(  # noqa: F821
-            x[b], v[b], w[b], weave, elastic, drag_rate[b], resistance[b], gravity[b], wind[b], shapes, colliders[b], sheet, b, h,
-            carried, substeps, air_every, look_every, options, plan, push, work, contact_room, limit, limited[b],
-        )  # fmt: skip
-        mark_diverged(x[b], v[b], diverged[b])
-
-
-@cache
-def _compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str) -> Any:
-    """The main loop around an integrator's substep, in which the forces are those of the model and of the layout."""
-    forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
-    bound = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **forces)
-    touching = contact_kernels(contact, by_particle)
-    parts = limiting.kernels_of(limits, by_particle) | SELF_COLLISION[collides] | touching
-    parts |= {"add_air_forces": forces["add_air_forces"], "substep": bound}
-    which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
-    block = specialize(uncounted(advance_one), f"advance_one_{which}", apart=True, **parts)
-    return specialize(advance, f"advance_{which}", advance_block=block, **touching)
 
 
 class Simulation(Observed):
@@ -142,6 +84,7 @@ class Simulation(Observed):
         dtype: str = "float32",
         threads: int | None = None,
     ) -> None:
+        # what was asked for, checked before anything is made
         if not isinstance(mesh, ClothMesh):
             raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
         if not isinstance(material, Material | None):
@@ -163,25 +106,30 @@ class Simulation(Observed):
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
-        # where the springs' order does not matter, the particles of a grid lie side by side
+        # how the batch lies in memory: where the springs' order does not matter, the particles of a grid lie side by side
         by_particle = is_regular(mesh) and self.integrator.any_order
         self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
+        # what holds the sheet
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
         self.anchors = self._hands.anchors
         self.grippers = Grippers(self._hands)
+        # what it touches: solids, and itself; attachments are stopped by solids with contact="sheet" alone
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self._barriers = self._solids if contact == "sheet" else Solids(self.layout, (), self.time_step, self.dtype)
         self.colliders = self._solids.colliders
+        self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
+        # what its forces go over, and in float64 for the bounds of substeps
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.any_order)
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, any_order=False)
-        self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
         self._weave = weave_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
+        # the main loop with the kernels of all that
         touched = needed(contact, self._solids.shapes.kinds)
         parts = self.bending, by_particle, strain_limit is not None, self._contact.options is not None, touched
-        self._advance = _compiled(self.integrator.substep, self.integrator.name, *parts)
+        self._advance = compiled(self.integrator.substep, self.integrator.name, *parts)
+        # a state at rest, with masses and stiffness of the material
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
         self._planned_substeps = 0
@@ -201,6 +149,7 @@ class Simulation(Observed):
         )
         self._apply_parameters(np.arange(self.num_envs))
         self.reset()
+        # how many substeps
         if substeps == "auto":
             self.substeps = guards.automatic_substeps(self.integrator, self._oscillators(0), self.time_step)
             return
@@ -214,6 +163,8 @@ class Simulation(Observed):
         count("n", n)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
+        motion, solids = Motion(self._x, self._v, self._w), Solid(self._solids.shapes, self._solids.rows)
+        outcome = Outcome(self._limited, self._diverged)
 
         def work(first: int, last: int) -> None:
             held, blocks = None, slice(first, last)
@@ -224,10 +175,7 @@ class Simulation(Observed):
             self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
             if held is not None:
                 self._contact.forgive(self._hands.holder[blocks] != held, blocks)
-            self._advance(
-                first, last, self._x, self._v, self._w, self._weave, self._fabric, self._solids.shapes, self._solids.rows, sheet,
-                *schedule, self._limited, self._diverged,
-            )  # fmt: skip
+            self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
         for _ in range(n):
             _jit.run_spans(work, self.layout.blocks, self.threads)
@@ -255,11 +203,17 @@ class Simulation(Observed):
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
         # a share of a substep more, or rounding would make three of them two
         look_every, air_every = (max(1, int(interval / h + 1e-3)) for interval in (SURFACE_INTERVAL, AIR_INTERVAL))
-        self._schedule = (
-            self.dtype.type(h), self.dtype.type(h * method.carried), self.substeps,
-            air_every if self._fabric.resistance.any() else 0, look_every, tuple(method.options.values()), self._plan,
-            method.room(len(self._elements.springs.weight), len(self._elements.bends.weight)), float(self.strain_limit or 0),
-        )  # fmt: skip
+        self._schedule = Schedule(
+            h=self.dtype.type(h),
+            carried=self.dtype.type(h * method.carried),
+            substeps=self.substeps,
+            air_every=air_every if self._fabric.resistance.any() else 0,
+            look_every=look_every,
+            options=tuple(method.options.values()),
+            plan=self._plan,
+            room=method.room(len(self._elements.springs.weight), len(self._elements.bends.weight)),
+            limit=float(self.strain_limit or 0),
+        )
 
     def largest_substep(self, env: int = 0) -> tuple[float, str]:
         """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""

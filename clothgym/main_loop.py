@@ -1,0 +1,129 @@
+"""Floor 5: the main loop, which is all that happens in a control step.
+
+``advance`` takes blocks one after the other, and ``advance_block`` takes one through all its substeps.  The kernels that they call
+are bound when a simulation is made (``compiled``), by its integrator, bending model, layout, limiter and contact:
+
+* ``add_air_forces``: drag and lift of each triangle (``forces``, ``grid_forces``).
+* ``substep``: the integrator's: forces, velocities, positions (``integrators``).
+* ``restrain``, ``remeasure``: strain limiting after a substep, and the largest strain at the end (``limiting``).
+* ``press``, ``keep_apart``: contact of the sheet with itself, before the solids and after them (``collisions.self.step``).
+* ``resolve``, ``room_for_contact``: contact with solids, and its scratch (``collisions.solids.particle_contact``).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym import limiting
+from clothgym._jit import specialize, uncounted
+from clothgym.bending import Bending
+from clothgym.collisions.self.step import KERNELS as SELF_CONTACT
+from clothgym.collisions.solids.particle_contact import kernels_of as contact_kernels
+from clothgym.elements import Elastic
+from clothgym.grid_forces import kernels_of
+from clothgym.guards import mark_diverged
+from clothgym.integrators.base import room_for_work
+
+
+class Motion(NamedTuple):
+    """Positions x [m] and velocities v [m/s], (blocks, 3, particles, lanes), and inverse masses w, zero where something is held
+    [1/kg], (blocks, particles, lanes)."""
+
+    x: NDArray
+    v: NDArray
+    w: NDArray
+
+
+class Schedule(NamedTuple):
+    """What is done when in a control step, and with what.
+
+    h: a substep [s].  carried: for how long velocities have moved the positions when contact changes them [s].
+    substeps: of a control step.  air_every, look_every: substeps after which the air's force is computed again, 0 for no air, and
+    after which solids are looked for between particles.
+    options, plan, room: of the integrator: numbers, matrices that it has factorized, and the size of its scratch.
+    limit: largest strain.
+    """
+
+    h: Any
+    carried: Any
+    substeps: int
+    air_every: int
+    look_every: int
+    options: tuple[Any, ...]
+    plan: tuple[NDArray, ...]
+    room: tuple[int, int, int]
+    limit: float
+
+
+class Solid(NamedTuple):
+    """Solids as kernels see them: what all environments share, and a block's rows, (blocks, colliders, COLLIDER_ROWS, lanes)."""
+
+    shapes: Any
+    rows: NDArray
+
+
+class Outcome(NamedTuple):
+    """Strain met and left in a control step, (blocks, 3, lanes), and whether an environment has diverged, (blocks, lanes)."""
+
+    limited: NDArray
+    diverged: NDArray
+
+
+def advance_block(
+    x, v, w, weave, elastic, drag_rate, resistance, gravity, wind, schedule, shapes, colliders, sheet, block, push, work, room,
+    limited,
+):  # fmt: skip
+    """All substeps of one block."""
+    h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
+    for step in range(substeps):
+        # the air's force is slow beside the springs': until it is computed again it is a constant push
+        if air_every > 0 and step % air_every == 0:
+            push[:] = 0
+            add_air_forces(x, v, push, weave.air, resistance, wind, work.scratch)  # noqa: F821
+        # the integrator: springs, bending, gravity, drag and that push move the particles on
+        substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)  # noqa: F821
+        # springs that are stretched beyond the limit are pulled back to it
+        restrain(x, v, w, weave, limit, limited)  # noqa: F821
+        # contacts of the sheet with itself press as before, so that solids bear what lies on them
+        press(x, v, w, sheet, block, step, h, carried)  # noqa: F821
+        # solids move on, and push out what is in them
+        look = step % look_every == 0
+        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, room)  # noqa: F821
+        # the contacts' impulses are corrected, and no vertex leaves its displacement bound
+        keep_apart(x, v, w, sheet, block, h, carried)  # noqa: F821
+    remeasure(x, weave, limited)  # noqa: F821
+
+
+def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome):
+    """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
+    x, v, w = motion
+    # scratch, which the blocks share one after the other
+    work, push = room_for_work(x[first], weave.offset, schedule.room), np.zeros(x.shape[1:], x.dtype)
+    room = room_for_contact(x[first], weave.triangles, solids.shapes)  # noqa: F821
+    for b in range(first, last):
+        push[:] = 0
+        outcome.limited[b] = 0
+        elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b])
+        take_block(  # noqa: F821
+            x[b], v[b], w[b], weave, elastic, fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b],
+            schedule, solids.shapes, solids.rows[b], sheet, b, push, work, room, outcome.limited[b],
+        )  # fmt: skip
+        mark_diverged(x[b], v[b], outcome.diverged[b])
+
+
+@cache
+def compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str) -> Any:
+    """``advance`` around an integrator's substep: with the forces of a bending model and a layout, with a limiter or none, with
+    contact of the sheet with itself or none, and with contact with solids (see ``particle_contact.needed``)."""
+    forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
+    bound = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **forces)
+    touching = contact_kernels(contact, by_particle)
+    parts = limiting.kernels_of(limits, by_particle) | SELF_CONTACT[collides] | {"resolve": touching["resolve"]}
+    parts |= {"add_air_forces": forces["add_air_forces"], "substep": bound}
+    which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
+    block = specialize(uncounted(advance_block), f"advance_block_{which}", apart=True, **parts)
+    return specialize(advance, f"advance_{which}", take_block=block, room_for_contact=touching["room_for_contact"])
