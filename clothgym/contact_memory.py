@@ -153,7 +153,7 @@ def check(state: dict[str, NDArray], layout: Layout, particles: int, sound: NDAr
 
 def restore(memory: Any, state: dict[str, NDArray], layout: Layout, x: NDArray) -> None:
     """Take over what a state holds, with positions x in blocks [m]."""
-    block, lane = layout.place(np.arange(layout.num_envs))
+    block, lane = layout.at(np.arange(layout.num_envs))
     begin(memory, block, lane, x)
     for name, kept in SAVED.items():
         array, given = getattr(memory, name), state[name]

@@ -278,7 +278,7 @@ class Grippers:
         layout = self._hands.layout
         env = np.arange(layout.num_envs) if envs is None else indices("envs", envs, layout.num_envs, "this batch's environments")
         x = spread("positions", finite("positions", positions), (len(env), len(self), 3))
-        self._hands.place(*layout.place(env), x)
+        self._hands.place(*layout.at(env), x)
 
 
 @kernel

@@ -222,7 +222,7 @@ class Simulation(Observed):
     def _oscillators(self, env: int) -> Oscillators:
         """What decides on an environment's substep."""
         sheet = self.mesh, self._exact_elements, self.bending
-        return guards.oscillators(*sheet, self._fabric, self._free_w, *divmod(env, self.layout.lanes))
+        return guards.oscillators(*sheet, self._fabric, self._free_w, *self.layout.at(env))
 
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
@@ -256,14 +256,14 @@ class Simulation(Observed):
         """Block, lane and anchor of each pair."""
         env, count = self.layout.chosen(envs, once=anchors is None), self.anchors.size
         if anchors is None:
-            return (*self.layout.place(np.repeat(env, count)), np.tile(np.arange(count), len(env)))
+            return (*self.layout.at(np.repeat(env, count)), np.tile(np.arange(count), len(env)))
         which = spread("anchors", indices("anchors", anchors, count, "this simulation's anchors"), env.shape)
-        return (*self.layout.place(env), which)
+        return (*self.layout.at(env), which)
 
     def set_wind(self, wind: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Velocity of the air from now on [m/s], (len(envs), 3) or (3,)."""
         env = self.layout.chosen(envs)
-        block, lane = self.layout.place(env)
+        block, lane = self.layout.at(env)
         self._fabric.wind[block, :, lane] = spread("wind", finite("wind", wind), (len(env), 3))
 
     def reset(self, envs: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
@@ -278,7 +278,7 @@ class Simulation(Observed):
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
         if positions is not None:
             self._contact.check(x, env)
-        block, lane = self.layout.place(env)
+        block, lane = self.layout.at(env)
         self._x[block, :, :, lane] = np.swapaxes(np.broadcast_to(x, shape), 1, 2)
         self._v[block, :, :, lane] = np.swapaxes(np.broadcast_to(v, shape), 1, 2)
         self._solids.begin(block, lane)
@@ -299,7 +299,7 @@ class Simulation(Observed):
             ValueError: an unknown name, or a value that ``Material`` would not take; nothing is changed then.
         """
         env = self.layout.chosen(envs)
-        block, lane = self.layout.place(env)
+        block, lane = self.layout.at(env)
         after = self._parameters.copy()
         after[env], fields = changed(self.material, after[env], figures)
         fabric_rows(self.mesh, after[env], self.bending.hinged, self.air_density)
@@ -316,7 +316,7 @@ class Simulation(Observed):
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
         """Put other solids of the same family (a plane, the same mesh, or any other) in place of collider ``index``, one an
         environment."""
-        self._solids.replace(index, colliders, *self.layout.place(self.layout.chosen(envs)))
+        self._solids.replace(index, colliders, *self.layout.at(self.layout.chosen(envs)))
 
     def move_colliders(
         self, index: int, targets: ArrayLike | None = None, velocities: ArrayLike | None = None, envs: ArrayLike | None = None
@@ -379,14 +379,14 @@ class Simulation(Observed):
         self._limited = np.zeros((self.layout.blocks, 3, self.layout.lanes), dtype)
         self._diverged = blocks(state.diverged, np.dtype(bool))
         self._reported = self.diverged
-        self._apply_masses(*self.layout.place(np.arange(self.num_envs)))
+        self._apply_masses(*self.layout.at(np.arange(self.num_envs)))
         self._contact.restore(state, self._x)
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
 
     def _apply_parameters(self, env: NDArray) -> None:
         """Write spring constants, dampers, drag and masses of environments from their material figures."""
-        block, lane = self.layout.place(env)
+        block, lane = self.layout.at(env)
         self._planned_substeps = 0
         for name, rows in fabric_rows(self.mesh, self._parameters[env], self.bending.hinged, self.air_density).items():
             array = getattr(self._fabric, name)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -125,8 +125,8 @@ class Layout(NamedTuple):
             return np.swapaxes(blocks[..., 0], 1, 2).copy()
         return np.ascontiguousarray(np.swapaxes(self.to_public(blocks), 1, 2))
 
-    def place(self, envs: NDArray) -> tuple[NDArray, NDArray]:
-        """Block and lane of each environment."""
+    def at(self, envs: Any) -> tuple[Any, Any]:
+        """Block and lane of an environment, or of several, (envs,): two integers, or two arrays of them."""
         return np.divmod(envs, self.lanes)
 
     def chosen(self, envs: ArrayLike | None, once: bool = True) -> NDArray:

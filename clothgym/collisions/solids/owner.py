@@ -60,7 +60,7 @@ class Solids:
         if targets is None and velocities is None:
             raise ValueError("move_colliders: give targets, velocities, or both")
         after = np.zeros((len(env), 3)) if velocities is None else vectors("velocities", velocities, len(env))
-        block, lane = self.layout.place(env)
+        block, lane = self.layout.at(env)
         now = after
         if targets is not None:
             x = vectors("targets", targets, len(env))
