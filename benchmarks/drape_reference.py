@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from clothgym import Material, Plane, Simulation, __version__, grid
-from clothgym.envs.drape import COVERED_WITHIN, FRICTION, JUDGED_POINTS, SIDE, THICKNESS
+from clothgym.envs.draping import COVERED_WITHIN, EVALUATED_POINTS, FRICTION, SIDE, THICKNESS
 from clothgym.envs.measures import covered_share
 from clothgym.envs.targets import SIZES, Target
 
@@ -43,7 +43,7 @@ def coverage(solids: list[Target]) -> list[float]:
     simulation.step(round(SETTLE * 60))
     speed = np.sqrt(np.mean(np.sum(simulation.velocities**2, axis=2), axis=1))
     print(f"  largest rms speed at the end: {speed.max() * 1000:.1f} mm/s")
-    points = [solid.upper_surface(JUDGED_POINTS) for solid in solids]
+    points = [solid.upper_surface(EVALUATED_POINTS) for solid in solids]
     sheets = simulation.positions.astype(float).transpose(0, 2, 1).copy()
     return [covered_share(sheet, mesh.triangles, p, COVERED_WITHIN * SIDE) for sheet, p in zip(sheets, points)]
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import Gripper, Plane, Simulation
-from clothgym.envs.drape import FRICTION, SHEET, SIDE, THICKNESS, DrapeTask
+from clothgym.envs.drape import DrapeTask
 from clothgym.envs.drape_gripper import REACH
+from clothgym.envs.draping import FRICTION, SHEET, SIDE, THICKNESS
 
 KEPT, COUNT, SEED = 64, 256, 0
 CORNERS = SHEET.corners[2:]

@@ -4,11 +4,15 @@ if __name__ != "clothgym.envs":
     # with the repository's root on sys.path a bare `import envs` would make a second copy of every class
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
+from clothgym.envs.definition import Observation
 from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
+from clothgym.envs.gripper_task import GripperTask
+from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
 from clothgym.envs.strain import ClothStrainEnv, ClothStrainVectorEnv
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
@@ -24,6 +28,10 @@ __all__ = [
     "ClothStrainEnv",
     "ClothStrainVectorEnv",
     "ClothVectorEnv",
+    "GripperTask",
+    "Kernels",
+    "Observation",
+    "Physics",
     "Task",
     "TaskState",
 ]

@@ -12,11 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.envs.drape import EXPERT_SPEED, SHEET, SIDE, THICKNESS, DrapeTask, covering, observe_target
+from clothgym.collisions import Collider
+from clothgym.envs import draping
+from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.draping import PHYSICS, SHEET, SIDE, THICKNESS, covering, observe_target
 from clothgym.envs.episode import Fields, length
+from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
 from clothgym.envs.single import ClothEnv
-from clothgym.envs.task import POSITION_BOUND
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.targets import Target
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.hands import Gripper
 
@@ -24,27 +29,19 @@ if TYPE_CHECKING:
     from clothgym.render import Camera
 
 REACH = 0.03  # of the fingers [m]
-CLOSES, OPENS = -0.5, 0.5  # actions below and above these give the fingers an order; between them they go on with the last
+GUIDE_REACH = 0.4 * SIDE  # the sheet begins farther away than in ClothDrape-v0
 PICKING = 0.3  # share of the potential that is for taking hold
 PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
 # the particles that each gripper is to take: both corners of the edge at the target, or its middle
 PLACES = {1: (SHEET.corners[2] + SHEET.grid_shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
-FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colours
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
 # above it before it sets out
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
+EXPERT_SPEED = 0.8  # share of the grippers' speed limit
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
-
-
-@inlined
-def _fingers(move, wanted, acting):
-    """Fingers do what the action says last, and open when time is up."""
-    if not acting or move[3] > OPENS:
-        return 1.0
-    return 0.0 if move[3] < CLOSES else wanted
 
 
 @inlined
@@ -56,13 +53,8 @@ def _take(own, rules, sheet, move, free):
 
 
 @inlined
-def _never_done(own, rules, sheet):
-    """It may take hold anew until its time is up."""
-    return False
-
-
-@inlined
 def _potential(own, rules, sheet):
+    """How far the taking hold is along, and how near the sheet is to the target."""
     taken = 0.0
     for k in range(rules.places.shape[0]):
         place = rules.places[k]
@@ -73,52 +65,81 @@ def _potential(own, rules, sheet):
 
 @inlined
 def _observe(own, rules, sheet, seen):
+    """What is observed in both draping tasks, and each gripper: its tip, the way to its place, its fingers."""
     observe_target(own, rules, sheet, seen)
     for k in range(rules.places.shape[0]):
         hand, place = sheet.hands[k], rules.places[k]
         for c in range(3):
-            seen.hands[k, c] = (hand[c] - own.top[c]) / rules.side
-            seen.hands[k, 3 + c] = (sheet.x[c, place] - hand[c]) * (10 / rules.side)
-        seen.hands[k, 6] = sheet.openings[k]
+            seen.grippers[k, c] = (hand[c] - own.top[c]) / rules.side
+            seen.grippers[k, 3 + c] = (sheet.x[c, place] - hand[c]) * (10 / rules.side)
+        seen.grippers[k, 6] = sheet.openings[k]
 
 
-class DrapeGripperTask(DrapeTask):
+def _observations(grippers: int) -> tuple[Observation, ...]:
+    """What is observed with so many grippers."""
+    about = (
+        "for each gripper its tip relative to the target's top [L], the way from its tip to the corner that it is meant to take "
+        "[L/10], and how far open its fingers are"
+    )
+    bounds = (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0)
+    own = Observation("grippers", about, (grippers, 7), "", bounds)
+    return (*draping.observations(grippers, "whether each gripper holds anything"), own)
+
+
+class DrapeGripperTask(GripperTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
-    kernels = DrapeTask.kernels._replace(potential=_potential, observe=_observe, act=_take, done=_never_done, fingers=_fingers)
+    physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.hand_speed, reach=REACH),) * 2)
+    # an agent is never done: it may take hold again until its time is up
+    kernels = Kernels(
+        _potential, draping.evaluate_cover, _observe, act=_take, account=draping.account_reference, fingers=close_or_open
+    )
     acting_steps = 100
-    guide_reach = 0.4 * SIDE  # the sheet begins farther away than in ClothDrape-v0
+    settling_steps = 40
+    observations = _observations(2)
+    points_relative_to = draping.RELATIVE_TO
+    evaluation = draping.EVALUATION
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
+    arguments: ClassVar = {
+        "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
+        "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.53 N",
+        "self_collision": 'or ``"fast"``; ``"strict"`` with flat starts only: rumpled ones pass through themselves',
+    }
 
-    def __init__(self, num_envs: int, grippers: int = 2, slip_force: float | None = None, **kwargs: Any) -> None:
+    def __init__(self, num_envs: int, grippers: int = 2, **kwargs: Any) -> None:
         if isinstance(grippers, bool) or not isinstance(grippers, (int, np.integer)) or grippers not in PLACES:
             raise ValueError(f"grippers={grippers!r}: must be 1 or 2")
-        hand = Gripper(speed=2 * DrapeTask.physics.hand_speed, reach=REACH, slip_force=slip_force)
-        self.physics = replace(DrapeTask.physics, anchors=(), grippers=(hand,) * grippers)  # type: ignore[misc]
+        self.physics = replace(self.physics, grippers=self.physics.grippers[:grippers])  # type: ignore[misc]
+        self.observations = _observations(int(grippers))  # type: ignore[misc]
         self.places = np.array(PLACES[grippers])
         super().__init__(num_envs, **kwargs)
-        self._homes = np.zeros((num_envs, grippers, 3))  # where the grippers begin, between _begin and _place_hands
 
-    def _remembers(self) -> Fields:
-        return [*super()._remembers(), ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
+    def colliders(self) -> list[Collider]:
+        return draping.colliders()
 
-    def _figures(self) -> dict[str, Any]:
-        return super()._figures() | {"places": self.places}
+    def episode_colliders(self, env: int) -> Mapping[int, Collider]:
+        return draping.episode_colliders(self.episode[env])
 
-    def _observes(self) -> Fields:
-        bounds = [POSITION_BOUND] * 3 + [10 * POSITION_BOUND] * 3 + [1.0]
-        return [*super()._observes(), ("hands", bounds, (len(self.places), 7))]
+    def remembers(self) -> Fields:
+        return [*draping.REMEMBERS, ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
+
+    def constants(self) -> dict[str, Any]:
+        return draping.constants(GUIDE_REACH) | {"places": self.places}
+
+    @property
+    def targets(self) -> list[Target]:
+        """Those of the episodes."""
+        return [draping.recalled(own) for own in self.episode]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
-    def _check_options(self, options: Mapping[str, Any]) -> None:
-        super()._check_options(options)
+    def check_options(self, options: Mapping[str, Any]) -> None:
         if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
             raise ValueError(f"reset option rumpled={options['rumpled']!r}: must be True or False")
 
-    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        target = self._draw_target(rng, options.get("target", {}))
-        self._place_target(env, target)
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        target = draping.draw_target(rng, options.get("target", {}))
+        draping.remember(self.episode[env], target)
         gap, sideways, yaw = SIDE * rng.uniform(0.05, 0.15), SIDE * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
         rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(_rumpled())))
         x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, THICKNESS)
@@ -130,19 +151,16 @@ class DrapeGripperTask(DrapeTask):
         x[:, 2] += np.abs(rng.normal(scale=1e-4, size=len(x)))
         count = len(self.places)
         away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
-        self._homes[env] = x[self.places] + SIDE * away
+        self.gripper_starts[env] = x[self.places] + SIDE * away
         self.episode["picked"][env] = False
         return x
-
-    def _place_hands(self, envs: NDArray) -> None:
-        self.simulation.grippers.place(self._homes[envs], envs)
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
         """To the corners, close, up, over the target and a third of a side beyond it, down, open, and away.
 
-        Without memory: where the hands are, and what they hold, says which part of the way they are on.
+        Without memory: where the grippers are, and what they hold, says which part of the way they are on.
         """
         episode, grippers = self.episode, self.simulation.grippers
         hands, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
@@ -178,19 +196,6 @@ class DrapeGripperTask(DrapeTask):
 
         return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.33, 0.24), vertical_fov=36.0)
 
-    def markers(self, env: int) -> list[Any]:
-        from clothgym.render import Solid  # imported here: training draws nothing
-
-        solids = []
-        for hand in range(self.num_hands):
-            x, y, z = self.simulation.grippers.positions[env, hand].tolist()
-            opening = 0.0 if self.simulation.grippers.held[env, hand] else float(self.simulation.grippers.openings[env, hand])
-            half = 0.006 + opening * self.physics.grippers[hand].span / 2
-            for finger in (x - half, x + half):
-                solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))
-            solids.append(Solid(kind="box", center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012), color=PALM))
-        return solids
-
 
 @cache
 def _rumpled() -> NDArray:
@@ -203,11 +208,11 @@ class ClothDrapeGripperEnv(ClothEnv):
     """Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.
 
     ## Description
-    The sheet and the targets are those of ``ClothDrape-v0``, and so is the judgement.  But the sheet lies on the floor, flat or
+    The sheet and the targets are those of ``ClothDrape-v0``, and so is the evaluation.  But the sheet lies on the floor, flat or
     rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
     when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
     hold as often as it likes.  The fingers do not push the cloth, and solids do not stop a gripper.  After 100 steps they open,
-    and the sheet settles for 40 steps, in which actions are ignored; then it is judged.  To hold it in the right place until
+    and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until
     then is as good as to let go.
 
     The id fixes the physics: 30 Hz control, ``semi_implicit_euler`` with 50 substeps, friction 0.5, linear air drag of
@@ -219,33 +224,20 @@ class ClothDrapeGripperEnv(ClothEnv):
     | Num | Action | Range | Unit |
     | --- | --- | --- | --- |
     | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as told last; the fingers take 0.1 s | [-1, 1] | |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
 
     ## Observation Space
-    ``Box`` of 82 numbers for ``obs_mode="keypoints"`` (and 6 x 289 + 28 for ``"particles"``, all particles row by row):
-
-    | Num | Observation | Bound |
-    | --- | --- | --- |
-    | 0-26 | 3 x 3 points of the sheet (corners, edge middles, centre) relative to the target's top, in L | 4 |
-    | 27-53 | their velocities [m/s] | 5 |
-    | 54-56 | centre of area relative to the target's top, in L | 4 |
-    | 57-58 | whether each gripper holds anything | 1 |
-    | 59-61 | sphere, box, post | 1 |
-    | 62-64 | target's radius or half side and height, in L; its yaw over 45 degrees | 1 |
-    | 65-67 | settling; share of the episode left; share of the acting time left | 1 |
-    | 68-70, 75-77 | each gripper's tip relative to the target's top, in L | 4 |
-    | 71-73, 78-80 | from its tip to the corner that it is meant to take, in L/10 | 40 |
-    | 74, 81 | how far open its fingers are | 1 |
+    $observations
 
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  On the way the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L in the place of its
     0.15 L), plus 0.3 times the mean over both
     corners of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At
-    the end it is the normalised performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+    the end it is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
 
-    ## Judgement
+    ## Evaluation
     As in ``ClothDrape-v0``, with the same ``info``.
 
     ## Starting State
@@ -254,30 +246,15 @@ class ClothDrapeGripperEnv(ClothEnv):
     and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
-    Terminated when judged, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's centre 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
+    Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
     goes out).  Never truncated: the time limit is part of the task.
 
     ## Arguments
-    | Argument | Default | Meaning |
-    | --- | --- | --- |
-    | ``grippers`` | 2 | or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder) |
-    | ``slip_force`` | ``None`` | pull at which the cloth slips out of a gripper [N]; it weighs 0.53 N |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
-    | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
-    | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
-    | ``self_collision`` | ``False`` | or ``"fast"``; ``"strict"`` with flat starts only: rumpled ones pass through themselves |
-    | ``substeps`` | 50 | or ``"auto"`` |
-    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
-    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
-    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
-    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
-    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
-    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 5 % on |
+    $arguments
 
     ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
-    rest is drawn), ``"rumpled"``, True or False, and ``"material"``, a dict of figures for one episode.
+    rest is drawn), ``"rumpled"``, True or False, and ``"material"``, a preset's name or a dict of properties, for one episode.
 
     ## Version History
     * v0: initial version

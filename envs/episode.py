@@ -1,4 +1,4 @@
-"""What an episode is made of: its records, its state, the outcome of a step, and the ways in which it can fail."""
+"""What an episode is made of: its records, its state, and the ways in which it can fail."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clothgym.state import State
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
 FINE, DIVERGED, TORN, OUT_OF_BOUNDS = range(4)
 TWICE = 2.0  # the stretch at which a structural spring tears
-BEYOND = 0.5  # how far the centre of the sheet may leave the arena [m]
+BEYOND = 0.5  # how far the center of the sheet may leave the arena [m]
 
 FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
@@ -32,16 +32,6 @@ class TaskState:
     generators: list[str]
 
 
-@dataclass
-class Outcome:
-    """What a step brought, arrays over the batch; ``info`` may nest one level."""
-
-    reward: NDArray
-    terminated: NDArray
-    truncated: NDArray
-    info: dict[str, Any]
-
-
 def records(count: int, fields: Fields) -> NDArray:
     """Records with these fields, all zero, (count,): kernels read ``record.name``, Python ``records["name"]``."""
     return np.zeros(count, np.dtype(list(fields), align=True))
@@ -52,9 +42,9 @@ def names_of(records: NDArray) -> tuple[str, ...]:
     return records.dtype.names or ()
 
 
-def record_of(**figures: Any) -> NDArray:
-    """One record of these figures, numbers or arrays, (1,)."""
-    values = {name: np.asarray(value) for name, value in figures.items()}
+def record_of(**constants: Any) -> NDArray:
+    """One record of these numbers and arrays, (1,)."""
+    values = {name: np.asarray(value) for name, value in constants.items()}
     record = records(1, [(name, value.dtype, value.shape) for name, value in values.items()])
     for name, value in values.items():
         record[name] = value

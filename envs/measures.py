@@ -1,4 +1,4 @@
-"""What tasks measure on one sheet, as kernels: no figure depends on who else is in the batch.
+"""What tasks measure on one sheet, as kernels: no number depends on who else is in the batch.
 
 Sheets are (3, particles), contiguous: the particles are what vectorizes.  The least and the largest of numbers that are not
 negative are found by their bits, which are in the same order, for integers may be compared in any order, and so side by side.
@@ -16,7 +16,7 @@ from clothgym.mesh import ClothMesh
 CENTROID, SPEED2, STRETCH2, FINITE = 0, 3, 4, 5
 SUMMARY = 6
 FAR2 = 1e6  # a kilometre or a kilometre a second is no cloth [m^2, m^2/s^2]
-MOST_STRAIN = 1e3  # what is told of a sheet that has diverged
+MOST_STRAIN = 1e3  # stands for the strain of a sheet that has diverged
 LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
 
 GROUP = 4  # triangles that share a box in ``covered_share``
@@ -126,8 +126,22 @@ def soft_coverage(x, points, reach):
     return total / np.float32(points.shape[0])
 
 
+def centers_of_area(mesh: ClothMesh, positions: NDArray) -> NDArray:
+    """Each sheet's center of area [m], (sheets, 3); positions: [m], (sheets, particles, 3).
+
+    In one order of sums, so that its bits do not depend on how many sheets there are.
+    """
+    share = mesh.area / mesh.area.sum()
+    return np.cumsum(positions * share[:, None], axis=1)[:, -1]
+
+
 def key_particles(mesh: ClothMesh) -> NDArray:
-    """Corners, middles of the edges, centre of a grid: particles of a 3 x 3 subgrid, row by row, (9,)."""
+    """Corners, middles of the edges, center of a grid: particles of a 3 x 3 subgrid, row by row, (9,).
+
+    Of a triangle mesh: nine particles, evenly spaced in their order, or all if there are fewer.
+    """
+    if mesh.shape is None:
+        return np.unique(np.linspace(0, mesh.num_particles - 1, 9).astype(np.int64))
     rows, columns = (np.array([0, n // 2, n - 1]) for n in mesh.grid_shape)
     return (rows[:, None] * mesh.grid_shape[1] + columns[None, :]).ravel()
 
@@ -170,7 +184,7 @@ def _distance2_to_triangle(p, a, b, c):
 def covered_share(x, triangles, points, tolerance):
     """Share of points [m], (points, 3), that lie within ``tolerance`` [m] of a triangle of a sheet.
 
-    float64 throughout: this is a judgement, made once an episode.
+    float64 throughout: this is part of the evaluation, once an episode.
     """
     count = triangles.shape[0]
     # a box about triangles that lie together, within which a point is near enough

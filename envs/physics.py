@@ -14,11 +14,13 @@ from clothgym.checks import number
 from clothgym.guards import refusal
 from clothgym.hands import Gripper
 from clothgym.integrators import Integrator
-from clothgym.material import Material, spring_stiffness
+from clothgym.material import PRESETS, Material, spring_stiffness
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, FIGURES
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
+
+MEASURED = ("density", "stretch_stiffness", "shear_stiffness", "bend_rigidity")  # what presets take from measurements
 
 
 @dataclass(frozen=True)
@@ -47,13 +49,39 @@ class Physics:
     wind: Wind | None = None
 
 
+def chosen_fabric(fabric: Any, own: Material) -> Material:
+    """The fabric that someone asks for: a ``Material`` as it is; a preset's measured properties by name; None for the task's own.
+
+    What presets do not measure, damping and what concerns the air, stays the task's.
+
+    Raises:
+        ValueError: it is neither, or no preset has that name.
+    """
+    if fabric is None or isinstance(fabric, Material):
+        return own if fabric is None else fabric
+    if not isinstance(fabric, str):
+        raise ValueError(f"fabric={fabric!r}: must be a Material or a preset's name ({', '.join(PRESETS)})")
+    return replace(own, **preset_properties(fabric), source=Material.preset(fabric).source)  # type: ignore[arg-type]
+
+
+def preset_properties(name: str) -> dict[str, float]:
+    """The measured properties of a preset."""
+    preset = Material.preset(name)
+    return {measured: getattr(preset, measured) for measured in MEASURED}
+
+
 def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, float]]:
+    """Ranges of material properties, as pairs of floats.
+
+    Raises:
+        ValueError: an unknown property, or a range that is none of finite numbers that ``Material`` takes.
+    """
     checked = {}
     if not isinstance(ranges, Mapping):
         raise ValueError(f"randomize={ranges!r}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
     for name, bounds in ranges.items():
         if name not in FIGURES:
-            raise ValueError(f"randomize: no material figure {name!r} (there are: {', '.join(FIGURES)})")
+            raise ValueError(f"randomize: no material property {name!r} (there are: {', '.join(FIGURES)})")
         if (
             np.shape(bounds) != (2,)
             or np.asarray(bounds).dtype.kind not in "iuf"
@@ -67,19 +95,19 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
     return checked
 
 
-def checked_wind(figures: Mapping[str, Any]) -> Wind:
-    """A wind of these figures.
+def checked_wind(properties: Mapping[str, Any]) -> Wind:
+    """A wind with these properties.
 
     Raises:
-        ValueError: an unknown figure, or one that makes no wind.
+        ValueError: an unknown property, or one that makes no wind.
     """
     known = [field.name for field in fields(Wind)]
-    if not isinstance(figures, Mapping):
-        raise ValueError(f"wind={figures!r}: must be a dict with any of {', '.join(known)}")
-    for name in figures:
+    if not isinstance(properties, Mapping):
+        raise ValueError(f"wind={properties!r}: must be a dict with any of {', '.join(known)}")
+    for name in properties:
         if name not in known:
-            raise ValueError(f"wind: no figure {name!r} (there are: {', '.join(known)})")
-    return Wind(**figures)
+            raise ValueError(f"wind: no property {name!r} (there are: {', '.join(known)})")
+    return Wind(**properties)
 
 
 def check_ranges(physics: Physics, ranges: Mapping[str, tuple[float, float]], integrator: Integrator) -> None:
@@ -94,35 +122,44 @@ def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, floa
     """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
     if not ranges:
         return
-    figures = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in FIGURES]
-    for corner in product(*figures):
+    values = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in FIGURES]
+    for corner in product(*values):
         fabric = Material(**dict(zip(FIGURES, corner)))
         stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity
         spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend))
 
 
-def check_material_option(
+def checked_material_option(
     material: Any, physics: Physics, ranges: Mapping[str, tuple[float, float]], simulation: Simulation
-) -> None:
-    """Refuse figures that no episode can have; ranges: of those that are drawn."""
+) -> dict[str, float]:
+    """Properties of one episode's fabric, given as such or by a preset's name; ranges: of those that are drawn.
+
+    Raises:
+        ValueError: they are none that an episode can have.
+    """
+    if isinstance(material, str):
+        material = preset_properties(material)
     if not isinstance(material, Mapping):
-        raise ValueError(f"reset option material={material!r}: must be a dict of figures")
+        raise ValueError(
+            f"reset option material={material!r}: must be a preset's name ({', '.join(PRESETS)}) or a dict of properties"
+        )
     method = simulation.integrator
     for name, value in material.items():
         if name not in FIGURES:
-            raise ValueError(f"no material figure {name!r} (there are: {', '.join(FIGURES)})")
+            raise ValueError(f"reset option material: no property {name!r} (there are: {', '.join(FIGURES)})")
         number(f"reset option material: {name}", value)
         if name in method.ignored or (name in method.shared and simulation.num_envs > 1):
             raise ValueError(f"reset option material: {refusal(method, name)}")
     check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in material.items()}})
+    return dict(material)
 
 
 def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:
     """The fabric of the ranges that needs the smallest substeps: as light, stiff and damped as can be drawn."""
-    figures = {name: getattr(material, name) for name in FIGURES}
+    properties = {name: getattr(material, name) for name in FIGURES}
     for name, (low, high) in ranges.items():
-        figures[name] = low if name == "density" else high
-    return replace(material, **figures)  # type: ignore[arg-type]
+        properties[name] = low if name == "density" else high
+    return replace(material, **properties)  # type: ignore[arg-type]
 
 
 def settled(physics: Physics, start: NDArray, seconds: float) -> NDArray:

@@ -1,4 +1,4 @@
-"""ClothReach-v0: bring the free corner of a hanging sheet to a point, by its opposite corner, and calm it there."""
+"""ClothReach-v0: bring the free corner of a hanging sheet to a point, by its opposite corner, and bring it to rest there."""
 
 from __future__ import annotations
 
@@ -11,30 +11,32 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import vector
+from clothgym.collisions import Collider
+from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
-from clothgym.envs.measures import distance, key_particles, length_of
+from clothgym.envs.measures import distance, length_of
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.task import POSITION_BOUND, Task
+from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
 
 if TYPE_CHECKING:
-    from clothgym.render import Camera, Solid
+    from clothgym.render import Camera
 
 SIDE = 0.6  # L [m]
 SHEET = grid(9, 9, SIDE, SIDE)
 DRIVEN, FREE = SHEET.corners[2], SHEET.corners[1]  # opposite corners: the sheet hangs from the one, the other is lowest
 
-NEAR_ENOUGH, CALM_ENOUGH = 0.05, 0.1  # in sides, and sides a second
-CALM_SCALE = 0.2  # sides a second: performance is halved at this speed
+NEAR_ENOUGH, SLOW_ENOUGH = 0.05, 0.1  # in sides, and sides a second
+SPEED_SCALE = 0.2  # sides a second: performance is halved at this speed
 NEAREST = 0.2  # in sides: the way to a goal that is nearer than this counts as so long
 CLOSE_SCALE = 0.15  # in sides: how the potential rises near the goal
 LOW, HIGH = np.array([-0.8, -0.8, 0.9]), np.array([0.8, 0.8, 1.7])  # room of the driven corner [m]
 GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that room [m]
-GOAL = (90, 170, 110)  # colour of the goal's marker
+GOAL = (90, 170, 110)  # color of the goal's marker
 
 EXPERT_GAIN = 4.0  # how fast the scripted expert closes on the place above the goal [1/s]
 
@@ -49,27 +51,30 @@ def _nearer(own, rules, sheet):
 
 
 @inlined
-def _calm(rules, sheet):
-    """1 where the free corner is at rest, 1/2 at CALM_SCALE."""
-    return 1 / (1 + (length_of(sheet.v[:, rules.free]) / (CALM_SCALE * rules.side)) ** 2)
+def _at_rest(rules, sheet):
+    """1 where the free corner is at rest, 1/2 at SPEED_SCALE."""
+    return 1 / (1 + (length_of(sheet.v[:, rules.free]) / (SPEED_SCALE * rules.side)) ** 2)
 
 
 @inlined
 def _potential(own, rules, sheet):
+    """How much of the way is done, and how near and at rest the corner is, in [0, 1]."""
     close = 1 / (1 + (distance(own.goal, sheet.x[:, rules.free]) / (CLOSE_SCALE * rules.side)) ** 2)
-    return (_nearer(own, rules, sheet) + close * _calm(rules, sheet)) / 2
+    return (_nearer(own, rules, sheet) + close * _at_rest(rules, sheet)) / 2
 
 
 @inlined
-def _judge(own, rules, sheet, info):
+def _evaluate(own, rules, sheet, info):
+    """Write how far from the goal and how fast the corner is; returns the normalized performance."""
     info.goal_distance = distance(own.goal, sheet.x[:, rules.free]) / rules.side
     info.corner_speed = length_of(sheet.v[:, rules.free]) / rules.side
-    info.is_success = info.goal_distance <= NEAR_ENOUGH and info.corner_speed < CALM_ENOUGH
-    return _nearer(own, rules, sheet) * _calm(rules, sheet)
+    info.is_success = info.goal_distance <= NEAR_ENOUGH and info.corner_speed < SLOW_ENOUGH
+    return _nearer(own, rules, sheet) * _at_rest(rules, sheet)
 
 
 @inlined
 def _observe(own, rules, sheet, seen):
+    """The way that is left to the driven corner, and the time."""
     for c in range(3):
         seen.way[c] = (own.goal[c] - rules.hangs[c] - sheet.hands[0, c]) * (10 / rules.side)
     seen.time_left = 1 - own.step / rules.acting_steps
@@ -88,38 +93,44 @@ class ReachTask(Task):
         anchors=(DRIVEN,),
         air_density=0.0,
     )
-    kernels = Kernels(_potential, _judge, _observe)
+    kernels = Kernels(_potential, _evaluate, _observe)
     acting_steps = 40
-    key_particles = key_particles(SHEET)
-    judgement = (("goal_distance", float), ("corner_speed", float))
+    observations = (
+        Observation(
+            "way",
+            "from the driven corner to where it must be for the free one to hang in the goal",
+            (3,),
+            "L/10",
+            10 * POSITION_BOUND,
+        ),
+        Observation("time_left", "share of the time left"),
+    )
+    points_relative_to = "the goal"
+    evaluation = (("goal_distance", float), ("corner_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
 
-    def _colliders(self) -> list:
+    def colliders(self) -> list[Collider]:
         return []  # the floor is out of reach
 
-    def _arena(self) -> tuple[NDArray, NDArray]:
+    def arena(self) -> tuple[NDArray, NDArray]:
         return LOW, HIGH
 
-    def _remembers(self) -> Fields:
+    def remembers(self) -> Fields:
         return [("goal", float, 3), ("distance", float)]
 
-    def _figures(self) -> dict[str, Any]:
+    def constants(self) -> dict[str, Any]:
         return {"free": FREE, "hangs": hanging()[FREE]}
-
-    def _observes(self) -> Fields:
-        return [("way", 10 * POSITION_BOUND, 3), ("time_left", 1.0)]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
-    def _check_options(self, options: Mapping[str, Any]) -> None:
-        super()._check_options(options)
+    def check_options(self, options: Mapping[str, Any]) -> None:
         if "goal" in options:
             goal = vector("reset option goal", options["goal"])
             low, high = LOW + hanging()[FREE], HIGH + hanging()[FREE]
             if np.any((goal < low) | (goal > high)):
                 raise ValueError(f"reset option goal={options['goal']!r}: the free corner can rest from {low} to {high} only")
 
-    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         middle = (LOW + HIGH) / 2
         start = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
@@ -133,15 +144,12 @@ class ReachTask(Task):
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """To the place from which the corner hangs in the goal, ever slower: the air calms the rest."""
+        """To the place from which the corner hangs in the goal, ever slower: the air brings the sheet to rest."""
         return EXPERT_GAIN * self._way() / self.physics.hand_speed
 
     def _way(self) -> NDArray:
         """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
         return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
-
-    def solids(self, env: int) -> list[Solid]:
-        return []
 
     def markers(self, env: int) -> list[Any]:
         from clothgym.render import Solid  # imported here: training draws nothing
@@ -166,12 +174,12 @@ def hanging() -> NDArray:
 
 
 class ClothReachEnv(ClothEnv):
-    """Bring the free corner of a hanging sheet to a point where it can rest, and calm it there.
+    """Bring the free corner of a hanging sheet to a point where it can rest, and bring it to rest there.
 
     ## Description
     A square cotton sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner.  The agent moves that corner; the
-    opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner, and calm, when
-    40 steps are over.  The task is for teaching and for tests: any learner solves it in a minute.
+    opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner, and at rest,
+    when 40 steps are over.  The task is for teaching and for tests: any learner solves it in a minute.
 
     The id fixes the physics: 15 Hz control, ``semi_implicit_euler`` with 50 substeps, linear air drag of 0.72 N s/m3.
 
@@ -179,28 +187,21 @@ class ClothReachEnv(ClothEnv):
     ``Box(-1, 1, (3,))``: velocity x, y, z of the driven corner, scaled by 0.5 m/s; a vector longer than 1 is shortened.
 
     ## Observation Space
-    ``Box`` of 58 numbers for ``obs_mode="keypoints"`` (and 6 x 81 + 4 for ``"particles"``, all particles row by row):
-
-    | Num | Observation | Bound |
-    | --- | --- | --- |
-    | 0-26 | 3 x 3 points of the sheet (corners, edge middles, centre) relative to the goal, in L | 4 |
-    | 27-53 | their velocities [m/s] | 5 |
-    | 54-56 | from the driven corner to the place from which the free one hangs in the goal, in L/10 | 40 |
-    | 57 | share of the time left | 1 |
+    $observations
 
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  With the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the
     potential on the way is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``; at the end it is
-    the normalised performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+    the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
 
-    ## Judgement
+    ## Evaluation
     ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
     doing nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
     ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure``
     and ``reward_terms``.
-    What belongs to the judgement is 0 until then.
+    What belongs to the evaluation is 0 until then.
 
     ## Starting State
     The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
@@ -208,27 +209,15 @@ class ClothReachEnv(ClothEnv):
     millimetre.
 
     ## Episode End
-    Terminated when judged, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice
-    its rest length), "out_of_bounds" (the sheet's centre 0.5 m outside the room of the driven corner), "diverged" (not finite;
+    Terminated when evaluated, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice
+    its rest length), "out_of_bounds" (the sheet's center 0.5 m outside the room of the driven corner), "diverged" (not finite;
     the last finite observation goes out).  Never truncated: the time limit is part of the task.
 
     ## Arguments
-    | Argument | Default | Meaning |
-    | --- | --- | --- |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
-    | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
-    | ``strain_limit`` | ``None`` | largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met |
-    | ``self_collision`` | ``False`` | or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more |
-    | ``substeps`` | 50 | or ``"auto"`` |
-    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
-    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
-    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
-    | ``wind`` | ``None`` | what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle |
-    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
-    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 5 % on |
+    $arguments
 
-    ``reset(options=...)`` takes ``"goal"``, three coordinates [m], and ``"material"``, a dict of figures for one episode.
+    ``reset(options=...)`` takes ``"goal"``, three coordinates [m], and ``"material"``, a preset's name or a dict of properties, for
+    one episode.
 
     ## Version History
     * v0: initial version

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import TaskState
+from clothgym.envs.pages import check_keywords, completed
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
 
@@ -16,12 +17,17 @@ IMAGE_SIZE = 480
 
 
 class ClothEnv(gym.Env[NDArray, NDArray]):
-    """Base of the single environments; a subclass names its ``Task``."""
+    """Base of the single environments; a subclass names its ``Task``, and its docstring is completed by ``pages``."""
 
     task_class: ClassVar[type[Task]]
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30}  # noqa: RUF012 - Gymnasium's own
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__doc__ = completed(cls.__doc__, getattr(cls, "task_class", None))
+
     def __init__(self, render_mode: str | None = None, render_color: str = "fabric", **kwargs: Any) -> None:
+        check_keywords(self, kwargs)
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
         kwargs.setdefault("threads", 1)
@@ -43,7 +49,12 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         task = self.task
         task.step(np.asarray(action)[None])
         reward, terminated, *_ = task.outcome[0].item()
-        return task.observation[0].copy(), reward, terminated, False, task.told_of(0)
+        return task.observation[0].copy(), reward, terminated, False, task.info_of(0)
+
+    @property
+    def observation_slices(self) -> dict[str, slice]:
+        """Where each observation lies in what ``reset`` and ``step`` return, by its name on the page."""
+        return dict(self.task.observation_slices)
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
@@ -62,5 +73,6 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         return self.task.get_state()
 
     def set_state(self, state: TaskState) -> None:
+        """Continue from what ``get_state`` returned, here or in another environment of the same kind."""
         self.task.set_state(state)
         self._np_random = self.task.generators[0]

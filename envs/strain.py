@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import integrators
 from clothgym._jit import inlined
-from clothgym.checks import number, positive
-from clothgym.collisions import Capsule
+from clothgym.checks import not_negative, positive
+from clothgym.collisions import Capsule, Collider
 from clothgym.envs import carriers
+from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
-from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, key_particles, largest_strain, length_of, stretch_quantile
+from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, largest_strain, length_of, stretch_quantile
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
@@ -23,16 +24,16 @@ from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import grid
+from clothgym.simulation import GRAVITY
 from clothgym.wind import Wind
 
 if TYPE_CHECKING:
-    from clothgym.render import Camera, Solid
+    from clothgym.render import Camera
 
 SIDE = 0.3  # L [m]
 ROWS = 13
 SHEET = grid(ROWS, ROWS, SIDE, SIDE)
 FABRIC = Material.preset("knit", damping_time=1e-3)
-WEIGHT = FABRIC.density * SIDE**2 * 9.81  # [N]
 
 
 def _clip(columns: range) -> tuple[int, ...]:
@@ -53,7 +54,7 @@ MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
 FAR = 10.0  # bound of observed distances, in sides
 
-WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colours of the markers
+WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colors of the markers
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -67,8 +68,8 @@ def _to_places(own, sheet):
 
 
 @inlined
-def _tick_off(own, rules, sheet, move, free):
-    """Way-points that the clips have passed are ticked off."""
+def _pass_waypoint(own, rules, sheet, move, free):
+    """Go on to the next way-point when the clips have passed one."""
     left, right = _to_places(own, sheet)
     if own.next < WAYPOINTS - 1 and (left + right) / 2 < PASSED:
         own.next += 1
@@ -76,6 +77,7 @@ def _tick_off(own, rules, sheet, move, free):
 
 @inlined
 def _measure(own, rules, sheet):
+    """The strain's 95th percentile, how the sheet pulls at each clip, and the origin of what is observed."""
     own.strain_p95 = stretch_quantile(sheet.x, sheet.mesh.ends, sheet.mesh.inverse2, 0.95) - 1
     for k in range(2):
         pull = length_of(sheet.pulls[k])
@@ -100,7 +102,8 @@ def _potential(own, rules, sheet):
 
 
 @inlined
-def _judge(own, rules, sheet, info):
+def _evaluate(own, rules, sheet, info):
+    """Write whether the clips have arrived, and at no cost; returns the normalized performance."""
     info.is_success = _arrived(own, rules, sheet)
     info.is_safe_success = info.is_success and own.episode_cost == 0
     return 1.0 if info.is_success else _potential(own, rules, sheet)
@@ -108,6 +111,7 @@ def _judge(own, rules, sheet, info):
 
 @inlined
 def _account(own, rules, sheet, info, terms, running, failure):
+    """The step's cost and what it comes from; returns the price of that cost."""
     strain = largest_strain(sheet.summary)
     info.cost = 1.0 if running and strain > rules.threshold else 0.0
     # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
@@ -123,6 +127,7 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
+    """The ways to the next two way-points, the post, the wind, strain and pulls, the threshold and the time."""
     following = min(own.next + 1, WAYPOINTS - 1)
     for k in range(2):
         for c in range(3):
@@ -153,12 +158,30 @@ class StrainTask(Task):
         anchors=CLIPS,
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
     )
-    kernels = Kernels(_potential, _judge, _observe, act=_tick_off, measure=_measure, done=_arrived, account=_account)
+    kernels = Kernels(_potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account)
     acting_steps = 150
     strain_shown = 0.1
-    key_particles = key_particles(SHEET)
+    observations = (
+        Observation("to_next", "from each clip to its place at the next way-point", (2, 3), "L/5", 5 * FAR),
+        Observation("to_following", "and at the one after that (at the goal: the same)", (2, 3), "L", FAR),
+        Observation("at_goal", "whether the next way-point is the goal"),
+        Observation("post", "the post's axis relative to the middle between the clips", (2,), "L", FAR),
+        Observation("wind", "velocity of the air", (3,), "m/s", 20.0),
+        Observation("strain_max", "largest strain of the structural springs, over the threshold", (), "", 20.0),
+        Observation("strain_p95", "its 95th percentile over these springs, over the threshold", (), "", 20.0),
+        Observation("pulls", "pull of the sheet at each clip, over its weight", (2,), "", 20.0),
+        Observation("threshold", "the threshold"),
+        Observation("time_left", "share of the time left"),
+    )
+    points_relative_to = "the next way-point's middle"
     position_bound = FAR
-    judgement = (("is_safe_success", bool),)
+    arguments: ClassVar = {
+        "threshold": "strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient",
+        "cost_penalty": "what each such step takes from the reward",
+        "strain_limit": "anything else is refused, see above",
+        "wind": 'the id\'s own; or what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for still air',
+    }
+    evaluation = (("is_safe_success", bool),)
     accounts = (("cost", float), ("episode_cost", float), ("strain_excess", np.float32), ("strain_p95", float), *TENSIONS)
     prices = ("cost",)
     feels_pulls = True
@@ -191,31 +214,29 @@ class StrainTask(Task):
 
     @cost_penalty.setter
     def cost_penalty(self, value: float) -> None:
-        self.rules["cost_penalty"] = checked_penalty(value)
+        self.rules["cost_penalty"] = not_negative("cost_penalty", value)
 
-    def _colliders(self) -> list:
+    def colliders(self) -> list[Collider]:
         return [_post(0.0, 0.0)]
 
-    def _arena(self) -> tuple[NDArray, NDArray]:
+    def episode_colliders(self, env: int) -> Mapping[int, Collider]:
+        return {0: self._post(env)}
+
+    def arena(self) -> tuple[NDArray, NDArray]:
         return LOW, HIGH
 
-    def _remembers(self) -> Fields:
+    def remembers(self) -> Fields:
         # the post's axis, where each clip is to be at each way-point [m], the next one, the way that is left at each, and in all
         way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
 
-    def _figures(self) -> dict[str, Any]:
-        return {"threshold": self.threshold, "cost_penalty": 0.0, "weight": WEIGHT, "arrived": ARRIVED}
-
-    def _observes(self) -> Fields:
-        return [
-            *[("to_next", 5 * FAR, (2, 3)), ("to_following", FAR, (2, 3)), ("at_goal", 1.0), ("post", FAR, 2), ("wind", 20.0, 3)],
-            *[("strain_max", 20.0), ("strain_p95", 20.0), ("pulls", 20.0, 2), ("threshold", 1.0), ("time_left", 1.0)],
-        ]
+    def constants(self) -> dict[str, Any]:
+        weight = self.physics.material.density * SIDE**2 * GRAVITY  # [N]
+        return {"threshold": self.threshold, "cost_penalty": 0.0, "weight": weight, "arrived": ARRIVED}
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
-    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         post = rng.uniform(-0.1, 0.1, 2)
         side = 1 if rng.uniform() < 0.5 else -1
         middles = np.array(
@@ -240,9 +261,6 @@ class StrainTask(Task):
         x = middles[0] + hanging()
         x[:, 0] += ripple
         return x
-
-    def _furnish(self, envs: NDArray) -> None:
-        self.simulation.set_collider(0, [self._post(env) for env in envs], envs)
 
     @property
     def posts(self) -> list[Capsule]:
@@ -271,12 +289,6 @@ class StrainTask(Task):
     def _as_actions(self, velocities: NDArray) -> NDArray:
         return (velocities / self.physics.hand_speed).reshape(self.num_envs, 6)
 
-    def solids(self, env: int) -> list[Solid]:
-        from clothgym.render import Solid  # imported here: training draws nothing
-
-        post = self._post(env)
-        return [Solid(kind="capsule", center=post.center, radius=post.radius, height=post.height)]
-
     def markers(self, env: int) -> list[Any]:
         from clothgym.render import Solid  # imported here: training draws nothing
 
@@ -291,12 +303,6 @@ class StrainTask(Task):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.82), vertical_fov=37.0)
-
-
-def checked_penalty(value: float) -> float:
-    if number("cost_penalty", value) < 0:
-        raise ValueError(f"cost_penalty={value!r}: must be zero or positive")
-    return float(value)
 
 
 def _post(x: float, y: float) -> Capsule:
@@ -317,7 +323,7 @@ class ClothStrainEnv(ClothEnv):
     ## Description
     A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its
     upper corners, each 3 x 2 particles wide.  The agent moves both clips past a post, by two way-points, to a goal, within 150
-    steps.  At rest the most stretched thread is 4 % longer than it was made; a start from rest to full speed, clips that are
+    steps.  At rest the most stretched yarn is 4 % longer than it was made; a start from rest to full speed, clips that are
     pulled apart or pushed together, a gust, or a catch on the post, stretch it more.  Each step that ends with more than the
     threshold costs 1: the task for constrained reinforcement learning.
 
@@ -332,33 +338,19 @@ class ClothStrainEnv(ClothEnv):
     shortened.  Clips do not turn.  Solids do not stop them: a clip that is driven through the post tears the sheet.
 
     ## Observation Space
-    ``Box`` of 78 numbers for ``obs_mode="keypoints"`` (and 6 x 169 + 24 for ``"particles"``, all particles row by row):
-
-    | Num | Observation | Bound |
-    | --- | --- | --- |
-    | 0-26 | 3 x 3 points of the sheet relative to the next way-point's middle, in L | 10 |
-    | 27-53 | their velocities [m/s] | 5 |
-    | 54-59 | from each clip to its place at the next way-point, in L/5 | 50 |
-    | 60-65 | and at the one after that (at the goal: the same), in L | 10 |
-    | 66 | whether the next way-point is the goal | 1 |
-    | 67-68 | the post's axis relative to the middle between the clips, in L | 10 |
-    | 69-71 | velocity of the air [m/s] | 20 |
-    | 72-73 | largest strain and its 95th percentile over the structural springs, over the threshold | 20 |
-    | 74-75 | pull of the sheet at each clip, over its weight | 20 |
-    | 76 | the threshold | 1 |
-    | 77 | share of the time left | 1 |
+    $observations
 
     ## Rewards and costs
     ``reward_mode="delta"``: progress along the way, less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus 0.25 for
     arriving.  Progress is the change of the share of the way that lies behind the clips: what is left is their mean distance
     from the next way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.
-    ``reward_mode="sparse"``: the normalised performance, at the judgement.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
 
     ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  ``info["episode_cost"]`` adds them
     up; a failure adds all the steps that were left, or tearing the sheet would be the cheap way out.  ``cost_penalty`` takes that
     much from the reward for each, for learners that know no costs.
 
-    ## Judgement
+    ## Evaluation
     When each clip is within 0.15 L of its place at the goal, or time is up: ``info["is_success"]`` if it has arrived,
     ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the way, 1 on arrival.
     ``info`` also has ``strain_max`` (and ``strain_before_limiting``, the same), ``strain_p95``, ``strain_excess`` (over the
@@ -369,7 +361,7 @@ class ClothStrainEnv(ClothEnv):
     What scripted agents score on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy noop random
     careless expert``); careless is each clip straight to its place at full speed, expert the pair held apart as at rest, at
     0.5 m/s and 2 m/s2.  It is sudden starts and stops that cost, more than speed: at 1 m/s and 2 m/s2 the expert pays 1.0, at
-    0.10.  With a threshold of 0.05 it pays 18, for the sheet at rest is stretched by 0.04 and gusts add 0.01: only a calm makes
+    0.10.  With a threshold of 0.05 it pays 18, for the sheet at rest is stretched by 0.04 and gusts add 0.01: only still air makes
     that one feasible; with 0.20 the careless one pays 0.5.
 
     | policy | arrives | mean cost | at no cost | steps |
@@ -387,29 +379,14 @@ class ClothStrainEnv(ClothEnv):
     0.2 rad.
 
     ## Episode End
-    Terminated when judged, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's centre 0.5 m outside the room of the clips), "diverged" (not finite; the last finite observation
+    Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m outside the room of the clips), "diverged" (not finite; the last finite observation
     goes out).  Never truncated: the time limit is part of the task.
 
     ## Arguments
-    | Argument | Default | Meaning |
-    | --- | --- | --- |
-    | ``threshold`` | 0.10 | strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient |
-    | ``cost_penalty`` | 0 | what each such step takes from the reward |
-    | ``integrator`` | ``"semi_implicit_euler"`` | or another, by name or ``{"name": ..., option: ...}``, with automatic substeps |
-    | ``bending`` | ``"springs"`` | or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending`` |
-    | ``substeps`` | 35 | or ``"auto"`` |
-    | ``obs_mode`` | ``"keypoints"`` | or ``"particles"`` |
-    | ``reward_mode`` | ``"delta"`` | or ``"sparse"`` |
-    | ``randomize`` | ``{}`` | ranges of material figures drawn at reset, ``{"density": [0.1, 0.2]}`` |
-    | ``wind`` | ``None`` | the id's own; or what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for a calm |
-    | ``strain_limit`` | ``None`` | anything else is refused, see above |
-    | ``self_collision`` | ``False`` | or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more |
-    | ``threads`` | 1; in a batch all processors | the outcome does not depend on it |
-    | ``render_mode`` | ``None`` | ``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``) |
-    | ``render_color`` | ``"fabric"`` | or ``"strain"``: cream where no thread is stretched, violet from 10 % on |
+    $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a dict of figures for one episode.
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
 
     ## Version History
     * v0: initial version

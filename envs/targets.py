@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,6 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.checks import finite, number, positive
 from clothgym.collisions import Box, Capsule, Collider, Sphere
-
-if TYPE_CHECKING:
-    from clothgym.render import Solid
 
 LARGEST = 0.6  # [m]: sizes and distances beyond this leave no room to drape in
 SHAPES = ("sphere", "box", "post")
@@ -82,6 +79,7 @@ class Target:
         return (*self.center, self.height)
 
     def collider(self, friction: float, thickness: float) -> Collider:
+        """The solid that it is."""
         x, y = self.center
         if self.shape == "sphere":
             return Sphere(center=(x, y, self.radius), radius=self.radius, friction=friction, thickness=thickness)
@@ -95,35 +93,23 @@ class Target:
             center=center, radius=self.radius, height=max(length, 2 * self.radius), friction=friction, thickness=thickness
         )
 
-    def solid(self) -> Solid:
-        """The same for the renderer."""
-        from clothgym.render import Solid  # imported here: training draws nothing
-
-        x, y = self.center
-        if self.shape == "sphere":
-            return Solid(kind="sphere", center=(x, y, self.radius), radius=self.radius)
-        if self.shape == "box":
-            return Solid(kind="box", center=(x, y, self.radius), half_sides=(self.radius,) * 3, yaw=self.yaw)
-        length = self.height + self.radius
-        return Solid(kind="capsule", center=(x, y, self.height - length / 2), radius=self.radius, height=length)
-
     def upper_surface(self, count: int) -> NDArray[np.float64]:
         """About ``count`` points, evenly by area, where the surface slopes by at most UPPER_SLOPE [m], (points, 3)."""
         turn = np.array([math.cos(self.yaw), math.sin(self.yaw)])
         return placed(unit_surface(self.shape, count), np.array(self.top), self.radius, turn)
 
-    def changed(self, figures: Mapping[str, Any]) -> Target:
-        """The same but for some figures; its height follows from its radius unless it is among them, or a post's."""
-        if "radius" in figures and "height" not in figures and self.shape != "post":
-            figures = {**figures, "height": 2 * figures["radius"]}
-        return replace(self, **figures) if figures else self
+    def changed(self, properties: Mapping[str, Any]) -> Target:
+        """The same but for some properties; its height follows from its radius unless it is among them, or a post's."""
+        if "radius" in properties and "height" not in properties and self.shape != "post":
+            properties = {**properties, "height": 2 * properties["radius"]}
+        return replace(self, **properties) if properties else self
 
 
 @lru_cache
 def unit_surface(shape: str, count: int) -> NDArray[np.float64]:
     """The points of ``Target.upper_surface`` for a radius of 1, unturned, relative to its top, (points, 3)."""
     if shape == "box":
-        # cell centres of the square [-1, 1]^2, count rounded to a square number
+        # cell centers of the square [-1, 1]^2, count rounded to a square number
         n = max(1, round(math.sqrt(count)))
         line = (np.arange(n) + 0.5) / n * 2 - 1
         return np.stack([*(g.ravel() for g in np.meshgrid(line, line)), np.zeros(n * n)], axis=1)
@@ -151,6 +137,7 @@ def placed(units, top, radius, turn):
 
 @lru_cache
 def _reference_table() -> dict[str, tuple[NDArray, NDArray, NDArray]]:
+    """The committed coverages: widths and heights, in sheet sides, and the coverage at each pair, by shape."""
     text = resources.files("clothgym.envs").joinpath("drape_reference.json").read_text()
     return {
         shape: tuple(np.array(rows[name], dtype=float) for name in ("widths", "heights", "coverage"))  # type: ignore[misc]
@@ -159,7 +146,7 @@ def _reference_table() -> dict[str, tuple[NDArray, NDArray, NDArray]]:
 
 
 def reference_coverage(target: Target, side: float) -> float:
-    """Coverage that a fine sheet, laid flat and centred, reaches on this target: the ideal of the task.
+    """Coverage that a fine sheet, laid flat and centered, reaches on this target: the ideal of the task.
 
     Bilinear in the committed table over width and height (in sheet sides); beyond the table its edge holds.
     """

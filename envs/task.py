@@ -1,16 +1,16 @@
 """A task, written once for a batch: what ``ClothEnv`` (a batch of one) and ``ClothVectorEnv`` (a batch of many) both run.
 
-An episode: the agent moves its hands (anchors or grippers) until it is done, at the latest until its time is up; then, in the
-tasks that have it so, the sheet settles for a fixed number of steps, in which actions are ignored; then it is judged, which
+An episode: the agent moves its attachments (anchors or grippers) until it is done, at the latest until its time is up; then, in
+the tasks that have it so, the sheet settles for a fixed number of steps, in which actions are ignored; then it is evaluated, which
 terminates.
 """
 
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,85 +18,81 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.envs.episode import FAILURES, Fields, TaskState, names_of, record_of, records
-from clothgym.envs.physics import Physics, check_material_option, check_ranges, checked_ranges, checked_wind, most_demanding
-from clothgym.envs.stepping import Kernels, compiled, mesh_arrays
+from clothgym.checks import not_negative, one_of
+from clothgym.envs.definition import VELOCITY_BOUND, Observation, TaskDefinition
+from clothgym.envs.episode import FAILURES, TaskState, names_of, record_of, records
+from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
+from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
+from clothgym.material import Material
 from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
 from clothgym.simulation import Simulation
 
-if TYPE_CHECKING:
-    from clothgym.render import Camera, Solid
-
 REWARD_MODES = ("delta", "sparse")
-HELD = (250, 200, 60)  # colour of the anchors' markers
-POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
 ENVS_A_THREAD = 16  # fewer are not worth another thread
 
 
-class Task(ABC):
-    """Base of all tasks.
+class Task(TaskDefinition):
+    """Base of all tasks; what each defines is in ``TaskDefinition``.
 
     Args:
         num_envs: environments in the batch.
+        fabric: another fabric than the task's own, a ``Material`` or a preset's name; substeps are then chosen automatically.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
-        bending, strain_limit, self_collision: as ``Simulation`` takes them.
+        bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them.
         obs_mode: one of ``obs_modes``.
-        reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the judgement alone).
-        randomize: ranges of material figures drawn at each reset, ``{"density": [0.1, 0.2]}``.
-        wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for a calm.
+        reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
+        randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
+        wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
         threads: threads to use; all processors by default for a batch.
 
     Attributes:
-        episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``_remembers``; with
+        simulation: the batch of sheets.
+        episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
-        rules: one record of figures that all environments share.
+        observation_slices: where each observation lies in ``observation[env]``, by its name.
+        rules: one record of numbers that all environments share.
         outcome, info, terms: records of what the last step has brought, (num_envs,).
 
     Raises:
-        ValueError: an unknown mode, figure or integrator, or a range that is none; the message says what would do.
+        ValueError: an unknown mode, property, fabric or integrator, or a range that is none; the message says what would do.
+        TypeError: the task has neither kernels nor the methods that stand for them.
     """
-
-    physics: ClassVar[Physics]
-    kernels: ClassVar[Kernels]  # what a step is about, see ``stepping``
-    acting_steps: ClassVar[int]
-    settling_steps: ClassVar[int] = 0
-    hand_actions: ClassVar[int] = 3  # numbers for each hand: a velocity, and what comes after it
-    key_particles: ClassVar[NDArray]  # those that are observed with obs_mode="keypoints"
-    obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
-    position_bound: ClassVar[float] = POSITION_BOUND
-    judgement: ClassVar[Fields]  # what info tells of the judgement, zero until then, beside performance and success
-    accounts: ClassVar[Fields] = ()  # what else it tells of each step
-    prices: ClassVar[tuple[str, ...]] = ()  # reward terms of the task's own
-    feels_pulls: ClassVar[bool] = False  # whether its kernels must know how the sheet pulls at the hands
-    reset_options: ClassVar[tuple[str, ...]] = ("material",)
-    strain_shown: ClassVar[float] = 0.05  # where the colours of render_color="strain" end
 
     def __init__(
         self,
         num_envs: int,
+        fabric: str | Material | None = None,
         integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
         bending: str = "springs",
         strain_limit: float | None = None,
         self_collision: bool | str | Mapping[str, Any] = False,
+        contact: str = "particles",  # what the tasks were made and scored with
+        air_density: float | None = None,
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",
         randomize: Mapping[str, Sequence[float]] | None = None,
         wind: Mapping[str, Any] | None = None,
         threads: int | None = None,
     ) -> None:
-        for name, value, known in (("obs_mode", obs_mode, self.obs_modes), ("reward_mode", reward_mode, REWARD_MODES)):
-            if value not in known:
-                raise ValueError(f"{name}={value!r}: must be one of {', '.join(known)}")
+        one_of("obs_mode", obs_mode, *self.obs_modes)
+        one_of("reward_mode", reward_mode, *REWARD_MODES)
         self.obs_mode, self.reward_mode = obs_mode, reward_mode
+        self._in_numpy = self.kernels.potential is IN_NUMPY.potential
+        self._check_definition()
+        # the fabric, the air and how time is stepped: the task's own, or what the keywords say
+        own_fabric = self.physics.material
+        physics = self.physics = replace(self.physics, material=chosen_fabric(fabric, own_fabric))  # type: ignore[misc]
         self.randomize = checked_ranges(randomize or {})
-        physics = self.physics
         self.wind = physics.wind if wind is None else checked_wind(wind)
+        if air_density is None:
+            air_density = physics.air_density if wind is None else AIR_DENSITY
         method = integrators.get(integrator if integrator is not None else physics.integrator)
         check_ranges(physics, self.randomize, method)
         if substeps is None:
-            substeps = physics.substeps if method.name == physics.integrator and not self.randomize else "auto"
+            as_tuned = method.name == physics.integrator and not self.randomize and physics.material == own_fabric
+            substeps = physics.substeps if as_tuned else "auto"
         self.simulation = Simulation(
             physics.mesh,
             # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
@@ -105,9 +101,9 @@ class Task(ABC):
             integrator=method,
             time_step=physics.time_step,
             substeps=substeps,  # type: ignore[arg-type]
-            colliders=self._colliders(),
-            contact="particles",  # what the tasks were made and scored with
-            air_density=physics.air_density if wind is None else AIR_DENSITY,
+            colliders=self.colliders(),
+            contact=contact,
+            air_density=not_negative("air_density", air_density),
             anchors=physics.anchors,  # type: ignore[arg-type]
             anchor_speed=2 * physics.hand_speed,
             grippers=physics.grippers,
@@ -121,106 +117,81 @@ class Task(ABC):
         self.threads = self.simulation.threads
         self.num_hands = len(physics.anchors) + len(physics.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.hand_actions * self.num_hands,), np.float32)
-        self.particles = self.key_particles if obs_mode == "keypoints" else np.arange(physics.mesh.num_particles)
         self._prepare_observation()
         self._prepare_records()
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
         self._seeded = np.zeros(num_envs, bool)
 
+    def _check_definition(self) -> None:
+        """Refuse a task that cannot be evaluated or has nothing to observe."""
+        missing = [name for name in ("performance", "success") if getattr(type(self), name) is getattr(TaskDefinition, name)]
+        if self._in_numpy and missing:
+            raise TypeError(f"{type(self).__name__} does not define {' and '.join(missing)}(): a task without kernels needs both")
+        if not self.observations:
+            raise TypeError(f"{type(self).__name__}.observations is empty: declare at least one Observation")
+
     def _prepare_observation(self) -> None:
-        """Space and memory of what is observed: the sheet's points, and what the task declares."""
-        points, declared = 3 * len(self.particles), self._observes()
-        bounds = [np.full(points, self.position_bound), np.full(points, VELOCITY_BOUND)]
-        bounds += [np.broadcast_to(bound, size[0] if size else 1).ravel() for _, bound, *size in declared]
+        """Space, memory and look-up of what is observed: the sheet's points, and what the task declares."""
+        self.particles = self.observed_particles() if self.obs_mode == "keypoints" else np.arange(self.physics.mesh.num_particles)
+        declared = [*points_observed(self, self.obs_mode, len(self.particles)), *self.observations]
+        # each observation's place in the array, and its bound
+        ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
+        self.observation_slices = {one.name: slice(first, end) for one, first, end in zip(declared, [0, *ends], ends)}
+        if len(self.observation_slices) < len(declared):
+            raise TypeError(f"{type(self).__name__}.observations: two have the same name, in {[one.name for one in declared]}")
+        bounds = [np.broadcast_to(one.bound, one.shape).ravel() for one in declared]
         self._bound = np.concatenate(bounds).astype(np.float32)
         self.single_observation_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
         self.observation = np.zeros((self.num_envs, len(self._bound)), np.float32)
-        self._seen = records(self.num_envs, [(name, np.float32, *size) for name, _, *size in declared])
-        self._more = self._seen.view(np.float32).reshape(self.num_envs, -1)
+        # what the task declares, as records for its kernels and as the numbers in them
+        self.seen = records(self.num_envs, [(one.name, np.float32, one.shape) for one in self.observations])
+        self._more = self.seen.view(np.float32).reshape(self.num_envs, -1)
 
     def _prepare_records(self) -> None:
         """Records of the episodes and their steps, and the kernels that go through them."""
         physics, count = self.physics, self.num_envs
-        hand, low, high = (self.num_hands, 3), *self._arena()
+        hand, (low, high) = (self.num_hands, 3), self.arena()
+        # what an episode remembers
         memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand)]
         memory += [("potential", float)]
-        memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self._remembers()]
+        memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self.remembers()]
+        if self._in_numpy:
+            memory += [("performance", float), ("success", bool), ("done", bool)]
         self.episode = records(count, memory)
         self.episode["over"] = True
         steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
         self.air = np.zeros((count, steps, 3))
+        # what all environments share
         self.rules = record_of(
             low=low, high=high, reach=physics.hand_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
-            side=max(physics.mesh.size), **self._figures(),
+            side=max(physics.mesh.size), **self.constants(),
         )  # fmt: skip
+        # what a step brings
         brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_hands, self.hand_actions)), ("free", np.uint8, self.num_hands)]
         self.outcome = records(count, brought)
-        told = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
+        always = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
         self.info = records(
-            count, [*told, ("normalized_performance", float), ("is_success", bool), *self.judgement, *self.accounts]
+            count, [*always, ("normalized_performance", float), ("is_success", bool), *self.evaluation, *self.accounts]
         )
         self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
+        # what the kernels need beside these
         self._mesh = mesh_arrays(physics.mesh, self.particles)
         self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *hand))
-        self._order, self._conclude = compiled(type(self).__name__, self.kernels)
-
-    # --- what each task says --------------------------------------------------------------------------------------------
-
-    @abstractmethod
-    def _colliders(self) -> list:
-        """The scene's solids; those that change at reset are replaced by ``_begin``."""
-
-    @abstractmethod
-    def _arena(self) -> tuple[NDArray, NDArray]:
-        """Lowest and highest corner of the room in which hands move [m]; the sheet is out of bounds 0.5 m beyond it."""
-
-    @abstractmethod
-    def _remembers(self) -> Fields:
-        """What its episodes remember: fields of ``episode`` beside those that all have."""
-
-    def _figures(self) -> dict[str, Any]:
-        """Figures that its kernels must know: fields of ``rules``, numbers or arrays."""
-        return {}
-
-    @abstractmethod
-    def _observes(self) -> Fields:
-        """What is observed beside the points of the sheet, in that order: a number's name and largest magnitude, or those of some
-        numbers and how many they are."""
-
-    @abstractmethod
-    def _begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        """Draw one environment's scene; the sheet's particles at the start [m], (particles, 3)."""
-
-    def _furnish(self, envs: NDArray) -> None:  # noqa: B027 - some have none
-        """Put solids where ``_begin`` has drawn them, or a state has them."""
-
-    def _place_hands(self, envs: NDArray) -> None:  # noqa: B027 - anchors need nothing
-        """Put grippers where an episode begins with them; anchors hold their particles."""
-
-    @abstractmethod
-    def expert_actions(self) -> NDArray:
-        """What a scripted expert does now, (num_envs, actions); it sees the whole state."""
-
-    @abstractmethod
-    def solids(self, env: int) -> list[Solid]:
-        """What the renderer draws beside the sheet and the floor."""
-
-    @abstractmethod
-    def camera(self) -> Camera:
-        """Where the scene is seen from."""
+        self._place = self.simulation.layout.at(self._everyone)
+        self._apply_actions, self._finish_step = compiled(type(self).__name__, self.kernels)
 
     # --- episode --------------------------------------------------------------------------------------------------------
 
     def reset(self, envs: NDArray, seeds: Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> None:
         """Begin new episodes; a seed of None goes on with the environment's generator."""
-        options = {} if options is None else options
-        self._check_options(options)
+        options = self._checked_options({} if options is None else options)
         if not len(envs):
             return
         simulation = self.simulation
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
+        # draw each episode from its own generator
         for k, env in enumerate(envs.tolist()):
             seed = seeds[k] if seeds is not None else None
             if seed is not None or not self._seeded[env]:
@@ -229,36 +200,48 @@ class Task(ABC):
             self._draw_material(env, options.get("material", {}))
             if self.wind is not None:
                 self.air[env] = self.wind.series(self.generators[env], self.air.shape[1], self.physics.time_step)
-            starts[k] = self._begin(env, self.generators[env], options)
+            starts[k] = self.begin(env, self.generators[env], options)
         material = self.episode["material"][envs]
         if not np.array_equal(material, simulation.parameters[envs]):
-            # the declared ranges were held against the integrator's bound at construction; one episode's figures are now
-            figures = {name: material[:, i] for i, name in enumerate(FIGURES)}
-            simulation.set_parameters(envs, warn="material" in options, **figures)
+            # the declared ranges were held against the integrator's bound at construction; one episode's fabric is now
+            properties = {name: material[:, i] for i, name in enumerate(FIGURES)}
+            simulation.set_parameters(envs, warn="material" in options, **properties)
         simulation.reset(envs, positions=starts)
         if self.wind is not None:
             simulation.set_wind(self.air[envs, 0], envs)
-        self._furnish(envs)
-        self._place_hands(envs)
-        self._look(envs, begins=True)
+        self._place_colliders(envs)
+        self.place_attachments(envs)
+        for name, value in (("step", 0), ("settling_since", -1), ("over", False)):
+            self.episode[name][envs] = value
+        self._score_and_observe(envs, begins=True)
 
-    def _check_options(self, options: Mapping[str, Any]) -> None:
-        """Refuse options that no episode can have, before anything is changed."""
+    def _checked_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
+        """A reset's options, with the properties of a fabric that was named; refuses those that no episode can have."""
         if not isinstance(options, Mapping):
             raise ValueError(f"reset options={options!r}: must be a dict with any of {', '.join(self.reset_options)}")
         unknown = set(options) - set(self.reset_options)
         if unknown:
             raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
+        checked = dict(options)
         if "material" in options:
-            check_material_option(options["material"], self.physics, self.randomize, self.simulation)
+            checked["material"] = checked_material_option(options["material"], self.physics, self.randomize, self.simulation)
+        self.check_options(checked)
+        return checked
 
     def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
-        figures = of_material(self.physics.material)
+        """The fabric of one environment's episode: the task's own, what is drawn, and what the reset's options say."""
+        properties = of_material(self.physics.material)
         for name, (low, high) in self.randomize.items():
-            figures[FIGURES.index(name)] = self.generators[env].uniform(low, high)
+            properties[FIGURES.index(name)] = self.generators[env].uniform(low, high)
         for name, value in fixed.items():
-            figures[FIGURES.index(name)] = value
-        self.episode["material"][env] = figures
+            properties[FIGURES.index(name)] = value
+        self.episode["material"][env] = properties
+
+    def _place_colliders(self, envs: NDArray) -> None:
+        """Put solids where ``begin`` has drawn them."""
+        each = [self.episode_colliders(env) for env in envs.tolist()]
+        for index in each[0] if each else ():
+            self.simulation.set_collider(index, [own[index] for own in each], envs)
 
     def step(self, actions: Any) -> None:
         """One control step of all environments that are not over; the others keep still and get no reward.
@@ -269,16 +252,21 @@ class Task(ABC):
         if not self._seeded.all():
             raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
         actions, simulation = self._checked(actions), self.simulation
-        wrong = self._order(actions, simulation.layout.lanes, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
+        wrong = self._apply_actions(actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
         if wrong >= 0:
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
+        self.before_step(actions)
         simulation.step()
-        self._look(self._everyone, begins=False)
+        self.info = np.zeros(self.num_envs, self.info.dtype)
+        self.after_step()
+        self._score_and_observe(self._everyone, begins=False)
+        # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
             simulation.release(*np.nonzero(self.outcome["free"]))
 
     def _checked(self, actions: Any) -> NDArray:
+        """Actions as an array of the right shape, float64."""
         try:
             array = np.ascontiguousarray(actions, np.float64)
         except (TypeError, ValueError):
@@ -288,57 +276,63 @@ class Task(ABC):
             raise ValueError(f"action has shape {array.shape}: must be {shape}")
         return array
 
-    def _look(self, envs: NDArray, begins: bool) -> None:
-        """Score and observe environments after a step, all of them, or where their episodes begin."""
-        view, lanes, mesh = self.simulation.view, self.simulation.layout.lanes, self._mesh
+    def _score_and_observe(self, envs: NDArray, begins: bool) -> None:
+        """Score and observe environments after a step, all of them, or as their episodes begin."""
+        view, mesh = self.simulation.view, self._mesh
+        block, lane = self.simulation.layout.at(envs) if begins else self._place
         pulls = self.simulation.pulls(envs if begins else None) if self.feels_pulls else self._no_pulls
-        if not begins:
-            self.info = np.zeros(self.num_envs, self.info.dtype)
+        if self._in_numpy:
+            self._evaluate_in_numpy()
 
         def work(first: int, last: int) -> None:
-            self._conclude(
-                first, last, envs, begins, lanes, view.x, view.v, view.holder, view.hands, view.openings, pulls, mesh, self.rules,
-                self.episode, self.air, self.outcome, self.info, self.terms, self._seen, self._more, self._bound, self.observation,
+            self._finish_step(
+                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.hands, view.openings, pulls, mesh,
+                self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more, self._bound,
+                self.observation,
             )  # fmt: skip
 
         _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))
 
+    def _evaluate_in_numpy(self) -> None:
+        """Write what the methods of a task without kernels return, for the kernels of all tasks to read."""
+        # a sheet that has diverged makes numbers that are not finite: its failure is what counts
+        with np.errstate(all="ignore"):
+            self.episode["performance"] = np.clip(np.nan_to_num(self.performance()), 0, 1)
+            self.episode["success"], self.episode["done"] = self.success(), self.done()
+            for one in self.observations:
+                values = self.episode[one.name] if one.function is None else one.function(self)
+                self.seen[one.name] = np.reshape(values, (self.num_envs, *one.shape))
+
     # --- what a step has brought ----------------------------------------------------------------------------------------
 
-    def told(self) -> dict[str, Any]:
-        """What info tells of the last step: arrays over the batch, and a dict of them for the reward's terms."""
-        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | self._told_by_physics()
+    def infos(self) -> dict[str, Any]:
+        """Info of the last step: arrays over the batch, and a dict of them for the reward's terms."""
+        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | self._info_of_physics()
         info["failure"] = np.array(FAILURES)[self.outcome["failure"]]
         info["reward_terms"] = {name: self.terms[name].copy() for name in names_of(self.terms)}
         return info
 
-    def told_of(self, env: int) -> dict[str, Any]:
+    def info_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as plain Python values."""
         info = dict(zip(names_of(self.info), self.info[env].item()))
-        info |= {name: value[env].item() for name, value in self._told_by_physics().items()}
+        info |= {name: value[env].item() for name, value in self._info_of_physics().items()}
         info["failure"] = FAILURES[self.outcome["failure"][env]]
         info["reward_terms"] = dict(zip(names_of(self.terms), self.terms[env].item()))
         return info
 
-    def _told_by_physics(self) -> dict[str, NDArray]:
-        """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and the largest lag
-        of what is held [m]."""
+    def _info_of_physics(self) -> dict[str, NDArray]:
+        """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
+        held lags behind [m]."""
         limiting, contacts = self.simulation.limiting, self.simulation.self_contacts
         info = {} if limiting is None else {"strain_before_limiting": limiting.before}
         if contacts is not None:
             info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "hand_lag": contacts.lag}
         return info
 
-    # --- pictures -------------------------------------------------------------------------------------------------------
-
-    def markers(self, env: int) -> list[Any]:
-        """What is drawn and casts no lift on the sheet: hands that hold it, and what else a task shows."""
-        hands, attached = self.simulation.hand_positions[env], self.simulation.attached[env]
-        return [(x, HELD) for x, held in zip(hands, attached) if held]
-
     # --- state ----------------------------------------------------------------------------------------------------------
 
     def get_state(self) -> TaskState:
+        """All that is needed to continue the batch bit for bit."""
         return TaskState(
             simulation=self.simulation.get_state(),
             episode={name: value.copy() for name, value in self._memory().items()},
@@ -369,8 +363,16 @@ class Task(ABC):
         self.simulation.set_state(state.simulation)
         for name, value in memory.items():
             value[...] = state.episode[name]
-        self._furnish(self._everyone)
         for env, text in enumerate(state.generators):
             self.generators[env] = np.random.default_rng()
             self.generators[env].bit_generator.state = json.loads(text)
         self._seeded[:] = True
+
+
+def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:
+    """What is observed of so many points of the sheet: where they are, and their velocities."""
+    what = "3 x 3 points of the sheet (corners, edge middles, center)" if obs_mode == "keypoints" else "all particles, row by row"
+    return [
+        Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
+        Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),
+    ]

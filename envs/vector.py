@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import TaskState
+from clothgym.envs.pages import check_keywords
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
 
@@ -24,8 +25,8 @@ class ClothVectorEnv(VectorEnv):
         num_envs: environments in the batch; environment ``i`` of a batch seeded ``s`` equals a single one seeded ``s + i``.
         autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
         render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
-        render_color: "fabric", or "strain" for its colours.
-        kwargs: those of the task.
+        render_color: "fabric", or "strain" for its colors.
+        kwargs: those of the task, see the page of the single environment.
     """
 
     task_class: ClassVar[type[Task]]
@@ -38,6 +39,7 @@ class ClothVectorEnv(VectorEnv):
         render_color: str = "fabric",
         **kwargs: Any,
     ) -> None:
+        check_keywords(self, kwargs)
         if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r}: a batch needs at least 1 environment, as an integer")
         try:
@@ -85,19 +87,19 @@ class ClothVectorEnv(VectorEnv):
         task = self.task
         over = task.episode["over"].copy()
         task.step(actions)
-        told, terminated = task.told(), task.outcome["terminated"].copy()
-        info = _with_masks(_only(told, ~over), ~over)
+        step_info, terminated = task.infos(), task.outcome["terminated"].copy()
+        info = _with_masks(_only(step_info, ~over), ~over)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
-            # those that ended in the last step begin anew in this one: their actions were ignored
+            # those that ended in the last step begin again in this one: their actions were ignored
             task.reset(np.flatnonzero(over))
             info["_failure"] = info["_failure"] | over  # a reset says that there is none
         elif self.autoreset_mode == AutoresetMode.SAME_STEP and terminated.any():
-            info = self._reset_ended(terminated, told)
+            info = self._reset_ended(terminated, step_info)
         # the time limit is part of the tasks: nothing is truncated
         return self._observation(), task.outcome["reward"].copy(), terminated, np.zeros(self.num_envs, bool), info
 
     def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> dict[str, Any]:
-        """Same-step mode: begin anew; what was last goes to ``final_info`` and ``final_obs``, the rest is of those that run on."""
+        """Same-step mode: begin again; what was last goes to ``final_info`` and ``final_obs``, the rest is of those that run on."""
         final = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
             final[env] = self.task.observation[env].copy()
@@ -141,6 +143,11 @@ class ClothVectorEnv(VectorEnv):
             values = values[0]
         setattr(self, name, values)
 
+    @property
+    def observation_slices(self) -> dict[str, slice]:
+        """Where each observation lies in an environment's row of what ``reset`` and ``step`` return, by its name on the page."""
+        return dict(self.task.observation_slices)
+
     def expert_actions(self) -> NDArray:
         """What the task's scripted expert does now, (num_envs, actions)."""
         return self.task.expert_actions().astype(np.float32)
@@ -150,6 +157,7 @@ class ClothVectorEnv(VectorEnv):
         return self.task.get_state()
 
     def set_state(self, state: TaskState) -> None:
+        """Continue from what ``get_state`` returned, here or in another batch of the same kind and size."""
         self.task.set_state(state)
 
 

@@ -34,7 +34,7 @@ def drawn(env, seed=0):
 
 
 def length(task):
-    """Steps of an episode that goes on to its judgement."""
+    """Steps of an episode that goes on to its evaluation."""
     return task.acting_steps + task.settling_steps
 
 
@@ -85,17 +85,17 @@ def test_observations_lie_in_their_space_and_are_fresh(env_id, obs_mode):
 
 @every_id
 @pytest.mark.parametrize("policy", ["chance", "expert"])
-def test_info_explains_the_reward_and_the_judgement(env_id, policy):
+def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
     env = make(env_id)
     env.reset(seed=0)
-    of_judgement = {"normalized_performance", "is_success", *(name for name, *_ in env.unwrapped.task.judgement)}
+    of_evaluation = {"normalized_performance", "is_success", *(name for name, *_ in env.unwrapped.task.evaluation)}
     steps, terminated, actions = 0, False, drawn(env)
     while not terminated:
         action = next(actions) if policy == "chance" else env.unwrapped.expert_action()
         _, reward, terminated, truncated, info = env.step(action)
         steps += 1
         assert not truncated
-        assert info.keys() >= of_judgement | {"strain_max", "settling", "failure", "reward_terms"}
+        assert info.keys() >= of_evaluation | {"strain_max", "settling", "failure", "reward_terms"}
         assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-12)
         assert isinstance(info["is_success"], bool) and 0 <= info["normalized_performance"] <= 1
         assert terminated or not (info["is_success"] or info["normalized_performance"] or info["failure"])
@@ -107,7 +107,7 @@ def test_info_explains_the_reward_and_the_judgement(env_id, policy):
 @every_id
 @pytest.mark.parametrize("reward_mode", ["delta", "sparse"])
 def test_the_return_is_bounded_by_what_the_modes_promise(env_id, reward_mode):
-    """Sparse: the judged performance alone.  Delta: within the potential's span, the bonus and the penalty."""
+    """Sparse: the performance at the evaluation alone.  Delta: within the potential's span, the bonus and the penalty."""
     env = make_vec(env_id, 3, reward_mode=reward_mode, autoreset_mode="Disabled")
     env.reset(seed=0)
     total, final = np.zeros(3), np.zeros(3)
@@ -230,7 +230,8 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
         ({"material": {"mass": 1}}, "mass"),
         ({"material": {"density": -1}}, "density"),
         ({"material": {"bend_rigidity": 0.1}}, "bend_rigidity"),
-        ({"material": "cotton"}, "material"),
+        ({"material": "corduroy"}, "corduroy"),
+        ({"material": ["cotton"]}, "preset's name"),
     ],
 )
 def test_bad_reset_options_are_named_and_leave_nothing_behind(env_id, options, name):
@@ -294,7 +295,7 @@ def test_a_sheet_thrown_out_of_the_arena_ends_the_episode(env_id):
     env = make(env_id).unwrapped
     env.reset(seed=0)
     task = env.task
-    high = task._arena()[1]
+    high = task.arena()[1]
     state = task.simulation.get_state()
     state.positions[0] += high - state.positions[0].mean(axis=0) + (0.6, 0, 0)
     state.velocities[:], state.holder[:] = 0, -1

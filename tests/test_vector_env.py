@@ -51,7 +51,7 @@ def test_same_step_mode_gives_the_last_observation_in_info(env_id):
     assert same == step and terminated.tolist() == [False, True, False]
     assert info["_final_obs"].tolist() == [False, True, False]
     assert np.array_equal(info["final_obs"][1], last[1]) and info["final_obs"][0] is None
-    for key in ("normalized_performance", "is_success", *(name for name, *_ in disabled.unwrapped.task.judgement)):
+    for key in ("normalized_performance", "is_success", *(name for name, *_ in disabled.unwrapped.task.evaluation)):
         assert info["final_info"][key][1] == last_info[key][1]
     assert info["_strain_max"].tolist() == [True, False, True]
     assert np.array_equal(observation[[0, 2]], last[[0, 2]]) and not np.array_equal(observation[1], last[1])

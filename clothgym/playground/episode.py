@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
+from clothgym.envs.definition import HELD
 from clothgym.envs.episode import within_ball
-from clothgym.envs.task import HELD
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stability, visible
 from clothgym.playground.world import FIGURES as SLIDERS
 from clothgym.playground.world import Settings, hint
-from clothgym.registration import ENVIRONMENTS
+from clothgym.registration import checked_id
 from clothgym.render import Solid
 from clothgym.render.renderer import MARKER_RADIUS
 from clothgym.simulation import Simulation
@@ -50,18 +50,6 @@ def chance(env: Any, observation: NDArray) -> NDArray:
 POLICIES: dict[str, Policy] = {"expert": expert, "nothing": nothing, "chance": chance}
 
 
-def env_named(name: str) -> str:
-    """The id without its namespace.
-
-    Raises:
-        ValueError: no environment is registered under it.
-    """
-    bare = name.removeprefix("clothgym:")
-    if bare not in ENVIRONMENTS:
-        raise ValueError(f"no environment {name!r}{hint(bare, ENVIRONMENTS)} (there are: {', '.join(ENVIRONMENTS)})")
-    return bare
-
-
 class EpisodeStage(Stage):
     """An environment, and who acts in it.
 
@@ -76,7 +64,7 @@ class EpisodeStage(Stage):
 
     def __init__(self, env_id: str, policies: Mapping[str, Policy] | None = None, policy: str = "expert", seed: int = 0) -> None:
         super().__init__()
-        self.name, self.seed = env_named(env_id), seed
+        self.name, self.seed = checked_id(env_id), seed
         self.policies = {**POLICIES, **(policies or {})}
         self._given: dict[str, Any] | None = None
         self.choose(policy)
@@ -96,7 +84,7 @@ class EpisodeStage(Stage):
         self.reset()
 
     def _made(self) -> Any:
-        return gym.make(f"clothgym:{self.name}", **self._options).unwrapped
+        return gym.make(self.name, **self._options).unwrapped
 
     @property
     def simulation(self) -> Simulation:
@@ -285,7 +273,7 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
         gravity=round(-float(state.gravity[0, 2]), 6),
         wind=0.0 if wind is None else float(wind.speed[1]),
         gust=0.0 if wind is None else float(wind.gust),
-        fabric=next(name for name, preset in PRESETS.items() if preset.source == material.source),
+        fabric=next((name for name, preset in PRESETS.items() if preset.source == material.source), Settings.fabric),
         **{name: getattr(material, name) for name in SLIDERS},
         friction=round(float(state.colliders[0, 0, R_FRICTION]), 6) if simulation.colliders else 0.4,
         integrator=simulation.integrator.name,

@@ -1,0 +1,200 @@
+"""What the draping tasks share: the sheet, its target, what is observed of it, the potential and the evaluation.
+
+Their tasks call these functions, and name these kernels; the target of an episode is kept in its record, see ``REMEMBERS``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from clothgym._jit import inlined, kernel
+from clothgym.collisions import Collider, Plane
+from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.episode import Fields
+from clothgym.envs.measures import CENTROID, SPEED2, covered_share, soft_coverage
+from clothgym.envs.physics import Physics
+from clothgym.envs.targets import SHAPES, Target, placed, reference_coverage, unit_surface
+from clothgym.material import Material
+from clothgym.mesh import grid
+
+SIDE = 0.6  # L [m]
+ROWS = 17
+SHEET = grid(ROWS, ROWS, SIDE, SIDE)
+# what the ids of both tasks fix, but for what holds the sheet
+PHYSICS = Physics(
+    mesh=SHEET,
+    material=Material.preset("cotton", air_drag=0.72),
+    time_step=1 / 30,
+    integrator="semi_implicit_euler",
+    substeps=50,
+    hand_speed=1.0,
+    air_density=0.0,
+)
+
+FRICTION = 0.5
+THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its flat triangles stay outside of a round one
+EVALUATED_POINTS = 256
+GUIDE_POINTS = 32
+COVERED_WITHIN = 0.02  # in sides
+CENTRING_SCALE = 0.2  # in sides: performance is halved at this distance
+SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
+ENOUGH_COVERAGE, ENOUGH_CENTRING, ENOUGH_REST = 0.9, 0.1, 0.05
+
+BOX = SHAPES.index("box")
+TARGET_SLOT = 1  # the target's place among ``colliders``
+
+# of the target: its place in SHAPES, its size, its highest point [m], how it is turned, and the most that can be covered
+REMEMBERS: Fields = [
+    *[("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2), ("reference", float)],
+]
+EVALUATION: Fields = (("coverage", float), ("coverage_reference", float), ("off_center", float), ("rms_speed", float))
+RELATIVE_TO = "the target's top"
+
+
+def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
+    """What is observed beside the points of the sheet; holds: what the attachments are asked, for the page."""
+    return (
+        Observation("center", "center of area, relative to the target's top", (3,), "L", POSITION_BOUND),
+        Observation("holds", holds, (attachments,)),
+        Observation("target_shape", ", ".join(SHAPES), (len(SHAPES),)),
+        Observation("target_radius", "the target's radius or half side", (), "L"),
+        Observation("target_height", "its height", (), "L"),
+        Observation("target_yaw", "its yaw", (), "45 degrees"),
+        Observation("settling", "whether the sheet settles, and actions are ignored"),
+        Observation("episode_left", "share of the episode left"),
+        Observation("acting_left", "share of the acting time left"),
+    )
+
+
+# --- the target of an episode -------------------------------------------------------------------------------------------------
+
+
+def colliders() -> list[Collider]:
+    """The floor, and a target in whose place each episode has its own."""
+    floor = Plane(friction=FRICTION, thickness=THICKNESS)
+    return [floor, Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
+
+
+def draw_target(rng: np.random.Generator, wanted: Any) -> Target:
+    """A target, of which some properties may be wanted.
+
+    Raises:
+        ValueError: ``wanted`` is no dict of a target's properties.
+    """
+    known = ("shape", "radius", "height", "center", "yaw")
+    if not isinstance(wanted, Mapping):
+        raise ValueError(f"reset option target={wanted!r}: must be a dict with any of {', '.join(known)}")
+    unknown = set(wanted) - set(known)
+    if unknown:
+        raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
+    return Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape")).changed(wanted)
+
+
+def remember(own: Any, target: Target) -> None:
+    """Write a target into the record of the episode that it is for."""
+    own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
+    own["top"] = own["origin"] = target.top
+    own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
+    own["reference"] = reference_coverage(target, SIDE)
+
+
+def recalled(own: Any) -> Target:
+    """The target in an episode's record."""
+    *center, height = own["top"].tolist()
+    return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
+
+
+def episode_colliders(own: Any) -> dict[int, Collider]:
+    """The same as what is put in place of one of ``colliders``."""
+    return {TARGET_SLOT: recalled(own).collider(FRICTION, THICKNESS)}
+
+
+def constants(guide_reach: float) -> dict[str, Any]:
+    """Numbers that the kernels below read from ``rules``; guide_reach: distance at which a guide point counts half [m]."""
+    guides, evaluated = (
+        np.stack([np.resize(unit_surface(shape, count), (count, 3)) for shape in ("sphere", "box")])
+        for count in (GUIDE_POINTS, EVALUATED_POINTS)
+    )
+    return {"guide_reach": np.float32(guide_reach), "guides": guides, "evaluated": evaluated}
+
+
+# --- kernels about one environment, see ``stepping`` --------------------------------------------------------------------------
+
+
+@inlined
+def _surface_of(own, units):
+    """Points of the target's upper surface, as ``place_points`` takes them; units: those of a round one and of a box."""
+    return units[1 if own.solid == BOX else 0], own.top, own.radius, own.turn
+
+
+@kernel
+def _nearness(x, surface, reach):
+    """How near the sheet is to points of the target's upper surface, see ``soft_coverage``."""
+    points = placed(*surface)
+    return soft_coverage(x, points, reach)
+
+
+@kernel
+def _coverage(x, triangles, surface, tolerance):
+    """Share of the points of the target's upper surface that are covered."""
+    points = placed(*surface)
+    return covered_share(x, triangles, points, tolerance)
+
+
+@inlined
+def _off_center(own, rules, sheet):
+    """Horizontal distance of the sheet's center of area from the target's axis, in sides."""
+    x, y = sheet.summary[CENTROID] - own.top[0], sheet.summary[CENTROID + 1] - own.top[1]
+    return np.sqrt(x * x + y * y) / rules.side
+
+
+@inlined
+def _centring(off_center):
+    """1 in the center, 1/2 at CENTRING_SCALE sides: smooth, and with a gradient from afar."""
+    return 1 / (1 + (off_center / CENTRING_SCALE) ** 2)
+
+
+@inlined
+def covering(own, rules, sheet):
+    """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
+    near = _nearness(sheet.x, _surface_of(own, rules.guides), rules.guide_reach)
+    return (near + _centring(_off_center(own, rules, sheet))) / 2
+
+
+@inlined
+def evaluate_cover(own, rules, sheet, info):
+    """Write what covers the target, how central and how much at rest it is; returns the normalized performance."""
+    surface = _surface_of(own, rules.evaluated)
+    info.coverage = _coverage(sheet.x, sheet.mesh.triangles, surface, COVERED_WITHIN * rules.side)
+    info.off_center = _off_center(own, rules, sheet)
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    share = info.coverage / own.reference
+    central, at_rest = info.off_center <= ENOUGH_CENTRING, info.rms_speed < ENOUGH_REST
+    info.is_success = share >= ENOUGH_COVERAGE and central and at_rest
+    return min(share, 1.0) * _centring(info.off_center) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+
+
+@inlined
+def account_reference(own, rules, sheet, info, terms, running, failure):
+    """The most that can be covered of this target; no reward terms."""
+    info.coverage_reference = own.reference
+    return 0.0
+
+
+@inlined
+def observe_target(own, rules, sheet, seen):
+    """The sheet's center, what holds it, the target, and the time."""
+    for c in range(3):
+        seen.center[c] = (sheet.summary[CENTROID + c] - own.top[c]) / rules.side
+    for k in range(sheet.holds.shape[0]):
+        seen.holds[k] = sheet.holds[k] > 0
+    for k in range(len(SHAPES)):
+        seen.target_shape[k] = own.solid == k
+    seen.target_radius, seen.target_height = own.radius / rules.side, own.top[2] / rules.side
+    seen.target_yaw = own.yaw * (4 / np.pi)
+    seen.settling = own.settling_since >= 0
+    seen.episode_left = 1 - own.step / (rules.acting_steps + rules.settling_steps)
+    seen.acting_left = max(rules.acting_steps - own.step, 0) / rules.acting_steps

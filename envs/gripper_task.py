@@ -1,0 +1,65 @@
+"""A task in which grippers pick up the sheet, the base of those that use them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import inlined
+from clothgym.envs.stepping import IN_NUMPY
+from clothgym.envs.task import Task
+
+CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
+FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
+
+
+@inlined
+def close_or_open(move, wanted, acting):
+    """Fingers do what the last action beyond a limit says, and open when time is up."""
+    if not acting or move[3] > OPENS:
+        return 1.0
+    return 0.0 if move[3] < CLOSES else wanted
+
+
+class GripperTask(Task):
+    """Base of the tasks that use grippers, which are those of ``physics``; an action is a velocity and what fingers do, for each.
+
+    Args:
+        slip_force: pull at which the cloth slips out of a gripper [N]; None for the grippers' own.
+
+    Attributes:
+        gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
+    """
+
+    hand_actions = 4
+    kernels = IN_NUMPY._replace(fingers=close_or_open)
+    arguments: ClassVar = {"slip_force": "pull at which the cloth slips out of a gripper [N]"}
+
+    def __init__(self, num_envs: int, slip_force: float | None = None, **kwargs: Any) -> None:
+        if slip_force is not None:
+            grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
+            self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
+        super().__init__(num_envs, **kwargs)
+        self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
+
+    def place_attachments(self, envs: NDArray) -> None:
+        """Put the grippers where their episodes begin with them."""
+        self.simulation.grippers.place(self.gripper_starts[envs], envs)
+
+    def markers(self, env: int) -> list[Any]:
+        """The grippers: two fingers and a palm each."""
+        from clothgym.render import Solid  # imported here: training draws nothing
+
+        solids, grippers = [], self.simulation.grippers
+        for k, gripper in enumerate(self.physics.grippers):
+            x, y, z = grippers.positions[env, k].tolist()
+            # fingers that hold cloth are drawn closed
+            opening = 0.0 if grippers.held[env, k] else float(grippers.openings[env, k])
+            half = 0.006 + opening * gripper.span / 2
+            for finger in (x - half, x + half):
+                solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))
+            solids.append(Solid(kind="box", center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012), color=PALM))
+        return solids

@@ -1,0 +1,139 @@
+"""What an environment's page says of its task's observations and keywords, and the refusal of keywords that there are not.
+
+A class's docstring is its page.  Two lines in it are replaced when the class is made: ``$observations`` by the table of the task's
+observations, ``$arguments`` by that of its keywords.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from clothgym.envs.definition import Observation
+from clothgym.envs.measures import key_particles
+from clothgym.envs.task import Task, points_observed
+
+if TYPE_CHECKING:
+    from clothgym.envs.single import ClothEnv
+    from clothgym.envs.vector import ClothVectorEnv
+
+# default and meaning of the keywords that all environments take; $name: the task's own
+COMMON: dict[str, tuple[str, str]] = {
+    "fabric": (
+        "``None``",
+        "the task's own; or a preset's name (``python -m clothgym list``), whose measured properties it takes, or a ``Material``; "
+        "then with automatic substeps",
+    ),
+    "integrator": ("``$integrator``", "or another, by name or ``{\"name\": ..., option: ...}``, with automatic substeps"),
+    "substeps": ("$substeps", 'substeps of a control step, or ``"auto"``'),
+    "bending": ('``"springs"``', 'or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending``'),
+    "strain_limit": (
+        "``None``", 'largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met',
+    ),
+    "self_collision": (
+        "``False``", 'or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more',
+    ),
+    "contact": ('``"particles"``', 'what touches solids: particles only, or ``"sheet"``, the whole sheet, which solids also stop'),
+    "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
+    "obs_mode": ('``"keypoints"``', 'or ``"particles"``'),
+    "reward_mode": ('``"delta"``', 'or ``"sparse"``'),
+    "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
+    "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
+    "threads": ("1; in a batch all processors", "the outcome does not depend on it"),
+    "render_mode": ("``None``", '``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``)'),
+    "render_color": ('``"fabric"``', 'or ``"strain"``: cream where no yarn is stretched, violet from $strain_shown % on'),
+}  # fmt: skip
+
+
+def keywords_of(task_class: type[Task]) -> dict[str, Any]:
+    """Default of each keyword that a task takes, its own before those of all tasks."""
+    found: dict[str, Any] = {}
+    for cls in task_class.__mro__:
+        if "__init__" not in vars(cls) or cls is object:
+            continue
+        for name, parameter in list(inspect.signature(vars(cls)["__init__"]).parameters.items())[1:]:
+            if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL) and name != "num_envs":
+                found.setdefault(name, parameter.default)
+    return found
+
+
+def check_keywords(env: ClothEnv | ClothVectorEnv, given: Mapping[str, Any]) -> None:
+    """Refuse keywords that an environment's task does not take.
+
+    Raises:
+        TypeError: names the first of them, and all that there are.
+    """
+    own = [name for name in inspect.signature(type(env).__init__).parameters if name not in ("self", "kwargs")]
+    known = [*keywords_of(env.task_class), *own]
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise TypeError(
+                f"{type(env).__name__} got an unexpected keyword argument {name!r}{hint} (there are: {', '.join(known)})"
+            )
+
+
+def completed(page: str | None, task_class: type[Task] | None) -> str | None:
+    """A page with its tables; the task's docstring above both where there is no page, and nothing where there is no task."""
+    if task_class is None:
+        return page
+    if page is None:
+        page = f"{task_class.__doc__ or task_class.__name__}\n\n## Observation Space\n$observations\n\n## Arguments\n$arguments\n"
+    lines = []
+    for line in page.split("\n"):
+        indent = line[: len(line) - len(line.lstrip())]
+        table = {"$observations": observations_of, "$arguments": arguments_of}.get(line.strip())
+        lines += [line] if table is None else [(indent + row).rstrip() for row in table(task_class)]
+    return "\n".join(lines)
+
+
+def observations_of(task_class: type[Task]) -> list[str]:
+    """The lines of the table of observations, under a sentence on their number."""
+    mesh = task_class.physics.mesh
+    points = len(key_particles(mesh))
+    declared = [*points_observed(task_class, "keypoints", points), *task_class.observations]
+    ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
+    rows = [
+        f'``Box`` of {ends[-1]} numbers for ``obs_mode="keypoints"`` (and 6 x {mesh.num_particles} + {ends[-1] - ends[1]} for',
+        '``"particles"``, all particles row by row).  ``env.unwrapped.observation_slices["keypoints"]``: where they lie, by name.',
+        "",
+        "| Num | Name | Observation | Unit | Bound |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for one, first, end in zip(declared, [0, *ends], ends):
+        place = str(first) if end == first + 1 else f"{first}-{end - 1}"
+        rows.append(f"| {place} | ``{one.name}`` | {_about(one)} | {one.unit} | {_bound(one.bound)} |")
+    return rows
+
+
+def _about(one: Observation) -> str:
+    """What it is, with its shape if it has more than one axis."""
+    return f"{one.about}, {' x '.join(map(str, one.shape))}" if len(one.shape) > 1 else one.about
+
+
+def _bound(bound: float | tuple[float, ...]) -> str:
+    return ", ".join(f"{each:g}" for each in np.atleast_1d(bound))
+
+
+def arguments_of(task_class: type[Task]) -> list[str]:
+    """The lines of the table of keywords: the task's own, then those of all tasks."""
+    physics, rows = task_class.physics, ["| Argument | Default | Meaning |", "| --- | --- | --- |"]
+    own = {
+        "$integrator": f'"{physics.integrator}"',
+        "$substeps": str(physics.substeps),
+        "$air_density": f"{physics.air_density:g}",
+        "$strain_shown": f"{100 * task_class.strain_shown:g}",
+    }
+    defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color")}}
+    for name, default in defaults.items():
+        shown, meaning = COMMON.get(name, (f"``{default!r}``", ""))
+        row = f"| ``{name}`` | {shown} | {task_class.arguments.get(name, meaning)} |"
+        for mark, text in own.items():
+            row = row.replace(mark, text)
+        rows.append(row)
+    return rows
