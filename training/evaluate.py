@@ -21,6 +21,8 @@ import tyro
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from clothgym.registration import checked_id
+
 HELD_OUT = 1_000_000
 BATCH = 250
 
@@ -51,7 +53,7 @@ def run_episodes(
     env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any
 ) -> dict[str, NDArray]:
     """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
-    env = gym.make_vec(f"clothgym:{env_id}", num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
+    env = gym.make_vec(env_id, num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
     batches = []
     with tqdm(total=len(seeds), unit="episode", disable=not progress, leave=False) as bar:
         for first in range(0, len(seeds), env.num_envs):
@@ -137,7 +139,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def main(args: Args) -> None:
-    args.env = args.env.removeprefix("clothgym:")
+    args.env = checked_id(args.env)
     if args.episodes < 1:
         raise ValueError(f"--episodes {args.episodes}: must be at least 1")
     scores = {}

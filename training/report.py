@@ -46,7 +46,7 @@ def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references:
 
 def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, stride: int = 1) -> None:
     """Some held-out episodes side by side, one after the other's end standing still; every so many frames of them."""
-    env = gym.make_vec(f"clothgym:{env_id}", num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
+    env = gym.make_vec(env_id, num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
     observations, _ = env.reset(seed=evaluate.HELD_OUT)
     frames, running = [], np.ones(episodes, bool)
     still = [np.asarray(frame) for frame in env.render()]

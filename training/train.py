@@ -37,6 +37,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 import clothgym
 from clothgym.adapters.sb3 import make_sb3_vec_env
+from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
 
@@ -69,7 +70,7 @@ class Args:
     """Threads of torch while it learns; two gain little on nets as small as these, and wait for each other on a busy machine."""
 
     def __post_init__(self) -> None:
-        self.env = self.env.removeprefix("clothgym:")
+        self.env = checked_id(self.env)
         for name in ("timesteps", "eval_episodes", "final_episodes", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
@@ -153,7 +154,9 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
     path = args.hyperparams or HERE / "hyperparams" / f"{args.algo}.yml"
     table = yaml.safe_load(path.read_text())
     if args.env not in table:
-        raise ValueError(f"{path} has no hyperparameters for {args.env!r} (there are: {', '.join(table)})")
+        raise ValueError(
+            f"{path} has no hyperparameters for {args.env!r} (there are: {', '.join(table)}): give a file with --hyperparams"
+        )
     hyperparameters = dict(table[args.env])
     config = {
         "clothgym": clothgym.__version__,
@@ -169,7 +172,8 @@ def configure(args: Args) -> tuple[Path, dict[str, Any]]:
         "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
         "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
     }
-    name = args.env if args.algo == "ppo" else f"{args.env}_{args.algo}"
+    bare = args.env.rpartition(":")[2]
+    name = bare if args.algo == "ppo" else f"{bare}_{args.algo}"
     folder = args.run or Path("runs") / f"{name}_{args.seed}"
     if (folder / policies.CHECKPOINT).exists():
         raise FileExistsError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")

@@ -46,7 +46,7 @@ def learnt(folder: Path, env_id: str) -> Policy:
     config = read_config(folder)
     if config["env"] != env_id:
         raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
-    env = gym.make_vec(f"clothgym:{env_id}", num_envs=1, **config["env_kwargs"])
+    env = gym.make_vec(env_id, num_envs=1, **config["env_kwargs"])
     policy = ActorCriticPolicy(
         env.single_observation_space, env.single_action_space, lambda _: 0.0, **config["hyperparameters"].get("policy_kwargs", {})
     )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from clothgym.envs.vector import ClothVectorEnv
-from clothgym.registration import ENVIRONMENTS
+from clothgym.registration import checked_id
 
 
 class ClothSB3VecEnv(VecEnv):
@@ -47,7 +47,7 @@ class ClothSB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{"cost": float(c)} for c in info["cost"]] if "cost" in info else [{} for _ in done]
         if done.any():
             for env in np.flatnonzero(done):
-                infos[env] = self.env.task.told_of(int(env))
+                infos[env] = self.env.task.info_of(int(env))
                 infos[env]["terminal_observation"] = info["final_obs"][env]
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
         return observation, reward.astype(np.float32), done, infos
@@ -91,16 +91,18 @@ class ClothSB3VecEnv(VecEnv):
 def make_sb3_vec_env(env_id: str, num_envs: int = 64, seed: int | None = None, **kwargs: Any) -> ClothSB3VecEnv:
     """A batch of a clothgym environment for SB3: ``PPO("MlpPolicy", make_sb3_vec_env("ClothDrape-v0", 64, seed=0))``.
 
-    Put SB3's ``VecMonitor`` on it to have episodes logged.  ``kwargs`` go to the environment.
+    Put SB3's ``VecMonitor`` on it to have episodes logged.  ``env_id``: any registered id whose environment is a ``ClothEnv``, see
+    ``registration.checked_id``.  ``kwargs`` go to the environment.
 
     Raises:
-        ValueError: an id that is not ours, or a keyword that the environment does not know.
+        ValueError: an id that is not ours, or without a vector entry point.
+        TypeError: a keyword that the environment does not know.
     """
-    name = env_id.split(":")[-1]
-    if name not in ENVIRONMENTS:
-        raise ValueError(f"no clothgym environment {env_id!r} (there are: {', '.join(ENVIRONMENTS)})")
-    env = gym.make_vec(name, num_envs=num_envs, autoreset_mode="SameStep", **kwargs)
-    assert isinstance(env, ClothVectorEnv)
+    env = gym.make_vec(
+        checked_id(env_id), num_envs=num_envs, vectorization_mode="vector_entry_point", autoreset_mode="SameStep", **kwargs
+    )
+    if not isinstance(env, ClothVectorEnv):
+        raise ValueError(f"env_id={env_id!r}: its vector_entry_point must be a subclass of ClothVectorEnv")
     vec_env = ClothSB3VecEnv(env)
     vec_env.seed(seed)
     return vec_env

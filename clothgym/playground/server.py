@@ -15,16 +15,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from numpy.typing import NDArray
 
-from clothgym.playground.episode import EpisodeStage, Policy, Replay, env_named
+from clothgym.playground.episode import EpisodeStage, Policy, Replay
 from clothgym.playground.page import Page
 from clothgym.playground.recording import Recording
 from clothgym.playground.scenes import SCENES, TITLES
 from clothgym.playground.show import furnish
 from clothgym.playground.stage import SceneStage, Stage
 from clothgym.playground.world import hint
-from clothgym.registration import ENVIRONMENTS
+from clothgym.registration import ENVIRONMENTS, checked_id
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
@@ -54,8 +55,13 @@ class Gallery:
         """
         bare = name.removeprefix("clothgym:")
         known = list(self.titles.values())
-        if bare not in known:
+        if bare in known:
+            return bare
+        if ":" not in bare and bare not in gym.registry:
             raise ValueError(f"no scene or environment {name!r}{hint(bare, known)} (there are: {', '.join(known)})")
+        # an id that somebody else has registered, which the page lists from now on
+        bare = checked_id(bare)
+        self.titles = {**self.titles, bare: bare}
         return bare
 
     def open(self, name: str) -> Stage:
@@ -66,7 +72,7 @@ class Gallery:
             return Replay(self.recording, REPLAY)
         if name in SCENES:
             return SceneStage(name)
-        own = self.policies.get(env_named(name), {})
+        own = self.policies.get(name, {})
         return EpisodeStage(name, own, next(iter(own), "expert"))
 
 
