@@ -40,4 +40,4 @@ class HangTowelVectorEnv(ClothVectorEnv):
     task_class = HangTowel
 
 
-gym.register("HangTowel-v0", entry_point=HangTowelEnv, vector_entry_point=HangTowelVectorEnv)
+gym.register("HangTowel-v0", entry_point="hang_towel:HangTowelEnv", vector_entry_point="hang_towel:HangTowelVectorEnv")
