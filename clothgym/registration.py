@@ -50,5 +50,8 @@ def checked_id(env_id: str) -> str:
         entry = gym.spec(name).entry_point
         creator = load_env_creator(entry) if isinstance(entry, str) else entry
         if not (isinstance(creator, type) and issubclass(creator, ClothEnv)):
-            raise ValueError(f"environment {env_id!r} is no clothgym environment: its entry point must be a subclass of ClothEnv")
+            known = ", ".join(ENVIRONMENTS)
+            raise ValueError(
+                f"environment {env_id!r} is no clothgym environment ({known}): its entry point must be a subclass of ClothEnv"
+            )
     return bare
