@@ -1,7 +1,10 @@
-"""The bounds of self-collision: what has left its bound is looked at anew, and in strict mode drawn back.
+"""Displacement bounds of self-collision: vertices that leave their bounds are checked, and in strict mode clamped.
 
-Everything happens between two certified states, the positions at the end of two substeps.  A move is cut short on the straight way
-from the first, which lies in every bound.
+Everything happens between two certified states, the positions at the end of two substeps.  A move that is cut short ends on the
+straight line from the first state to the second; the first lies within every bound.
+
+Names: a vertex is *outside* if it has moved farther than its bound since the last query.  A gap constraint is *active* if one of
+its vertices is outside, and *violated* if its gap along its normal is smaller than the distance that it keeps.
 """
 
 from __future__ import annotations
@@ -23,60 +26,70 @@ from clothgym.contact_memory import (
     REPORT_UNCERTAIN,
 )
 
-INSIDE = 0.999  # of a bound that is used, for rounding
-REPAY = 1.0  # speed at which a particle that lags behind its hand catches up [m/s]
+INSIDE = 0.999  # share of each bound that is used; the rest allows for rounding
+CATCH_UP = 1.0  # speed at which a particle that lags behind its attachment catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
-PATIENCE = 4  # looks at all gap constraints after which a query, which frees the vertices again, is the cheaper
-AHEAD = 8  # substeps for which a query shall last: for fast vertices it looks farther
-FORESEEN = 1.0  # of the reach, the most that it looks beyond it for one
-HALVES = 4  # times that the way of a gap constraint is halved before it stays
-PASSING = 8  # gap constraints passed over, since none of their vertices is beyond its bound, that cost as much as a look at one
+PATIENCE = 4  # evaluations of all gap constraints after which a query, which gives the vertices new bounds, is cheaper
+AHEAD = 8  # substeps that a query should last: it looks farther around fast vertices
+AHEAD_MOST = 1.0  # largest distance beyond the reach that it looks, as a share of the reach
+HALVINGS = 4  # times that the moves of a gap constraint's vertices are halved before they stay in place
+INACTIVE_COST = 8  # inactive gap constraints that cost as much to skip as one active one to evaluate
 
 
 @inlined
 def confine(x, v, w, sheet, block, h):
-    """Keep one block's sheets within their bounds; see the module."""
+    """Keep one block's sheets within their displacement bounds.
+
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  h: the substep [s].
+    """
     memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
     start, bounds, limits, old = memory.start[block], memory.bounds[block], memory.limits[block], memory.old[block]
     lanes = x.shape[2]
+    # particles that lag behind their attachments catch up
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    left = np.empty((x.shape[1], lanes), np.bool_)
-    out, far = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
+    # which vertices have left their bounds, and in which lanes a query is due
+    outside = np.empty((x.shape[1], lanes), np.bool_)
+    any_outside, query_due = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
     if lanes == 1:
-        out[0], far[0] = _mark(x, start, bounds, limits, samples, 0, left[:, 0])
+        any_outside[0], query_due[0] = _find_outside_in_lane(x, start, bounds, limits, samples, 0, outside[:, 0])
     else:
-        _leave(x, start, bounds, limits, samples, left, out, far)
-    beyond = np.empty(x.shape[1], np.bool_)
+        _find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due)
+    # what follows costs nothing in the other lanes
+    own_outside = np.empty(x.shape[1], np.bool_)
     for l in range(memory.used[block]):
-        # a query if something is beyond all bounds, or if a gap constraint has come close in the direction that it had at the last
-        # one
-        if not out[l]:
+        if not any_outside[l]:
             continue
-        due = far[l]
+        due = query_due[l]
+        # within their limits, vertices are certified by their gap constraints: evaluate the active ones
         if not due and setting.strict:
             for p in range(x.shape[1]):
-                beyond[p] = left[p, l]
-            affected = np.empty(memory.constraints[block, l], np.int32)
-            number = _list_affected(memory.members[block, l], beyond, affected)
-            due, close = _comes_close(x, memory, block, l, affected[:number])
-            if close and not due:
-                _hold_apart(x, v, w, sheet, block, l, beyond, affected, number)
-                # what has stayed has not shared the motion of the others
-                _, due = _mark(x, start, bounds, limits, samples, l, beyond)
+                own_outside[p] = outside[p, l]
+            active = np.empty(memory.constraints[block, l], np.int32)
+            number = _list_active(memory.members[block, l], own_outside, active)
+            due, violated = _evaluate_constraints(x, memory, block, l, active[:number])
+            # jammed constraints are enforced without a query, which would find the same again
+            if violated and not due:
+                _hold_apart(x, v, w, sheet, block, l, own_outside, active, number)
+                # vertices that stayed in place have left the common motion, and so perhaps their limits
+                _, due = _find_outside_in_lane(x, start, bounds, limits, samples, l, own_outside)
+        # a query at the certified positions gives new bounds
         if due:
-            _renew(x, v, w, sheet, block, l, h, beyond)
+            _query_again(x, v, w, sheet, block, l, h, own_outside)
+    # these positions are certified now
     old[:] = x
 
 
 @kernel
-def _leave(x, start, bounds, limits, samples, left, some, far):
-    """Which vertices have left their bounds, (particles, lanes), in which lanes some have, and in which one has left its limit.
+def _find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due):
+    """Find the vertices that have left their bounds since the last query, |x - start - m| > b, beside the common motion m.
 
-    A motion that all share does not count: it changes no distance.
+    m, the mean displacement of the samples, changes no distance.  outside: becomes which vertices, (particles, lanes); any_outside:
+    in which lanes there are some; query_due: in which lanes one has left its limit, (lanes,).
     """
     lanes = x.shape[2]
+    # the common motion of each lane
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
     for s in range(samples.shape[0]):
@@ -84,22 +97,23 @@ def _leave(x, start, bounds, limits, samples, left, some, far):
             xs, ss = x[c, samples[s]], start[c, samples[s]]
             for l in range(lanes):
                 mean[c, l] += (xs[l] - ss[l]) * share
+    # the displacements beside it, squared
     for p in range(x.shape[1]):
-        bp, lp, out = bounds[p], limits[p], left[p]
+        bp, lp, outside_p = bounds[p], limits[p], outside[p]
         for l in range(lanes):
             dx = x[0, p, l] - start[0, p, l] - mean[0, l]
             dy = x[1, p, l] - start[1, p, l] - mean[1, l]
             dz = x[2, p, l] - start[2, p, l] - mean[2, l]
             square = dx * dx + dy * dy + dz * dz
-            inside, allowed = square <= bp[l], square <= lp[l]
-            out[l] = not inside
-            some[l] |= not inside
-            far[l] |= not allowed
+            within_bound, within_limit = square <= bp[l], square <= lp[l]
+            outside_p[l] = not within_bound
+            any_outside[l] |= not within_bound
+            query_due[l] |= not within_limit
 
 
 @kernel
-def _shift(x, start, samples, l):
-    """The motion of one lane that all its vertices share [m]: it changes no distance."""
+def _common_motion(x, start, samples, l):
+    """Motion of one lane since the last query that all its vertices share, the mean of the samples [m]: it changes no distance."""
     share = x.dtype.type(1 / samples.shape[0])
     mx, my, mz = x.dtype.type(0), x.dtype.type(0), x.dtype.type(0)
     for s in range(samples.shape[0]):
@@ -111,82 +125,95 @@ def _shift(x, start, samples, l):
 
 
 @kernel
-def _mark(x, start, bounds, limits, samples, l, left):
-    """The same of one lane; left: (particles,).  Without loops of one round."""
-    mx, my, mz = _shift(x, start, samples, l)
-    some, far = False, False
+def _find_outside_in_lane(x, start, bounds, limits, samples, l, outside):
+    """The same for lane l alone, without loops over lanes; outside: (particles,).  Returns whether some are, and whether a query is
+    due.
+    """
+    mx, my, mz = _common_motion(x, start, samples, l)
+    any_outside, query_due = False, False
     for p in range(x.shape[1]):
         dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
         square = dx * dx + dy * dy + dz * dz
-        inside, allowed = square <= bounds[p, l], square <= limits[p, l]
-        left[p] = not inside
-        some |= not inside
-        far |= not allowed
-    return some, far
+        within_bound, within_limit = square <= bounds[p, l], square <= limits[p, l]
+        outside[p] = not within_bound
+        any_outside |= not within_bound
+        query_due |= not within_limit
+    return any_outside, query_due
 
 
 @kernel
 def _catch_up(x, w, lag, l, h):
-    """Move what lags behind its hand on, as far as the speed for it allows; who has been let go lags no more.  Returns the largest
-    lag that is left."""
+    """Move lagging particles of lane l towards their attachments, at ``CATCH_UP`` at most.  A released particle lags no more.
+    Returns the largest lag left [m].
+    """
     zero = x.dtype.type(0)
-    left = zero
-    most = x.dtype.type(REPAY) * h
+    largest = zero
+    longest_way = x.dtype.type(CATCH_UP) * h
     for p in range(x.shape[1]):
+        # released
         if w[p, l] > zero:
             lag[0, p, l] = lag[1, p, l] = lag[2, p, l] = zero
             continue
         lx, ly, lz = lag[0, p, l], lag[1, p, l], lag[2, p, l]
         length = np.sqrt(lx * lx + ly * ly + lz * lz)
         if length > zero:
-            share = min(most / length, x.dtype.type(1))
+            share = min(longest_way / length, x.dtype.type(1))
             for c in range(3):
                 way = share * lag[c, p, l]
                 x[c, p, l] += way
                 lag[c, p, l] -= way
-            left = max(left, length - share * length)
-    return left
+            largest = max(largest, length - share * length)
+    return largest
 
 
 @inlined
-def _renew(x, v, w, sheet, block, l, h, beyond):
-    """Query one lane at its certified positions, and in strict mode draw what is beyond its bound back to it.
+def _query_again(x, v, w, sheet, block, l, h, outside):
+    """Query lane l at its certified positions, and in strict mode clamp the vertices to their new limits.
 
-    Bounds are about the motion that all share, so that a sheet in flight keeps it.  Where something is held, by a constraint or
-    since it may not move at all, they are about the place itself: there rounding must not add up.  So they are where what a hand
-    holds does not go with the others: else a jam would carry the hands away.
+    Bounds are relative to the common motion, so that a sheet in flight keeps its speed.  They are relative to the positions
+    themselves where a gap constraint acts or a vertex may not move at all: there rounding must not add up.  The same holds where
+    attached particles do not move with the others: otherwise a jam would carry the attachments away.
+
+    outside: scratch, (particles,).
     """
     memory, particles = sheet.memory, x.shape[1]
-    place, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
-    look_around(memory.old[block], v, w, sheet, block, l, h, place, limits, held)
+    # query: its positions in float64, squared limits, and which particles are attached
+    p64, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
+    look_around(memory.old[block], v, w, sheet, block, l, h, p64, limits, held)
     if sheet.setting.strict:
+        # the common motion, unless a vertex may not move, or an attached one does not share it
         start, zero = memory.start[block], x.dtype.type(0)
-        mx, my, mz = _shift(x, start, sheet.pairs.samples, l)
-        together = True
+        mx, my, mz = _common_motion(x, start, sheet.pairs.samples, l)
+        in_common = True
         for p in range(particles):
-            together &= limits[p] > zero
+            in_common &= limits[p] > zero
             if held[p]:
                 dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
-                together &= dx * dx + dy * dy + dz * dz <= limits[p]
-        if not together:
+                in_common &= dx * dx + dy * dy + dz * dz <= limits[p]
+        if not in_common:
             mx, my, mz = zero, zero, zero
-        _draw_back(x, v, memory, block, l, h, place, limits, held, mx, my, mz)
-        members, planes, constraints, close = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l], False
+        # clamp each vertex to its limit
+        _clamp(x, v, memory, block, l, h, p64, limits, held, mx, my, mz)
+        # where that violates a gap constraint, clamp without the common motion, then enforce the constraints
+        members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
+        violated = False
         for t in range(constraints):
-            close |= _is_close(x, members, planes, t, l)
-        if close:
-            _draw_back(x, v, memory, block, l, h, place, limits, held, zero, zero, zero)
-            beyond[:] = True
-            affected = np.empty(constraints, np.int32)
-            _hold_apart(x, v, w, sheet, block, l, beyond, affected, _list_affected(members, beyond, affected))
+            violated |= _is_violated(x, members, planes, t, l)
+        if violated:
+            _clamp(x, v, memory, block, l, h, p64, limits, held, zero, zero, zero)
+            outside[:] = True
+            active = np.empty(constraints, np.int32)
+            _hold_apart(x, v, w, sheet, block, l, outside, active, _list_active(members, outside, active))
         _note_lag(w, memory, block, l)
 
 
 @kernel
-def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
-    """Draw one lane's vertices back to their limits about a common motion m since the query [m].
+def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
+    """Clamp the vertices of lane l to their limits: x <- s + m + (x - s - m) min(1, b / |x - s - m|).
 
-    start: where they were at the query, (particles, 3); limits: the squares of how far they may go [m^2], (particles,).
+    start: positions s at the query [m], (particles, 3).  limits: b^2 [m^2], (particles,).  held: attached particles, (particles,);
+    what they lose is added to their lag.  m: common motion since the query [m].  The velocity beside m / h is shortened by the same
+    share.
     """
     lag, report = memory.lag[block], memory.report[block, l]
     real = x.dtype.type
@@ -198,7 +225,7 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
             keep = np.sqrt(limits[p] / square)
             report[REPORT_CLAMPED] += 1
             for c, s, m, d in ((0, sx, mx, dx), (1, sy, my, dy), (2, sz, mz, dz)):
-                # from the start, so that what may not move at all does not creep by rounding
+                # reckoned from the start, so that a vertex that may not move does not creep by rounding
                 goal = s + (m + keep * d)
                 if held[p]:
                     lag[c, p, l] += x[c, p, l] - goal
@@ -208,122 +235,128 @@ def _draw_back(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
 
 
 @inlined
-def _is_affected(members, t, beyond):
-    """Whether a gap constraint has a vertex beyond its bound: one of the first four, or of what others it has."""
+def _is_active(members, t, outside):
+    """Whether a vertex of gap constraint t is outside its bound: the first four, which all have, are tested without a branch."""
     some = (
-        beyond[members[t, G_VERTICES]]
-        | beyond[members[t, G_VERTICES + 1]]
-        | beyond[members[t, G_VERTICES + 2]]
-        | beyond[members[t, G_VERTICES + 3]]
+        outside[members[t, G_VERTICES]]
+        | outside[members[t, G_VERTICES + 1]]
+        | outside[members[t, G_VERTICES + 2]]
+        | outside[members[t, G_VERTICES + 3]]
     )
     for m in range(4, members[t, G_NUMBER]):
-        some |= beyond[members[t, G_VERTICES + m]]
+        some |= outside[members[t, G_VERTICES + m]]
     return some
 
 
 @kernel
-def _list_affected(members, beyond, affected):
-    """List the gap constraints with a vertex beyond its bound, all there is room for; returns how many."""
+def _list_active(members, outside, active):
+    """List the active gap constraints in ``active``, which has room for all, (constraints,).  Returns how many there are."""
     number = 0
-    for t in range(affected.shape[0]):
-        affected[number] = t
-        number += _is_affected(members, t, beyond)
+    for t in range(active.shape[0]):
+        # written without a branch: the next one takes the place of an inactive one
+        active[number] = t
+        number += _is_active(members, t, outside)
     return number
 
 
 @kernel
-def _is_close(x, members, planes, t, l):
-    """Whether a gap constraint of one lane is closer than it may be."""
+def _is_violated(x, members, planes, t, l):
+    """Whether gap constraint t of lane l is violated: min n . x_first - max n . x_second < the distance that it keeps."""
     own = members[t, G_OWN]
     nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
-    low, high = np.inf, -np.inf
+    nearest, farthest = np.inf, -np.inf
     for m in range(members[t, G_NUMBER]):
         p = members[t, G_VERTICES + m]
         place = nx * x[0, p, l] + ny * x[1, p, l] + nz * x[2, p, l]
         if m < own:
-            low = min(low, place)
+            nearest = min(nearest, place)
         else:
-            high = max(high, place)
-    # not what is not a number: that has diverged, and is not held
-    return low - high < planes[t, G_KEPT]
+            farthest = max(farthest, place)
+    # false for NaN: a diverged lane is left alone
+    return nearest - farthest < planes[t, G_KEPT]
 
 
 @kernel
-def _comes_close(x, memory, block, l, affected):
-    """Whether a query is due for gap constraints of one lane, and whether one that is affected is closer than it may be.
+def _evaluate_constraints(x, memory, block, l, active):
+    """Whether a query is due because of the active gap constraints of lane l, and whether one of them is violated.
 
-    Pairs that have been held since the last query are jammed, and it would say the same: for them none is due until more have been
-    looked at than it is worth.
+    active: their numbers.  Constraints that were enforced since the last query are jammed: a query would find the same again, so
+    they cause none until evaluating has cost more than a query would.
     """
     members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
-    due, close = False, False
-    for c in range(affected.shape[0]):
-        if _is_close(x, members, planes, affected[c], l):
-            close = True
-            due |= members[affected[c], G_GROUP] != GROUP_JAMMED
-    memory.looks[block, l] += constraints // PASSING + affected.shape[0]
-    return due or memory.looks[block, l] > PATIENCE * constraints, close
+    due, violated = False, False
+    for c in range(active.shape[0]):
+        if _is_violated(x, members, planes, active[c], l):
+            violated = True
+            due |= members[active[c], G_GROUP] != GROUP_JAMMED
+    # inactive constraints cost a little, too
+    memory.looks[block, l] += constraints // INACTIVE_COST + active.shape[0]
+    return due or memory.looks[block, l] > PATIENCE * constraints, violated
 
 
 @apart
-def _hold_apart(x, v, w, sheet, block, l, beyond, affected, number):
-    """Where a gap constraint of one lane would come closer than it may, halve the way of its vertices, and in the end leave them
-    where they were; others may follow.
+def _hold_apart(x, v, w, sheet, block, l, outside, active, number):
+    """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
+    positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.
 
-    affected: room for all gap constraints; the first ``number`` are those with a vertex beyond its bound.
+    active: room for all gap constraints, (constraints,); the first ``number`` entries are the active ones.  outside: which vertices
+    are outside their bounds; becomes which have been moved, too, (particles,).
     """
     memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
-    members, planes, constraints = memory.members[block, l], memory.planes[block, l], affected.shape[0]
+    members, planes, constraints = memory.members[block, l], memory.planes[block, l], active.shape[0]
     zero, half = x.dtype.type(0), x.dtype.type(0.5)
-    going = False
+    # mark the violated constraints as jammed
+    again = False
     for c in range(number):
-        if _is_close(x, members, planes, affected[c], l):
-            members[affected[c], G_GROUP] = GROUP_JAMMED
-            going = True
-    halved = np.zeros(x.shape[1], np.int64)
-    while going:
-        # in their order, round by round; once others are affected, the rest of the round looks at all
-        going, spread, c, t = False, False, 0, -1
+        if _is_violated(x, members, planes, active[c], l):
+            members[active[c], G_GROUP] = GROUP_JAMMED
+            again = True
+    halvings = np.zeros(x.shape[1], np.int64)
+    while again:
+        # rounds over the active constraints, in their order; when a move activates others, the round goes on over all of them
+        again, spread, c, t = False, False, 0, -1
         while c < number or spread:
+            # the next constraint of this round
             if spread:
                 t += 1
                 if t == constraints:
                     break
-                if not _is_affected(members, t, beyond):
+                if not _is_active(members, t, outside):
                     continue
             else:
-                t = affected[c]
+                t = active[c]
                 c += 1
-            if not _is_close(x, members, planes, t, l):
+            if not _is_violated(x, members, planes, t, l):
                 continue
+            # halve the moves of its vertices, those of attached particles into their lag
             for m in range(members[t, G_NUMBER]):
                 p = members[t, G_VERTICES + m]
-                if halved[p] > HALVES:
+                if halvings[p] > HALVINGS:
                     continue
-                report[REPORT_CLAMPED] += halved[p] == 0
-                halved[p] += 1
-                going = True
-                spread |= not beyond[p]
-                beyond[p] = True
-                share = half if halved[p] <= HALVES else zero
+                report[REPORT_CLAMPED] += halvings[p] == 0
+                halvings[p] += 1
+                again = True
+                spread |= not outside[p]
+                outside[p] = True
+                share = half if halvings[p] <= HALVINGS else zero
                 for k in range(3):
-                    place = old[k, p, l]
-                    if share > zero:  # what is not finite stays, too
-                        place += share * (x[k, p, l] - place)
+                    goal = old[k, p, l]
+                    if share > zero:  # zero times a move that is not finite is not zero
+                        goal += share * (x[k, p, l] - goal)
                     if w[p, l] <= zero:
-                        lag[k, p, l] += x[k, p, l] - place
+                        lag[k, p, l] += x[k, p, l] - goal
                     else:
                         v[k, p, l] *= share
-                    x[k, p, l] = place
+                    x[k, p, l] = goal
         if spread:
-            number = _list_affected(members, beyond, affected)
+            number = _list_active(members, outside, active)
     _note_lag(w, memory, block, l)
 
 
 @kernel
 def _note_lag(w, memory, block, l):
-    """The largest lag of one lane."""
+    """Note the largest lag of lane l [m]."""
     lag = memory.lag[block]
     largest = lag.dtype.type(0)
     for p in range(w.shape[0]):
@@ -335,40 +368,46 @@ def _note_lag(w, memory, block, l):
 
 @inlined
 def look_around(x, v, w, sheet, block, l, h, p, limits, held):
-    """Query one lane at the given positions; where it is fast it looks farther.
+    """Query lane l at positions x, and farther around fast vertices.
 
-    p, limits and held become its positions in float64 [m], (particles, 3), the squares of how far they may go before the next query
-    [m^2], (particles,), and whether they are held, (particles,): lanes lie far apart, so what is read again is copied.
+    p, limits, held: become its positions in float64 [m], (particles, 3), the squares of how far each vertex may move before the
+    next query [m^2], (particles,), and which particles are attached, (particles,).  They are copies: the values of a lane lie far
+    apart.
     """
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
     particles = x.shape[1]
-    room, free, extra = np.empty(particles), np.empty(particles), np.empty(particles)
-    _foresee(v, sheet, l, h, extra)
+    # copies of what the query reads, and how far ahead it looks
+    new_bounds, new_limits, extra = np.empty(particles), np.empty(particles), np.empty(particles)
+    _look_ahead(v, sheet, l, h, extra)
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
             start[c, k, l] = x[c, k, l]
             p[k, c] = x[c, k, l]
+    # find contacts and gap constraints, and bounds
     report = memory.report[block, l]
     report[REPORT_QUERIES] += 1
     before = memory.contacts[block, l]
     known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
     count, constraints = query(
-        p, sheet.pairs, sheet.reach, extra, held, room, free, memory.particles[block, l], memory.coefficients[block, l],
+        p, sheet.pairs, sheet.reach, extra, held, new_bounds, new_limits, memory.particles[block, l], memory.coefficients[block, l],
         memory.members[block, l], memory.planes[block, l], report,
     )  # fmt: skip
     memory.constraints[block, l] = constraints
+    # fast mode takes no notice of distances: it queries when something may have come within reach
     if not setting.strict:
-        room[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
-        free[:] = room + 2.0 * SHARE * extra
+        new_bounds[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
+        new_limits[:] = new_bounds + 2.0 * SHARE * extra
+    # bounds are compared with squared displacements
     for k in range(particles):
-        bounds[k, l] = (INSIDE * room[k]) ** 2
-        limits[k] = (INSIDE * free[k]) ** 2
+        bounds[k, l] = (INSIDE * new_bounds[k]) ** 2
+        limits[k] = (INSIDE * new_limits[k]) ** 2
         memory.limits[block, k, l] = limits[k]
-    _take_over(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
+    # contacts found again keep their impulses
+    _keep_impulses(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
     memory.contacts[block, l] = count
-    # what has been found is swept over at once
+    # a sweep is due at once
     memory.choices[block, l] = -1
     memory.looks[block, l] = memory.span[block, l] = 0
     if count == 0:
@@ -378,7 +417,7 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
 
 @kernel
 def note_uncertain(x, report, used):
-    """Note which of one block's sheets are too far from the origin to be certified; what is not finite has diverged."""
+    """Report the lanes of one block whose sheet is too far from the origin to be certified, unless it has diverged."""
     farthest = np.zeros(x.shape[2], x.dtype)
     for p in range(x.shape[1]):
         for c in range(3):
@@ -391,35 +430,41 @@ def note_uncertain(x, report, used):
 
 
 @kernel
-def _foresee(v, sheet, l, h, extra):
-    """How much farther than its reach a query of one lane looks for each vertex [m].
+def _look_ahead(v, sheet, l, h, extra):
+    """How much farther than its reach a query of lane l looks around each vertex [m]: ``extra``, (particles,).
 
-    It is what the vertex needs, at the speed that it has beside the whole sheet's, not to ask for the next one too soon: few are
-    that fast.
+    It is enough to last ``AHEAD`` substeps at the vertex's speed relative to the whole sheet.  Few vertices are fast enough to need
+    any.
     """
     samples, far = sheet.pairs.samples, sheet.reach.far
+    # mean velocity of the samples
     mx, my, mz = 0.0, 0.0, 0.0
     for s in range(samples.shape[0]):
         p = samples[s]
         mx, my, mz = mx + v[0, p, l], my + v[1, p, l], mz + v[2, p, l]
-    share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, FORESEEN * far
+    share, ahead, most = 1.0 / samples.shape[0], 0.5 * AHEAD * h / SHARE, AHEAD_MOST * far
+    # speeds relative to it, squared
     for p in range(v.shape[1]):
         dx, dy, dz = v[0, p, l] - share * mx, v[1, p, l] - share * my, v[2, p, l] - share * mz
         extra[p] = dx * dx + dy * dy + dz * dz
-    for p in range(v.shape[1]):  # side by side: roots of many at once
+    # a loop of its own, so that the roots are vectorized
+    for p in range(v.shape[1]):
         extra[p] = min(max(ahead * np.sqrt(extra[p]) - 0.5 * far, 0.0), most)
 
 
 @kernel
-def _take_over(known, impulses, particles, fresh, count, vertices):
-    """Give the contacts that a query has found the impulses which the same contacts had before it, so that stacks stay at rest.
+def _keep_impulses(known, impulses, particles, fresh, count, vertices):
+    """Give each contact found by a query the impulse that the same contact had before, so that stacks stay at rest.
 
-    known, impulses: those of before; particles, fresh: of now, of which there are ``count``.
+    known, impulses: particles and impulses before, (contacts, 4), (contacts, 3).  particles, fresh: the same now, of which there
+    are ``count``.  vertices: how many the sheet has.
     """
+    # the contacts of each first particle, as a linked list
     last, before = np.full(vertices, -1, np.int32), np.empty(len(known), np.int32)
     for k in range(len(known)):
         before[k] = last[known[k, 0]]
         last[known[k, 0]] = k
+    # the same four particles in the same order
     for k in range(count):
         fresh[k, 0] = fresh[k, 1] = fresh[k, 2] = 0
         old = last[particles[k, 0]]

@@ -1,14 +1,20 @@
-"""Contacts of a sheet with itself: impulses between what is closer than the thickness of the cloth.
+"""Impulses between parts of one sheet that are closer than the cloth's thickness.
 
-Projected Gauss-Seidel on the velocities with a warm start: an impulse is kept from substep to substep, pressed on again before
-anything else, and corrected by a sweep over the contacts, each substep, or every few where nothing had to be corrected by much.
-Between sweeps, what all contacts press is one change of velocity for each particle.
+Projected Gauss-Seidel on the velocities with a warm start.  A contact keeps its impulse from substep to substep: it is applied
+again before anything else, and corrected by a sweep over the contacts, in every substep, or every few where the last correction was
+small.  Between sweeps the impulses of all contacts are added up into one change of velocity for each particle.
 
-The normal part leaves as much velocity of approach as closes the gap to the thickness, not more, and never pulls; it does not
-switch on and off where the gap is the thickness.  The tangential part is what stops the sliding, as far as Coulomb's law allows.
-So stacks come to rest, and friction between layers holds.  What is too close is pushed apart at a bounded speed, by its position
-alone, so that no kinetic energy comes of it; springs that stand against it would make some again, so only what can give way is
-pushed (see ``proximity.edge_contacts``).
+A contact joins four vertices with weights c_i, those of the first primitive minus those of the second, and a unit normal n.  Its
+gap and relative velocity are g = n . sum c_i x_i and u = sum c_i v_i; its effective mass is m = 1 / sum w_i c_i^2, with the inverse
+masses w_i.
+
+* Normal: j_n <- max(j_n + m (u* - u_n), 0), where the target u* <= 0 closes the gap to the thickness and no more.  It never pulls,
+  and does not switch on and off where the gap equals the thickness.
+* Tangential: j_t <- j_t - m u_t, which stops the sliding, shortened to |j_t| <= mu j_n (Coulomb).
+
+So stacks come to rest, and friction between layers holds.  What is too close is pushed apart by positions alone, at a bounded
+speed, so that no kinetic energy comes of it.  Springs that resist the push would make some again, so only what can give way is
+pushed (see ``narrow_phase.edge_contacts``).
 """
 
 from __future__ import annotations
@@ -19,52 +25,59 @@ from clothgym._jit import apart, disjoint, inlined, kernel
 from clothgym.collisions.self.narrow_phase import SLOP
 from clothgym.contact_memory import C_NORMAL, C_THICKNESS, REPORT_TOUCHING
 
-RELAXED = 0.03  # share of what is too close by which a contact pushes apart in a substep: its neighbours push the same vertices
-SPAN = 4  # substeps between two sweeps over contacts that have converged; over others a sweep goes in each
-TOLERANCE = 0.005  # thicknesses by which a converged contact's correction moves it in the longest span, at most
-CHOSEN_EVERY = 8  # substeps after which contacts are chosen anew that may act soon
-# velocity of approach that a contact takes in a substep, at most [m/s]: in a jam, which takes all motion away, what is kept from
-# substep to substep would grow for ever
+RELAXED = 0.03  # share of the missing gap that a contact restores in a substep: its neighbors push the same vertices
+SPAN = 4  # substeps between two sweeps over contacts that have converged; others are swept over in every substep
+TOLERANCE = 0.005  # thicknesses by which the correction of a converged contact moves it in the longest span, at most
+CHOSEN_EVERY = 8  # substeps after which the active contacts, those that may act soon, are chosen again
+# largest velocity of approach that a contact removes in a substep [m/s]: in a jam, where bounds stop all motion, impulses would
+# otherwise grow from substep to substep without end
 FASTEST = 10.0
-SOON = 0.05  # thicknesses beyond the thickness within which a contact may act soon
+SOON = 0.05  # thicknesses beyond the thickness up to which a contact may act soon
 
 
 @apart
 def press_again(x, v, w, sheet, block, carried):
-    """What the contacts pressed at the last sweep, on one block's sheets; before the solids, so that these bear what lies on them.
+    """Apply the impulses of the last sweep to one block's sheets, v_i += w_i sum_k c_i j_k, before the solids, which so carry what
+    lies on them.
 
-    Where nothing presses, every bit stays.
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  carried: time for which a new velocity
+    has already moved the positions [s].  Where no impulse acts, no bit changes.
     """
     memory = sheet.memory
-    zero, some = x.dtype.type(0), False
+    zero, any_contact = x.dtype.type(0), False
+    # a block without contacts has nothing to apply
     for l in range(memory.used[block]):
-        some |= memory.contacts[block, l] > 0
-    if not some:
+        any_contact |= memory.contacts[block, l] > 0
+    if not any_contact:
         return
-    # what changes no bit when it is added; two selects of x and v instead would keep the loop from being one of vectors
-    nothing = -zero
+    # adding -0 changes no bit; selecting x and v instead would keep the loop from being vectorized
+    negative_zero = -zero
     for c in range(3):
         _press(
             x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried,
-            nothing
+            negative_zero
         )  # fmt: skip
 
 
 @disjoint
-def _press(x, v, w, pressed, carried, nothing):
-    """One component of what contacts press, by particle and lane."""
+def _press(x, v, w, pressed, carried, negative_zero):
+    """Add one component of the impulses: v += change, x += carried change; each array (particles times lanes,)."""
     zero = x.dtype.type(0)
     for e in range(x.shape[0]):
-        change = pressed[e] if (w[e] > zero) & (pressed[e] != zero) else nothing
+        change = pressed[e] if (w[e] > zero) & (pressed[e] != zero) else negative_zero
         x[e] += carried * change
         v[e] += change
 
 
 @apart
 def repel(x, v, w, sheet, block, h, carried):
-    """Contacts of one block's sheets with themselves, of those that a sweep is due for."""
+    """Correct the impulses of one block's sheets, in each lane in which a sweep is due.
+
+    x, v, w, carried: as in ``press_again``.  h: the substep [s].
+    """
     memory, number, lanes = sheet.memory, x.shape[1], x.shape[2]
     for l in range(memory.used[block]):
+        # lanes without contacts, and those whose contacts have converged, wait
         if memory.contacts[block, l] == 0:
             continue
         memory.waited[block, l] += 1
@@ -73,34 +86,37 @@ def repel(x, v, w, sheet, block, h, carried):
             continue
         if lanes == 1:
             _sweep(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
-        else:  # lanes lie far apart, and contacts read each particle many times
-            place, motion, mobility = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
-            _sweep(place, motion, mobility, sheet, block, l, h, carried)
-            x[:, :, l], v[:, :, l] = place, motion
+        else:  # contacts read each particle many times, so a lane, whose values lie far apart, is copied
+            own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
+            _sweep(own_x, own_v, own_w, sheet, block, l, h, carried)
+            x[:, :, l], v[:, :, l] = own_x, own_v
 
 
 @kernel
 def _sweep(x, v, w, sheet, block, l, h, carried):
-    """Sweep over one sheet's contacts; x, v: (3, particles), w: (particles,)."""
+    """One sweep over the contacts of one lane; x, v: [m], [m/s], (3, particles), w: [1/kg], (particles,)."""
     memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]
     particles, coefficients, impulses = memory.particles[block, l], memory.coefficients[block, l], memory.impulses[block, l]
     chosen = memory.chosen[block, l]
+    # choose the active contacts
     if memory.aged[block, l] >= CHOSEN_EVERY or memory.choices[block, l] < 0:
-        memory.choices[block, l] = _choose(x, v, particles, coefficients, impulses, chosen, count, h)
+        memory.choices[block, l] = _choose_active(x, v, particles, coefficients, impulses, chosen, count, h)
         memory.aged[block, l] = 0
+    # correct their impulses, and add them up for the substeps until the next sweep
     choices = memory.choices[block, l]
-    touching, most = _correct(
+    touching, largest = _correct(
         x, v, w, particles, coefficients, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
     )
     _add_up(w, particles, coefficients, impulses, chosen, choices, memory.pressed[block, :, :, l])
+    # the span doubles while corrections are within tolerance
     memory.report[block, l, REPORT_TOUCHING] = touching
     memory.waited[block, l] = 0
-    memory.span[block, l] = min(2 * waited, SPAN) if most * x.dtype.type(SPAN) * h < setting.tolerance else 1
+    memory.span[block, l] = min(2 * waited, SPAN) if largest * x.dtype.type(SPAN) * h < setting.tolerance else 1
 
 
 @inlined
-def _along(a, particles, coefficients, k, nx, ny, nz):
-    """n.(sum of weights times positions or velocities) of contact k."""
+def _relative(a, particles, coefficients, k, nx, ny, nz):
+    """For contact k, with a positions or velocities: n . sum c_i a_i, and sum c_i a_i by component."""
     i, j, m, n = particles[k, 0], particles[k, 1], particles[k, 2], particles[k, 3]
     wi, wj, wm, wn = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2], coefficients[k, 3]
     ax = wi * a[0, i] + wj * a[0, j] + wm * a[0, m] + wn * a[0, n]
@@ -111,7 +127,7 @@ def _along(a, particles, coefficients, k, nx, ny, nz):
 
 @inlined
 def _push(x, v, w, particles, coefficients, k, jx, jy, jz, carried, qx, qy, qz):
-    """Add an impulse j [N s] to contact k's velocities, what of it has been carried on to its positions, and a push q to these."""
+    """Apply an impulse j [N s] and a push q [kg m] to contact k's vertices: v_i += w_i c_i j and x_i += w_i c_i (carried j + q)."""
     for c in range(4):
         p = particles[k, c]
         share = w[p] * coefficients[k, c]
@@ -124,16 +140,17 @@ def _push(x, v, w, particles, coefficients, k, jx, jy, jz, carried, qx, qy, qz):
 
 
 @kernel
-def _choose(x, v, particles, coefficients, impulses, chosen, count, h):
-    """List the contacts that may act soon; returns how many.  The others lose their impulses."""
+def _choose_active(x, v, particles, coefficients, impulses, chosen, count, h):
+    """List the contacts that may act soon, and clear the impulses of the others.  Returns how many are listed."""
     zero = x.dtype.type(0)
     ahead = x.dtype.type(CHOSEN_EVERY) * h
     beyond = x.dtype.type(1 + SOON)
     number = 0
     for k in range(count):
         nx, ny, nz = coefficients[k, C_NORMAL], coefficients[k, C_NORMAL + 1], coefficients[k, C_NORMAL + 2]
-        gap, _, _, _ = _along(x, particles, coefficients, k, nx, ny, nz)
-        speed, _, _, _ = _along(v, particles, coefficients, k, nx, ny, nz)
+        gap, _, _, _ = _relative(x, particles, coefficients, k, nx, ny, nz)
+        speed, _, _, _ = _relative(v, particles, coefficients, k, nx, ny, nz)
+        # at its present velocity of approach it is within the thickness before the next choice
         if gap + ahead * min(speed, zero) < beyond * coefficients[k, C_THICKNESS]:
             chosen[number] = k
             number += 1
@@ -144,7 +161,7 @@ def _choose(x, v, particles, coefficients, impulses, chosen, count, h):
 
 @kernel
 def _add_up(w, particles, coefficients, impulses, chosen, choices, pressed):
-    """What the impulses of a substep change each particle's velocity by [m/s], (3, particles)."""
+    """Change of each particle's velocity by all impulses of a substep, w_i sum_k c_i j_k [m/s]: ``pressed``, (3, particles)."""
     zero = pressed.dtype.type(0)
     pressed[:] = zero
     for c in range(choices):
@@ -163,16 +180,19 @@ def _add_up(w, particles, coefficients, impulses, chosen, choices, pressed):
 def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carried, friction, push, h, waited):
     """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.
 
-    Returns how many contacts acted, and the most that the velocity along one's normal had to be corrected by [m/s].
+    chosen: the active contacts, the first ``choices`` of them.  friction: coefficient.  push: largest push in a substep [m].
+    Returns how many contacts acted, and the largest correction of a velocity along a normal [m/s].  See the module for the
+    formulas.
     """
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)
     since, most_speed = x.dtype.type(waited), x.dtype.type(FASTEST)
-    reach = x.dtype.type(SPAN) * h + carried
+    horizon = x.dtype.type(SPAN) * h + carried
     touching, largest = 0, zero
     for c in range(choices):
         k = chosen[c]
+        # normal and thickness, the impulse of all substeps since the last sweep, gap and velocity
         nx, ny, nz, thickness = (
             coefficients[k, C_NORMAL],
             coefficients[k, C_NORMAL + 1],
@@ -180,33 +200,36 @@ def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carrie
             coefficients[k, C_THICKNESS],
         )
         jx, jy, jz = since * impulses[k, 0], since * impulses[k, 1], since * impulses[k, 2]
-        before = nx * jx + ny * jy + nz * jz
-        gap, _, _, _ = _along(x, particles, coefficients, k, nx, ny, nz)
-        un, ux, uy, uz = _along(v, particles, coefficients, k, nx, ny, nz)
-        # the velocity of approach that closes the gap by the end of the longest span, and no sooner; what has been carried on is
-        # taken back
-        wanted = -max(gap - carried * un - sunk * thickness, zero) / reach
-        if before == zero and un >= wanted and gap >= sunk * thickness:
+        jn_before = nx * jx + ny * jy + nz * jz
+        gap, _, _, _ = _relative(x, particles, coefficients, k, nx, ny, nz)
+        un, ux, uy, uz = _relative(v, particles, coefficients, k, nx, ny, nz)
+        # u*: the velocity of approach that closes the gap at the end of the longest span, from the position without this velocity
+        target = -max(gap - carried * un - sunk * thickness, zero) / horizon
+        # inactive: no impulse, not approaching too fast, and apart
+        if jn_before == zero and un >= target and gap >= sunk * thickness:
             continue
-        mobile = zero
+        # m = 1 / sum w_i c_i^2; a contact between attached particles cannot move
+        inverse_mass = zero
         for m in range(4):
-            mobile += w[particles[k, m]] * coefficients[k, m] * coefficients[k, m]
-        if mobile <= zero:
+            inverse_mass += w[particles[k, m]] * coefficients[k, m] * coefficients[k, m]
+        if inverse_mass <= zero:
             continue
-        mass = one / mobile
-        now = min(max(before + (wanted - un) * mass, zero), since * most_speed * mass)
-        # what would stop the sliding, and as much of it as Coulomb allows
-        tx = jx - before * nx - (ux - un * nx) * mass
-        ty = jy - before * ny - (uy - un * ny) * mass
-        tz = jz - before * nz - (uz - un * nz) * mass
-        most = friction * now
-        share = min(most / (np.sqrt(tx * tx + ty * ty + tz * tz) + tiny), one)
-        px, py, pz = now * nx + share * tx, now * ny + share * ty, now * nz + share * tz
+        mass = one / inverse_mass
+        # normal part: j_n <- j_n + m (u* - u_n), at least zero
+        jn = min(max(jn_before + (target - un) * mass, zero), since * most_speed * mass)
+        # tangential part: j_t <- j_t - m u_t, shortened to mu j_n
+        tx = jx - jn_before * nx - (ux - un * nx) * mass
+        ty = jy - jn_before * ny - (uy - un * ny) * mass
+        tz = jz - jn_before * nz - (uz - un * nz) * mass
+        most_friction = friction * jn
+        share = min(most_friction / (np.sqrt(tx * tx + ty * ty + tz * tz) + tiny), one)
+        px, py, pz = jn * nx + share * tx, jn * ny + share * ty, jn * nz + share * tz
+        # the impulse is kept per substep
         impulses[k, 0], impulses[k, 1], impulses[k, 2] = px / since, py / since, pz / since
-        largest = max(largest, abs(now - before) * mobile)
-        # only what the impulse has not mended already is pushed
-        lack = sunk * thickness - (gap + carried * (now - before) * mobile)
-        out = since * min(relaxed * max(lack, zero), push) * mass
-        _push(x, v, w, particles, coefficients, k, px - jx, py - jy, pz - jz, carried, out * nx, out * ny, out * nz)
+        largest = max(largest, abs(jn - jn_before) * inverse_mass)
+        # push apart by what is still missing after the impulse has moved the positions
+        missing = sunk * thickness - (gap + carried * (jn - jn_before) * inverse_mass)
+        shift = since * min(relaxed * max(missing, zero), push) * mass
+        _push(x, v, w, particles, coefficients, k, px - jx, py - jy, pz - jz, carried, shift * nx, shift * ny, shift * nz)
         touching += 1
     return touching, largest

@@ -1,19 +1,26 @@
-"""What of one sheet is close to what: the query of self-collision.
+"""Narrow phase of self-collision: which pairs are close, and how far each vertex may move.
 
-From the positions of one environment it finds every vertex and triangle, and every two edges, without a common vertex, that are
-closer than the reach, and gives each vertex a bound: how far it may go, in any direction, before the query must be made anew.  If
-d is a lower bound of the distance of a pair, and each of its vertices moves by less than half of d, the pair cannot touch,
-whatever the paths are; so a vertex may move by ``SHARE`` times the smallest such distance, less a margin for rounding.
+The query takes the positions of one environment.  It finds each vertex and triangle, and each two edges, that share no vertex and
+are closer than the reach, and gives each vertex a displacement bound: how far it may move, in any direction, before the next query
+is due.  If d is a lower bound of a pair's distance and each of its vertices moves by less than d / 2, the pair cannot touch,
+whatever the paths.  So the bound of vertex v is
 
-Distances are taken in float64 and certified: with n the unit vector between the closest points, the least ``n.a`` of one side less
-the largest ``n.b`` of the other is a lower bound of the distance for any n at all, so nothing rests on the closest points
-being right.  (Closest points of slivers in float32 overestimate by half a millimetre.)
+    b_v = gamma_p min d  over the pairs of v,    gamma_p = SHARE < 1/2,
 
-Where layers touch, their distance is small, and bounds that are a share of it would call for a query with every step that
-they take, even together.  So pairs that are closer than ``LOOSE`` times the reach are constrained: once one of their vertices has
-left its bound, their distance along n is looked at, which may shrink to ``stop``; and what is left of the bounds, the limits,
-follows from the other pairs alone.  So each pair is certified in every state: by the bounds of its vertices, or by their limits, or
-by its constraint.
+less a margin for rounding.
+
+Distances are certified, in float64.  With n the unit vector between the closest points a and b, the lower bound is
+
+    d = min n . x_first - max n . x_second,
+
+which holds for any n, so nothing depends on the closest points being accurate.  (In float32 the closest points of slivers
+overestimate the distance by half a millimeter.)
+
+Where layers touch, d is small, and such bounds would call for a query in almost every substep, even where the layers move
+together.  So a pair closer than ``CLOSE`` times the reach becomes a gap constraint: once one of its vertices has left its bound,
+the distance along n is evaluated, and must not fall below ``stop``.  The limits of the vertices, beyond which a query is due,
+follow from the other pairs alone.  So each pair is certified in every state: by the bounds of its vertices, by their limits, or by
+its constraint.
 
 Per-vertex bounds instead of continuous collision detection: Chen, Hsu, Liu, Macklin, Yang and Yuksel, Offset Geometric
 Contact, ACM Transactions on Graphics 44(4), 2025.
@@ -39,17 +46,17 @@ from clothgym.contact_memory import (
 )
 from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle, segments_apart
 
-LAYERED = 0.8  # share of the distance of leaves' vertices that a plane between them must show to bound their edges too
-LOOSE = 0.8  # of the reach below which pairs are constrained
-SHARE = 0.45  # of a pair's distance that each side may use; below a half
-SLOP = 0.01  # share of the thickness that contacts may sink in: at rest they touch, and their impulses last
-GROUP_JAMMED = -2  # in the place of a pair of leaves: held since the last query
-MARGIN = 1e-5  # of the certified distance, kept for rounding in float32 within 16 m of the origin [m]
+LAYERED = 0.8  # share of the distance between two leaves' vertices that a plane between the leaves must certify to stand for all
+CLOSE = 0.8  # share of the reach within which a pair becomes a gap constraint
+SHARE = 0.45  # gamma_p: share of a pair's distance that each side may move by; less than a half
+SLOP = 0.01  # share of the thickness by which contacts may sink in: at rest they touch, and keep their impulses
+GROUP_JAMMED = -2  # in place of the pair of leaves of a gap constraint: it has been enforced since the last query
+MARGIN = 1e-5  # part of the certified distance kept for rounding in float32 within 16 m of the origin [m]
 
 
 @inlined
 def gap_of_vertex(p, v, i, j, k):
-    """Barycentric weights of the point of triangle ijk that is closest to vertex v, and the way from it to v [m]."""
+    """Barycentric weights of the point of triangle ijk that is closest to vertex v, and the vector from it to v [m]."""
     px, py, pz = p[v, 0], p[v, 1], p[v, 2]
     ax, ay, az = p[i, 0], p[i, 1], p[i, 2]
     bx, by, bz = p[j, 0], p[j, 1], p[j, 2]
@@ -60,7 +67,7 @@ def gap_of_vertex(p, v, i, j, k):
 
 @inlined
 def gap_of_edges(p, i, j, k, l):
-    """Where on edges ij and kl they are closest, from 0 to 1, and the way from the second to the first [m]."""
+    """Parameters s, t in [0, 1] of the closest points of edges ij and kl, and the vector from the second point to the first [m]."""
     ax, ay, az = p[i, 0], p[i, 1], p[i, 2]
     bx, by, bz = p[j, 0], p[j, 1], p[j, 2]
     cx, cy, cz = p[k, 0], p[k, 1], p[k, 2]
@@ -73,8 +80,8 @@ def gap_of_edges(p, i, j, k, l):
 
 
 @inlined
-def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, coefficients):
-    """Write a contact down."""
+def write_contact(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, coefficients):
+    """Write contact number ``count``: its vertices, their weights, its normal and its thickness [m]."""
     particles[count, 0], particles[count, 1], particles[count, 2], particles[count, 3] = i, j, k, l
     coefficients[count, 0], coefficients[count, 1], coefficients[count, 2], coefficients[count, 3] = wi, wj, wk, wl
     coefficients[count, C_NORMAL], coefficients[count, C_NORMAL + 1], coefficients[count, C_NORMAL + 2] = nx, ny, nz
@@ -83,161 +90,188 @@ def write(i, j, k, l, wi, wj, wk, wl, nx, ny, nz, thickness, count, particles, c
 
 @kernel
 def distance_to_keep(gap, held, stop, standoff):
-    """Distance that a gap constraint keeps [m]; a direction along which it is not apart certifies nothing: it stays as it is."""
+    """Distance that a gap constraint keeps [m]: ``stop``, or ``standoff`` with an attached vertex, or the gap if that is smaller.
+
+    A direction along which the pair does not lie apart certifies nothing: the distance is infinite, and the pair stays in place.
+    """
     return min(gap, standoff if held else stop) if gap > 0.0 else np.inf
 
 
 @inlined
-def constrain(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, constraints, members, planes):
-    """Write a pair down: the first ``own`` of its vertices, and the others, which may not come closer than ``stop`` along a
-    direction, or than ``standoff`` if a hand holds any."""
-    members[constraints, G_OWN], members[constraints, G_NUMBER], members[constraints, G_GROUP] = own, 4, group
+def write_constraint(i, j, k, l, own, group, nx, ny, nz, gap, held, stop, standoff, count, members, planes):
+    """Write gap constraint number ``count``: of the vertices i, j, k and l the first ``own`` belong to the first primitive, and
+    along the normal n their gap must not fall below the distance to keep.  gap: that of now [m].  held: attached particles,
+    (particles,).
+    """
+    members[count, G_OWN], members[count, G_NUMBER], members[count, G_GROUP] = own, 4, group
     (
-        members[constraints, G_VERTICES],
-        members[constraints, G_VERTICES + 1],
-        members[constraints, G_VERTICES + 2],
-        members[constraints, G_VERTICES + 3],
+        members[count, G_VERTICES],
+        members[count, G_VERTICES + 1],
+        members[count, G_VERTICES + 2],
+        members[count, G_VERTICES + 3],
     ) = i, j, k, l
     keep = distance_to_keep(gap, held[i] | held[j] | held[k] | held[l], stop, standoff)
-    planes[constraints, 0], planes[constraints, 1], planes[constraints, 2], planes[constraints, G_KEPT] = nx, ny, nz, keep
+    planes[count, 0], planes[count, 1], planes[count, 2], planes[count, G_KEPT] = nx, ny, nz, keep
 
 
 @inlined
-def set_free(i, j, k, l, certified, left, loose, extra, free):
-    """Lower the room that a pair which is not constrained leaves its four vertices.
+def lower_limits(i, j, k, l, certified, left, close, extra, limits):
+    """Lower the limits of four vertices for a pair that is not a gap constraint.
 
-    left: of its certified distance, after what its vertices have beyond their shares.  Where there was no room to constrain a pair
-    that is too close for that, they have nothing.
+    left: of the certified distance, what is left when the vertices use their extra [m].  A pair closer than ``close``, for which
+    there was no room among the constraints, leaves them nothing beyond their extra.
     """
     for v in (i, j, k, l):
-        free[v] = min(free[v], left if left >= loose else certified - 2.0 * extra[v])
+        limits[v] = min(limits[v], left if left >= close else certified - 2.0 * extra[v])
 
 
 @apart
 def vertex_contacts(
-    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, kept, margin, loose, stop,
-    standoff, held, room, free, closest, count, particles, coefficients, constraints, members, planes, report,
+    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, least, margin, close, stop,
+    standoff, held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
-    """Certify vertices and triangles, lower the room of their vertices, and write the contacts down.  Returns the
-    numbers of contacts and of gap constraints.
+    """Evaluate pairs of a vertex and a triangle: certify their distances, lower the bounds of their vertices, and write contacts
+    and gap constraints.  Returns the numbers of both.
 
-    extra: how much farther than ``reach`` is looked for each vertex, and how much more than its share it may go [m], (particles,).
-    Pairs closer than ``loose``, and what their vertices have of that, are constrained, as far as there is room; ``free`` is the
-    room that the others leave.  kept: the least thickness of a contact: one that is closer than ``thickness`` is pushed apart only
-    so far, and beyond it only kept from coming closer.
+    candidates: vertex, triangle and group, (candidates, 3).  reach: within which pairs matter; extra: how much farther around each
+    vertex, which is also how much more than its share it may move [m], (particles,).  thickness: of the cloth; least: the smallest
+    thickness of a contact: a closer one is pushed apart only so far, and otherwise only kept from approaching.  margin: beyond the
+    thickness within which a pair is a contact.  close: distance, less the extra of its vertices, within which a pair becomes a gap
+    constraint [m].  stop, standoff: see ``distance_to_keep``.  bounds, limits: become the smallest distances of each vertex, of all
+    its pairs and of those without a constraint [m], (particles,).  closest: becomes the smallest distance in each group [m] and its
+    direction, (groups, 4).
 
-    One contact for each closest feature: a face's inside, or a border that this triangle stands for; of two vertices, which meet
-    twice, the one of the lower number has it.  closest: becomes the smallest distance
-    of each group of candidates [m], and its direction, (groups, 4).
+    A closest point inside the triangle belongs to this pair alone.  One on an edge or a corner is shared by several triangles: only
+    the triangle that owns the edge or corner has the contact; of two vertices, which meet twice, only the one with the lower
+    number.
     """
     for m in range(candidates.shape[0]):
+        # the closest points, and whether they are within reach
         v, t = candidates[m, 0], candidates[m, 1]
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         a, b, c, nx, ny, nz = gap_of_vertex(p, v, i, j, k)
-        square, more = nx * nx + ny * ny + nz * nz, extra[v] + max(extra[i], max(extra[j], extra[k]))
-        if not square < (reach + more) * (reach + more):
+        square, extras = nx * nx + ny * ny + nz * nz, extra[v] + max(extra[i], max(extra[j], extra[k]))
+        if not square < (reach + extras) * (reach + extras):
             continue
+        # the certified distance along n
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
         nx, ny, nz = nx * scale, ny * scale, nz * scale
         farthest = max(along(p, i, nx, ny, nz), max(along(p, j, nx, ny, nz), along(p, k, nx, ny, nz)))
         certified = along(p, v, nx, ny, nz) - farthest
-        room[v], room[i], room[j], room[k] = (
-            min(room[v], certified), min(room[i], certified), min(room[j], certified), min(room[k], certified)
+        # it bounds all four vertices
+        bounds[v], bounds[i], bounds[j], bounds[k] = (
+            min(bounds[v], certified), min(bounds[i], certified), min(bounds[j], certified), min(bounds[k], certified)
         )  # fmt: skip
+        # a close pair becomes a gap constraint; any other, or one for which there is no room, limits its vertices, too
         group = candidates[m, 2]
-        left = certified - more
-        if left < loose and constraints < members.shape[0]:
-            constrain(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, constraints, members, planes)
-            constraints += 1
+        left = certified - extras
+        if left < close and constraint_count < members.shape[0]:
+            write_constraint(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, constraint_count, members, planes)
+            constraint_count += 1
         else:
-            set_free(v, i, j, k, certified, left, loose, extra, free)
-            report[REPORT_DROPPED] += left < loose
+            lower_limits(v, i, j, k, certified, left, close, extra, limits)
+            report[REPORT_DROPPED] += left < close
+        # the closest pair of each group
         if certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
+        # a contact, if it is certified and within the thickness, and belongs to this triangle
         if certified <= 0.0 or certified > thickness + margin:
             continue
         if b == 0.0 and c == 0.0:
-            mine = vertex_owner[i] == t and v < i
+            owned = vertex_owner[i] == t and v < i
         elif a == 0.0 and c == 0.0:
-            mine = vertex_owner[j] == t and v < j
+            owned = vertex_owner[j] == t and v < j
         elif a == 0.0 and b == 0.0:
-            mine = vertex_owner[k] == t and v < k
+            owned = vertex_owner[k] == t and v < k
         elif a == 0.0:
-            mine = edge_owner[triangle_edges[t, 0]] == t
+            owned = edge_owner[triangle_edges[t, 0]] == t
         elif b == 0.0:
-            mine = edge_owner[triangle_edges[t, 1]] == t
+            owned = edge_owner[triangle_edges[t, 1]] == t
         elif c == 0.0:
-            mine = edge_owner[triangle_edges[t, 2]] == t
+            owned = edge_owner[triangle_edges[t, 2]] == t
         else:
-            mine = True
-        if not mine:
+            owned = True
+        if not owned:
             continue
-        if count < particles.shape[0]:
-            own = min(thickness, max(kept, certified / (1.0 - SLOP)))
-            write(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, own, count, particles, coefficients)
-            count += 1
+        # a contact closer than the thickness keeps its present gap, but not less than ``least``
+        if contact_count < particles.shape[0]:
+            contact_thickness = min(thickness, max(least, certified / (1.0 - SLOP)))
+            write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, contact_thickness, contact_count, particles, coefficients)
+            contact_count += 1
         else:
             report[REPORT_DROPPED] += 1
-    return count, constraints
+    return contact_count, constraint_count
 
 
 @apart
 def edge_contacts(
-    p, candidates, edges, ridges, reach, extra, thickness, kept, margin, loose, stop, standoff, held, room, free, count, particles,
-    coefficients, constraints, members, planes, report,
+    p, candidates, edges, ridges, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
+    contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
-    """The same for edges: ridges of which both insides are closest; elsewhere vertices and triangles say the same.
+    """Evaluate pairs of edges; arguments and results as in ``vertex_contacts``, candidates: (candidates, 2).
 
-    Only vertices and triangles that do not hang together push each other apart.  Where cloth is pinched, near pairs have no room
-    for their thickness, and edges that are close become ridges and cease to be: what pushed them would never rest.
+    Only ridges whose closest points both lie inside become contacts: elsewhere vertices and triangles cover the same contact.  Only
+    vertices and triangles that are not near pairs push each other apart, see ``least``.  Where cloth is pinched, near pairs
+    have no room for their thickness, and close edges become ridges and stop being ridges: what pushed them would never rest.
     """
     for m in range(candidates.shape[0]):
+        # the closest points, and whether they are within reach
         e, f = candidates[m, 0], candidates[m, 1]
         i, j, k, l = edges[e, 0], edges[e, 1], edges[f, 0], edges[f, 1]
-        more = max(extra[i], extra[j]) + max(extra[k], extra[l])
+        extras = max(extra[i], extra[j]) + max(extra[k], extra[l])
         if segments_apart(
-            p[i, 0], p[i, 1], p[i, 2], p[j, 0], p[j, 1], p[j, 2], p[k, 0], p[k, 1], p[k, 2], p[l, 0], p[l, 1], p[l, 2], reach + more
+            p[i, 0], p[i, 1], p[i, 2], p[j, 0], p[j, 1], p[j, 2], p[k, 0], p[k, 1], p[k, 2], p[l, 0], p[l, 1], p[l, 2],
+            reach + extras,
         ):  # fmt: skip
             continue
         s, t, nx, ny, nz = gap_of_edges(p, i, j, k, l)
         square = nx * nx + ny * ny + nz * nz
-        if not square < (reach + more) * (reach + more):
+        if not square < (reach + extras) * (reach + extras):
             continue
+        # the certified distance along n
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
         nx, ny, nz = nx * scale, ny * scale, nz * scale
         nearest = min(along(p, i, nx, ny, nz), along(p, j, nx, ny, nz))
         certified = nearest - max(along(p, k, nx, ny, nz), along(p, l, nx, ny, nz))
-        room[i], room[j], room[k], room[l] = (
-            min(room[i], certified), min(room[j], certified), min(room[k], certified), min(room[l], certified)
+        # it bounds all four vertices
+        bounds[i], bounds[j], bounds[k], bounds[l] = (
+            min(bounds[i], certified), min(bounds[j], certified), min(bounds[k], certified), min(bounds[l], certified)
         )  # fmt: skip
-        left = certified - more
-        if left < loose and constraints < members.shape[0]:
-            constrain(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, constraints, members, planes)
-            constraints += 1
+        # a close pair becomes a gap constraint; any other, or one for which there is no room, limits its vertices, too
+        left = certified - extras
+        if left < close and constraint_count < members.shape[0]:
+            write_constraint(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, constraint_count, members, planes)
+            constraint_count += 1
         else:
-            set_free(i, j, k, l, certified, left, loose, extra, free)
-            report[REPORT_DROPPED] += left < loose
+            lower_limits(i, j, k, l, certified, left, close, extra, limits)
+            report[REPORT_DROPPED] += left < close
+        # a contact, if it is certified and within the thickness
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
-            if count < particles.shape[0]:
-                own = min(thickness, max(kept, certified / (1.0 - SLOP)))
-                write(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, own, count, particles, coefficients)
-                count += 1
+            if contact_count < particles.shape[0]:
+                contact_thickness = min(thickness, max(least, certified / (1.0 - SLOP)))
+                write_contact(
+                    i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, contact_thickness, contact_count, particles, coefficients
+                )
+                contact_count += 1
             else:
                 report[REPORT_DROPPED] += 1
-    return count, constraints
+    return contact_count, constraint_count
 
 
 @apart
 def constrain_layers(
-    p, corners, leaves, gaps, closest, extra, loose, stop, standoff, held, room, free, layered, constraints, members, planes, report
-):
-    """Tie pairs of leaves of which a plane shows about the distance that their vertices have, instead of their vertices and
-    triangles.  Returns the number of gap constraints.
+    p, corners, leaves, gaps, closest, extra, close, stop, standoff, held, bounds, limits, layered, constraint_count, members,
+    planes, report,
+):  # fmt: skip
+    """Replace the gap constraints between the vertices and triangles of two leaves by one, where a plane between the leaves
+    certifies about the same distance.  Returns the number of gap constraints.
 
-    gaps: what planes of the leaves show [m], and their normals; the plane across the closest vertex' way may show more.
-    layered: becomes which they are.
+    leaves: pairs of leaves, (pairs, 2).  gaps: the best distance certified by a plane of either leaf [m] and its normal, (pairs,
+    4); the plane normal to the closest pair of vertex and triangle, ``closest``, may certify more.  layered: becomes which pairs of
+    leaves have such a plane, (pairs,).  The rest as in ``vertex_contacts``.
     """
+    # the pairs of leaves with such a plane
     for pair in range(leaves.shape[0]):
         leaf, other = leaves[pair, 0], leaves[pair, 1]
         layered[pair] = gaps[pair, 0] >= max(LAYERED * closest[pair, 0], stop)
@@ -251,8 +285,9 @@ def constrain_layers(
                     closest[pair, 2],
                     closest[pair, 3],
                 )
+    # drop the gap constraints of their vertices and triangles
     kept = 0
-    for t in range(constraints):
+    for t in range(constraint_count):
         if members[t, G_GROUP] >= 0 and layered[members[t, G_GROUP]]:
             continue
         if kept < t:
@@ -261,6 +296,7 @@ def constrain_layers(
             for c in range(4):
                 planes[kept, c] = planes[t, c]
         kept += 1
+    # one gap constraint for each, or limits where there is no room or need
     for pair in range(leaves.shape[0]):
         if not layered[pair]:
             continue
@@ -269,25 +305,27 @@ def constrain_layers(
         for m in range(4):
             own, others = max(own, extra[corners[leaf, m]]), max(others, extra[corners[other, m]])
         left = gap - own - others
-        constrained = left < loose and kept < members.shape[0]
-        report[REPORT_DROPPED] += left < loose and not constrained
-        some = False
+        constrained = left < close and kept < members.shape[0]
+        report[REPORT_DROPPED] += left < close and not constrained
+        # the distance bounds all their vertices
+        any_held = False
         for m in range(4):
             for v in (corners[leaf, m], corners[other, m]):
-                room[v] = min(room[v], gap)
-                some |= held[v]
+                bounds[v] = min(bounds[v], gap)
+                any_held |= held[v]
                 if not constrained:
-                    free[v] = min(free[v], left if left >= loose else gap - 2.0 * extra[v])
+                    limits[v] = min(limits[v], left if left >= close else gap - 2.0 * extra[v])
+        # write the constraint
         if constrained:
             nx, ny, nz = gaps[pair, 1], gaps[pair, 2], gaps[pair, 3]
-            # the direction is from the second leaf to the first
-            way = along(p, corners[leaf, 0], nx, ny, nz) - along(p, corners[other, 0], nx, ny, nz)
-            sign = 1.0 if way > 0.0 else -1.0
+            # its normal points from the second leaf to the first
+            along_n = along(p, corners[leaf, 0], nx, ny, nz) - along(p, corners[other, 0], nx, ny, nz)
+            sign = 1.0 if along_n > 0.0 else -1.0
             members[kept, G_OWN], members[kept, G_NUMBER], members[kept, G_GROUP] = 4, 8, -1
             for m in range(4):
                 members[kept, G_VERTICES + m], members[kept, G_VERTICES + 4 + m] = corners[leaf, m], corners[other, m]
             planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
-            planes[kept, G_KEPT] = min(gap, standoff if some else stop)
+            planes[kept, G_KEPT] = min(gap, standoff if any_held else stop)
             kept += 1
     return kept
 
@@ -297,57 +335,64 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients,
     """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``coefficients``, and
     of gap constraints, which are in ``members`` and ``planes``.
 
-    p: positions in float64 [m], (particles, 3).  extra: how much farther than the reach is looked for each vertex [m],
-    (particles,).  held: particles that hands hold, (particles,).  bounds: becomes how far each vertex may go before a gap
-    constraint must be looked at, limits: before a query is due [m], (particles,).  report: (REPORT_SIZE,).
+    p: positions in float64 [m], (particles, 3).  extra: how much farther than the reach to look around each vertex [m],
+    (particles,).
+    held: which particles are attached, (particles,).
+    bounds: becomes how far each vertex may move before its gap constraints are evaluated; limits: before a query is due [m],
+    (particles,).  report: (REPORT_SIZE,).
     """
     triangles, edges, triangle_edges = pairs.triangles, pairs.edges, pairs.triangle_edges
     vertex_owner, edge_owner = pairs.vertex_owner, pairs.edge_owner
-    unlisted, margin, stop, standoff = min(reach.near, reach.far), reach.margin, reach.stop, reach.standoff
-    loose = LOOSE * unlisted
-    bounds[:] = unlisted
-    limits[:] = unlisted
+    # the distances of the query; pairs that are not found are farther apart than the least reach
+    least_reach, margin, stop, standoff = min(reach.near, reach.far), reach.margin, reach.stop, reach.standoff
+    close = CLOSE * least_reach
+    bounds[:] = least_reach
+    limits[:] = least_reach
+    # unit normals, and the edges that may be in contact
     faces, ridges = np.empty((3, triangles.shape[0])), np.empty(edges.shape[0], np.bool_)
     faces_of(p, triangles, faces)
     ridges_of(faces, pairs.edge_triangles, ridges)
+    # near pairs: parts that share a leaf or whose leaves share a vertex
     near, far, thin, thick = reach.near, reach.far, reach.near_thickness, reach.far_thickness
     corners, sides = near_candidates(p, pairs, near, extra)
     closest = np.zeros((1, 4))
     closest[0, 0] = near
-    # a literal would have a type, and so a version of the kernel, of its own
+    # an int64, since a literal has a type of its own and the kernel would be compiled twice
     none = np.int64(0)
-    count, constraints = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, loose, stop, standoff,
+    contact_count, constraint_count = vertex_contacts(
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, close, stop, standoff,
         held, bounds, limits, closest, none, particles, coefficients, none, members, planes, report,
     )  # fmt: skip
-    # these belong to no pair of leaves
-    members[:constraints, G_GROUP] = -1
-    count, constraints = edge_contacts(
-        p, sides, edges, ridges, near, extra, thin, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
-        coefficients, constraints, members, planes, report,
+    # near pairs belong to no pair of leaves
+    members[:constraint_count, G_GROUP] = -1
+    contact_count, constraint_count = edge_contacts(
+        p, sides, edges, ridges, near, extra, thin, 0.0, margin, close, stop, standoff, held, bounds, limits, contact_count,
+        particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
+    # all other pairs: vertices and triangles, layers, then edges
     leaves, gaps, corners = far_pairs(p, pairs, far, extra, faces)
     closest = np.zeros((leaves.shape[0], 4))
     closest[:, 0] = far
-    count, constraints = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, far, extra, thick, thick, margin, loose, stop, standoff,
-        held, bounds, limits, closest, count, particles, coefficients, constraints, members, planes, report,
+    contact_count, constraint_count = vertex_contacts(
+        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, far, extra, thick, thick, margin, close, stop, standoff,
+        held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
-    constraints = constrain_layers(
-        p, pairs.corners, leaves, gaps, closest, extra, loose, stop, standoff, held, bounds, limits, layered, constraints, members,
-        planes, report,
+    constraint_count = constrain_layers(
+        p, pairs.corners, leaves, gaps, closest, extra, close, stop, standoff, held, bounds, limits, layered, constraint_count,
+        members, planes, report,
     )  # fmt: skip
     sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
-    count, constraints = edge_contacts(
-        p, sides, edges, ridges, far, extra, thick, 0.0, margin, loose, stop, standoff, held, bounds, limits, count, particles,
-        coefficients, constraints, members, planes, report,
+    contact_count, constraint_count = edge_contacts(
+        p, sides, edges, ridges, far, extra, thick, 0.0, margin, close, stop, standoff, held, bounds, limits, contact_count,
+        particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
-    least = unlisted
+    # bounds and limits: gamma_p times the smallest distances, less the margin
+    least = least_reach
     for v in range(p.shape[0]):
         least = min(least, bounds[v])
         bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
         limits[v] = SHARE * max(limits[v] - MARGIN + 2.0 * extra[v], 0.0)
-    if least < unlisted:
+    if least < least_reach:
         report[REPORT_GAP] = min(report[REPORT_GAP], max(least, 0.0))
-    return count, constraints
+    return contact_count, constraint_count

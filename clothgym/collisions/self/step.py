@@ -1,22 +1,22 @@
-"""Self-collision: a sheet that keeps its distance to itself, and in strict mode does not pass through itself.
+"""Self-collision: the work of one substep, and the guarantee of strict mode.
 
-After each substep of any integrator, whose name it does not know:
+After each substep of any integrator, none of which it knows by name:
 
-1. ``press_again``: contacts press as they did at the end of the substep before.  Then the solids have their say, which so bear
-   what lies on them.
-2. ``repel``: those impulses are corrected, so that what is closer than the cloth's thickness no longer approaches, and slides no
-   more than friction allows; what is too close is pushed apart (see ``impulses``).
-3. ``confine``: where a vertex has left its bound (see ``narrow_phase``), the query is made anew at the last positions that are
-   certified to be free of intersections, and in strict mode vertices that are beyond even their new bounds are drawn back to
-   them, and gap constraints are held (see ``displacement_bounds``).
+1. ``press_again``: each contact applies its impulse of the previous substep.  The solids follow, and so carry what lies on them.
+2. ``repel``: the impulses are corrected.  What is closer than the cloth's thickness no longer approaches, slides only as far as
+   Coulomb friction allows, and is pushed apart (see ``impulses``).
+3. ``confine``: a vertex that has left its bound (see ``narrow_phase``) causes a query at the last certified positions, those
+   known to be free of intersections.  In strict mode vertices beyond their new bounds are clamped to them, and gap constraints
+   are enforced (see ``displacement_bounds``).
 
-So in strict mode: if a sheet starts without intersections, then in every substep every vertex and triangle, and every two edges,
-without a common vertex are at a positive distance all the way, so none has passed through another.  That holds for what hands
-hold, too: a hand that would pull cloth through cloth is slowed, and its particles lag.  Not promised are a least thickness, the
-untangling of a sheet that starts tangled, and that solids which squeeze cloth stay outside it.  Mode "fast" is the same without the
-drawing back, and promises nothing.
+The guarantee of strict mode: if a sheet starts without intersections, then in every substep each vertex and triangle, and each two
+edges, that share no vertex stay at a positive distance all along their paths, so none passes through another.  It holds for
+attached particles, too: an attachment that would pull cloth through cloth is slowed, and its particles lag behind.  Not
+guaranteed: a least thickness, the untangling of a sheet that starts with intersections, and that solids which squeeze cloth stay
+outside it.  Mode "fast" does the same without clamping, and guarantees nothing.
 
-Contacts go lane by lane: they share nothing but the mesh.  A lane without contacts costs the test of its bounds alone.
+Each lane, that is each environment of a block, is handled on its own: lanes share only the mesh.  A lane without contacts pays
+only for the test of its bounds.
 """
 
 from __future__ import annotations
@@ -33,22 +33,26 @@ from clothgym.collisions.self.impulses import press_again, repel
 from clothgym.collisions.self.topology import Pairs
 from clothgym.contact_memory import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
 
-PUSH = 0.5  # speed at which what is too close is pushed apart [m/s]
+PUSH = 0.5  # largest speed at which what is too close is pushed apart [m/s]
 
 
 class Memory(NamedTuple):
-    """What contact remembers, in blocks; all of it belongs to the state, or follows from it.
+    """What contact remembers, in blocks.  All of it is part of the state, or follows from it.
 
-    start: positions at the last query [m]; bounds, limits: squares of how far each vertex may go from there before gap constraints
-    are looked at, and before a query is due [m^2], or -1; old: the last certified positions [m]; lag: how far what is held is
-    behind its hand [m]; behind: the largest, (blocks, lanes).
+    start: positions at the last query [m]; old: the last certified positions [m], both (blocks, 3, particles, lanes).
+    bounds, limits: squares of how far each vertex may move from ``start`` before its gap constraints must be evaluated, and before
+    a query is due [m^2], -1 where one is due, (blocks, particles, lanes).
+    lag: from each attached particle to where its attachment would have it [m], (blocks, 3, particles, lanes); behind: the largest,
+    (blocks, lanes).
     contacts: how many, (blocks, lanes); particles, coefficients: see ``narrow_phase``, (blocks, lanes, room, 4) and (..., C_SIZE);
-    impulses: theirs of a substep [N s], (..., 3); pressed: what these change velocities by [m/s].  waited: substeps since the
-    contacts were swept over; span: after how many they are again; aged: since some were chosen, (blocks, lanes).  constraints: how
-    many gap constraints, (blocks, lanes); members, planes: see ``narrow_phase``, (..., 11) and (..., 4); looks: at these since the
-    last query.
-    chosen: contacts that may act soon, ``choices`` of them.
-    used: lanes that are no padding, (blocks,).  report: see ``narrow_phase``, (blocks, lanes, REPORT_SIZE).
+    impulses: of each contact per substep [N s], (..., 3); pressed: the change of each particle's velocity by these [m/s], (blocks,
+    3, particles, lanes).
+    waited: substeps since the last sweep over the contacts; span: substeps between two sweeps; aged: substeps since the active
+    contacts were chosen, (blocks, lanes).
+    chosen: the active contacts, (blocks, lanes, room), of which there are ``choices``, (blocks, lanes).
+    constraints: how many gap constraints; members, planes: see ``narrow_phase``, (blocks, lanes, room, G_SIZE) and (..., 4);
+    looks: evaluations of gap constraints since the last query, (blocks, lanes).
+    used: lanes that are not padding, (blocks,).  report: see ``narrow_phase``, (blocks, lanes, REPORT_SIZE).
     """
 
     start: NDArray
@@ -76,8 +80,11 @@ class Memory(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Options as kernels see them: friction, push speed [m/s], and by how much contacts may move and count as converged [m] in
-    their dtype."""
+    """Options as kernels see them, in the simulation's dtype.
+
+    strict: whether bounds are enforced.  single: whether positions are float32.  friction: coefficient.  push: speed at which what
+    is too close is pushed apart [m/s].  tolerance: how far the correction of a converged contact may move it [m].
+    """
 
     strict: bool
     single: bool
@@ -87,7 +94,7 @@ class Setting(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """All that the kernels need."""
+    """What the kernels need: the mesh's pairs, the distances of a query, the options and the memory."""
 
     pairs: Pairs
     reach: Reach
@@ -97,8 +104,13 @@ class Sheet(NamedTuple):
 
 @apart
 def press(x, v, w, sheet, block, step, h, carried):
-    """What happens to one block's sheets before the solids have their say; see the module."""
+    """Stage 1, before the solids: the contacts of one block apply their impulses of the previous substep.
+
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  step: of the control step.  h: the
+    substep [s].  carried: time for which a new velocity has already moved the positions at the end of a substep [s].
+    """
     memory = sheet.memory
+    # each control step has its own report; contacts and lags from before go on
     if step == 0:
         memory.choices[block] = -1
         for l in range(memory.used[block]):
@@ -107,6 +119,7 @@ def press(x, v, w, sheet, block, step, h, carried):
             report[REPORT_GAP] = np.inf
             report[REPORT_CONTACTS] = memory.contacts[block, l]
             report[REPORT_LAG] = memory.behind[block, l]
+        # float32 certifies distances only near the origin
         if sheet.setting.single:
             note_uncertain(x, memory.report[block], memory.used[block])
     press_again(x, v, w, sheet, block, carried)
@@ -114,22 +127,22 @@ def press(x, v, w, sheet, block, step, h, carried):
 
 @apart
 def keep_apart(x, v, w, sheet, block, h, carried):
-    """And what happens after; see the module."""
+    """Stages 2 and 3, after the solids: impulses, then bounds.  Arguments as in ``press``."""
     repel(x, v, w, sheet, block, h, carried)
     confine(x, v, w, sheet, block, h)
 
 
 @kernel
 def press_nothing(x, v, w, sheet, block, step, h, carried):
-    """Sheets that know nothing of themselves."""
+    """Stage 1 of a simulation without self-collision."""
 
 
 @kernel
 def keep_nothing_apart(x, v, w, sheet, block, h, carried):
-    """And may go anywhere."""
+    """Stages 2 and 3 of a simulation without self-collision."""
 
 
-# the names that the main loop calls, without self-collision and with it
+# what the main loop calls by these names, without self-collision and with it
 KERNELS = {
     False: {"press": press_nothing, "keep_apart": keep_nothing_apart},
     True: {"press": press, "keep_apart": keep_apart},
