@@ -1,7 +1,7 @@
-"""Which primitives of one sheet may be close: the broad phase of self-collision's query.
+"""Broad phase of self-collision: which primitives of one sheet may be close.
 
-Near pairs (see ``topology``) by the distances of their vertices; all others by the boxes of a tree, boxes, balls and planes of
-leaves, and boxes of primitives.  What is left out is surely farther apart than the query's reach.
+Near pairs (see ``topology``) are ruled out by the distances of their vertices; all others by the boxes of a tree, by boxes, balls
+and planes of leaves, and by boxes of primitives.  What is ruled out is farther apart than the query's reach.
 """
 
 from __future__ import annotations
@@ -13,18 +13,19 @@ import numpy as np
 from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.self.topology import NODE_BEGIN, NODE_END, NODE_LEAVES, NODE_NEXT
 
-TINY = 1e-300
+TINY = 1e-300  # keeps the normal of a degenerate triangle finite [m^4]
 ALL_LEAVES = 2**NODE_LEAVES - 1  # a bit for each leaf of a node
-V_WIDE, V_STRETCH = 3, 4  # in a row of ``near_rows``
-FLAT = 0.2  # angle [rad] up to which neighbouring faces are taken for flat: there vertices alone keep layers apart
+V_WIDE, V_STRETCH = 3, 4  # columns of ``near_rows``, after the position
+FLAT = 0.2  # angle between neighboring faces [rad] up to which their edge is no ridge: there vertices alone keep layers apart
 
 
 class Reach(NamedTuple):
     """Distances of a query [m].
 
-    near, far: within which near pairs, and all others, are found.  near_thickness, far_thickness: of the cloth there.
-    margin: beyond the thickness within which a pair becomes a contact.  stop: at which gap constraints are held.
-    standoff: distance at which what is held stops.
+    near, far: within which near pairs, and all others, are found.  near_thickness, far_thickness: thickness of the cloth between
+    them.
+    margin: beyond the thickness within which a pair becomes a contact.  stop: that gap constraints keep.  standoff: that they keep
+    where a vertex is attached.
     """
 
     near: float
@@ -38,23 +39,28 @@ class Reach(NamedTuple):
 
 @inlined
 def along(p, v, nx, ny, nz):
-    """Place of a vertex along a direction [m]."""
+    """Coordinate of vertex v along a direction, n . p_v [m]."""
     return nx * p[v, 0] + ny * p[v, 1] + nz * p[v, 2]
 
 
 @kernel
 def near_rows(p, pairs, extra, rows):
-    """What is asked of each vertex of a near pair, side by side, (particles, 5): its place [m]; the most that its triangles look
-    farther, since a primitive's extra is the largest of its vertices [m]; and the largest (length over rest length)^2, at least 1,
-    of the edges of its triangles."""
+    """What a test of near pairs reads of each vertex, side by side: ``rows``, (particles, 5).
+
+    Its position [m]; the largest extra of its triangles, where that of a triangle is the largest of its vertices [m]; and the
+    largest (length / rest length)^2, at least 1, of the edges of its triangles.
+    """
     edges, triangles, triangle_edges = pairs.edges, pairs.triangles, pairs.triangle_edges
+    # the stretch of each edge
     ratio = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
         i, j = edges[e, 0], edges[e, 1]
         dx, dy, dz = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         ratio[e] = max((dx * dx + dy * dy + dz * dz) * pairs.rest_edges[e], 1.0)
+    # the position of each vertex
     for v in range(p.shape[0]):
         rows[v, 0], rows[v, 1], rows[v, 2], rows[v, V_WIDE], rows[v, V_STRETCH] = p[v, 0], p[v, 1], p[v, 2], 0.0, 1.0
+    # the largest extra and stretch of its triangles
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         wide = max(extra[i], max(extra[j], extra[k]))
@@ -65,13 +71,18 @@ def near_rows(p, pairs, extra, rows):
 
 @kernel
 def come_close(rows, partners, partner, slack, near, out):
-    """Near pairs of vertices that are so close that some of their primitives may be within reach; returns how many."""
+    """List near pairs of vertices some of whose primitives may be within reach.  Returns how many.
+
+    A pair is listed if |p_i - p_j|^2 <= R^2 + slack stretch, with R the reach and both extras, and the slack at rest times the
+    larger stretch a bound of the slack now (see ``topology``).  out: room for all and one more.
+    """
     count = 0
     for i in range(rows.shape[0]):
         x, y, z, wide, stretch = rows[i, 0], rows[i, 1], rows[i, 2], near + rows[i, V_WIDE], rows[i, V_STRETCH]
         for q in range(partners[i], partners[i + 1]):
             j = partner[q]
             dx, dy, dz, within = rows[j, 0] - x, rows[j, 1] - y, rows[j, 2] - z, wide + rows[j, V_WIDE]
+            # written without a branch: the next one takes the place of one that is ruled out
             out[count] = q
             count += dx * dx + dy * dy + dz * dz <= within * within + slack[q] * max(stretch, rows[j, V_STRETCH])
     return count
@@ -79,16 +90,18 @@ def come_close(rows, partners, partner, slack, near, out):
 
 @apart
 def near_candidates(p, pairs, near, extra):
-    """Near pairs of primitives of which some vertices have come close: vertices and triangles, (candidates, 3), and edges
-    and edges, (candidates, 2)."""
+    """Near pairs that may be within reach: vertex, triangle and group 0, (candidates, 3), and two edges, (candidates, 2)."""
     near_pairs, begins, near_list, vertex_triangles = pairs.near_pairs, pairs.near, pairs.near_list, pairs.vertex_triangles
+    # close pairs of vertices
     rows, close = np.empty((p.shape[0], 5)), np.empty(pairs.partner.shape[0] + 1, np.int32)
     near_rows(p, pairs, extra, rows)
     number = come_close(rows, pairs.partners, pairs.partner, pairs.slack, near, close)
+    # room for all their primitive pairs
     room = 0
     for c in range(number):
         room += begins[close[c] + 1] - begins[close[c]]
     corners, edges = np.zeros((room, 3), np.int32), np.empty((room, 2), np.int32)
+    # each primitive pair once
     first, second = 0, 0
     seen = np.zeros(near_pairs.shape[0] if number > 0 else 0, np.bool_)
     for c in range(number):
@@ -108,8 +121,12 @@ def near_candidates(p, pairs, near, extra):
 
 @kernel
 def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
-    """Boxes, (6, leaves), and balls (centre and radius), (4, leaves), around leaves, wider by their extra, ``wide``, (leaves,), and
-    boxes around nodes, (6, nodes)."""
+    """Boxes, (6, leaves), and balls, center and radius, (4, leaves), around leaves, and boxes around nodes, ``hulls``, (6, nodes)
+    [m].
+
+    A box is its lower corner and its upper one.  All are wider by the largest extra of a leaf's vertices, ``wide``, (leaves,).
+    """
+    # leaves
     for leaf in range(corners.shape[0]):
         i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
         wide[leaf] = max(max(extra[i], extra[j]), max(extra[k], extra[l]))
@@ -118,12 +135,14 @@ def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
             box[c, leaf] = min(min(a, b), min(d, e)) - wide[leaf]
             box[3 + c, leaf] = max(max(a, b), max(d, e)) + wide[leaf]
             ball[c, leaf] = 0.25 * (a + b + d + e)
+        # the ball around the mean of the vertices
         square = 0.0
         for m in range(4):
             v = corners[leaf, m]
             dx, dy, dz = p[v, 0] - ball[0, leaf], p[v, 1] - ball[1, leaf], p[v, 2] - ball[2, leaf]
             square = max(square, dx * dx + dy * dy + dz * dz)
         ball[3, leaf] = np.sqrt(square) + wide[leaf]
+    # nodes, children before parents
     for k in range(nodes.shape[0] - 1, -1, -1):
         one, begin, end = k + 1, nodes[k, NODE_BEGIN], nodes[k, NODE_END]
         for c in range(3):
@@ -140,9 +159,9 @@ def enclose(p, corners, nodes, extra, wide, box, ball, hulls):
 
 @inlined
 def within(box, ball, leaf, first, number, far):
-    """Which of ``number`` leaves, from ``first`` on, may be within a leaf's reach, as bits.
+    """Which of ``number`` leaves, from ``first`` on, may be within ``far`` of a leaf, as bits.
 
-    All fit in a vector, for which their number must not be known to the compiler, nor their places be signed.
+    They fit in a vector.  For that the compiler must not know their number, and their indices must be unsigned.
     """
     lx, ly, lz = box[0, leaf] - far, box[1, leaf] - far, box[2, leaf] - far
     hx, hy, hz = box[3, leaf] + far, box[4, leaf] + far, box[5, leaf] + far
@@ -159,7 +178,7 @@ def within(box, ball, leaf, first, number, far):
 
 @inlined
 def leaves_within(box, first, number, hulls, node, far):
-    """Which of ``number`` leaves, from ``first`` on, may be within reach of a node, as bits; a vector, too."""
+    """Which of ``number`` leaves, from ``first`` on, may be within ``far`` of a node, as bits; vectorized, too."""
     lx, ly, lz = hulls[0, node] - far, hulls[1, node] - far, hulls[2, node] - far
     hx, hy, hz = hulls[3, node] + far, hulls[4, node] + far, hulls[5, node] + far
     bits = 0
@@ -173,39 +192,44 @@ def leaves_within(box, first, number, hulls, node, far):
 
 @kernel
 def far_leaves(pairs, far, ball, box, hulls, out):
-    """Pairs of leaves without a common vertex that may be within reach; returns how many, though no more are written than fit
-    with one to spare."""
+    """Find pairs of leaves without a common vertex that may be within ``far``.  Returns how many: if ``out``, (pairs, 2), has no
+    room for all and one more, the last row is overwritten.
+    """
     nodes, beside, beside_nodes, beside_leaves = pairs.nodes, pairs.beside, pairs.beside_nodes, pairs.beside_leaves
     count, last = 0, out.shape[0] - 1
     for one in range(nodes.shape[0]):
+        # only nodes without children
         if nodes[one, NODE_NEXT] > one + 1:
             continue
         begin, number = nodes[one, NODE_BEGIN], nodes[one, NODE_END] - nodes[one, NODE_BEGIN]
-        # what comes after it in the tree, and of that, in the same order, what is beside it; a node that is out of reach is passed
-        # over with all that is in it
+        # traverse the nodes from this one on, beside the list of adjacent ones, which is in the same order; a node that is out of
+        # reach is skipped with its subtree
         two, next_beside = one, beside[one]
         while two < nodes.shape[0]:
-            inside, two = two, nodes[two, NODE_NEXT]
-            if out_of_reach(hulls, one, hulls, inside, far):
+            node, two = two, nodes[two, NODE_NEXT]
+            if out_of_reach(hulls, one, hulls, node, far):
                 continue
-            if two > inside + 1:
-                two = inside + 1
+            # a node with children: go on with these
+            if two > node + 1:
+                two = node + 1
                 continue
-            while next_beside < beside[one + 1] and beside_nodes[next_beside] < inside:
+            # pairs of leaves that are not searched
+            while next_beside < beside[one + 1] and beside_nodes[next_beside] < node:
                 next_beside += 1
-            known = 0
-            if next_beside < beside[one + 1] and beside_nodes[next_beside] == inside:
-                known = beside_leaves[next_beside]
-            first, others = nodes[inside, NODE_BEGIN], nodes[inside, NODE_END] - nodes[inside, NODE_BEGIN]
-            some = leaves_within(box, begin, number, hulls, inside, far)
+            excluded = 0
+            if next_beside < beside[one + 1] and beside_nodes[next_beside] == node:
+                excluded = beside_leaves[next_beside]
+            # the leaves of this node that may be within reach of the other node, and then of its leaves
+            first, others = nodes[node, NODE_BEGIN], nodes[node, NODE_END] - nodes[node, NODE_BEGIN]
+            reached = leaves_within(box, begin, number, hulls, node, far)
             for k in range(number):
-                searched = ~(known >> (NODE_LEAVES * k)) & ALL_LEAVES
-                if not (some >> k) & 1 or searched == 0:
+                searched = ~(excluded >> (NODE_LEAVES * k)) & ALL_LEAVES
+                if not (reached >> k) & 1 or searched == 0:
                     continue
                 bits = within(box, ball, begin + k, first, others, far) & searched
                 if bits == 0:
                     continue
-                # all are written, without a branch that no processor could foresee; the next takes the place of one not to be kept
+                # written without a branch, which would be unpredictable: the next one takes the place of one that is ruled out
                 for m in range(NODE_LEAVES):
                     place = min(count, last)
                     out[place, 0], out[place, 1] = begin + k, first + m
@@ -215,21 +239,22 @@ def far_leaves(pairs, far, ball, box, hulls, out):
 
 @inlined
 def out_of_reach(a, i, b, j, far):
-    """Whether box i of ``a`` and box j of ``b`` are farther apart than ``far`` along an axis."""
+    """Whether box i of ``a`` and box j of ``b`` are farther apart than ``far`` along an axis; boxes: (6, boxes) [m]."""
     apart = (a[0, i] > b[3, j] + far) | (a[1, i] > b[4, j] + far) | (a[2, i] > b[5, j] + far)
     return apart | (b[0, j] > a[3, i] + far) | (b[1, j] > a[4, i] + far) | (b[2, j] > a[5, i] + far)
 
 
 @kernel
 def faces_of(p, triangles, faces):
-    """Unit normals of triangles, (3, triangles)."""
+    """Unit normals of triangles: ``faces``, (3, triangles)."""
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         ax, ay, az = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1], p[j, 2] - p[i, 2]
         bx, by, bz = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1], p[k, 2] - p[i, 2]
         cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         faces[0, t], faces[1, t], faces[2, t] = cx, cy, cz
-    for t in range(triangles.shape[0]):  # side by side: roots of many at once
+    # a loop of its own, so that the roots are vectorized
+    for t in range(triangles.shape[0]):
         cx, cy, cz = faces[0, t], faces[1, t], faces[2, t]
         scale = 1.0 / np.sqrt(cx * cx + cy * cy + cz * cz + TINY)
         faces[0, t], faces[1, t], faces[2, t] = cx * scale, cy * scale, cz * scale
@@ -237,7 +262,8 @@ def faces_of(p, triangles, faces):
 
 @kernel
 def ridges_of(faces, edge_triangles, ridges):
-    """Which edges are ridges: those on the border, and those whose faces differ by more than ``FLAT``."""
+    """Which edges are ridges, (edges,): those on the border, and those whose faces meet at an angle above ``FLAT``."""
+    # cos FLAT to second order
     least = 1.0 - 0.5 * FLAT * FLAT
     for e in range(edge_triangles.shape[0]):
         s, t = edge_triangles[e, 0], edge_triangles[e, 1]
@@ -247,7 +273,9 @@ def ridges_of(faces, edge_triangles, ridges):
 
 @inlined
 def between(p, corners, leaf, other, nx, ny, nz):
-    """Distance along a unit direction of two leaves that it separates [m], on whichever side; else negative."""
+    """Distance of two leaves along a unit direction n [m], whichever is in front: min n . p of one less max n . p of the other.  It
+    is negative where n does not separate them.
+    """
     i, j, k, l = corners[leaf, 0], corners[leaf, 1], corners[leaf, 2], corners[leaf, 3]
     a, b, c, d = along(p, i, nx, ny, nz), along(p, j, nx, ny, nz), along(p, k, nx, ny, nz), along(p, l, nx, ny, nz)
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
@@ -258,19 +286,21 @@ def between(p, corners, leaf, other, nx, ny, nz):
 
 @kernel
 def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, wide, found, number, gaps):
-    """Keep those of ``number`` pairs of leaves that no plane shows to be out of reach, with the distance that a plane shows, below
-    zero if none does, and the plane's normal, (pairs, 4).  Returns how many.
+    """Keep those of the first ``number`` pairs of leaves in ``found`` that no plane shows to be out of reach.  Returns how many.
 
-    The planes are square to either leaf's first triangle.
+    The planes are parallel to the first triangle of either leaf.  gaps: becomes the larger distance that they certify [m], negative
+    if neither separates the leaves, and its normal, (pairs, 4).
     """
     count = 0
     for pair in range(number):
         leaf, other = found[pair, 0], found[pair, 1]
+        # the larger of both distances
         s, t = own_triangles[leaf_triangles[leaf]], own_triangles[leaf_triangles[other]]
         gap = between(p, corners, leaf, other, faces[0, s], faces[1, s], faces[2, s])
         second = between(p, corners, leaf, other, faces[0, t], faces[1, t], faces[2, t])
         if second > gap:
             gap, s = second, t
+        # keep the pair
         if gap < far + wide[leaf] + wide[other]:
             found[count, 0], found[count, 1] = leaf, other
             gaps[count, 0], gaps[count, 1], gaps[count, 2], gaps[count, 3] = gap, faces[0, s], faces[1, s], faces[2, s]
@@ -280,15 +310,18 @@ def gaps_of_leaves(p, corners, faces, leaf_triangles, own_triangles, far, wide, 
 
 @kernel
 def far_vertices(p, leaves, box, far, wide, leaf_vertices, own_vertices, leaf_triangles, own_triangles, out):
-    """Vertices and triangles of leaves' pairs that may be close, with the number of the pair; returns how many, though no more than
-    fit are written."""
+    """Find vertices and triangles of pairs of leaves that may be close, with the number of the pair: ``out``, (candidates, 3).
+    Returns how many there are; only those for which there is room are written.
+    """
     count = 0
     for pair in range(leaves.shape[0]):
         for way in range(2):
             leaf, other = leaves[pair, way], leaves[pair, 1 - way]
+            # the box of the other leaf, within reach
             r = far + wide[leaf]
             lx, ly, lz = box[0, other] - r, box[1, other] - r, box[2, other] - r
             hx, hy, hz = box[3, other] + r, box[4, other] + r, box[5, other] + r
+            # each vertex in it, with all triangles of that leaf
             for m in range(leaf_vertices[leaf], leaf_vertices[leaf + 1]):
                 v = own_vertices[m]
                 x, y, z = p[v, 0], p[v, 1], p[v, 2]
@@ -302,10 +335,11 @@ def far_vertices(p, leaves, box, far, wide, leaf_vertices, own_vertices, leaf_tr
 
 @kernel
 def far_edges(p, leaves, layered, ridges, far, extra, leaf_edges, own_edges, edges, out):
-    """Edges of leaves' pairs that may be close, of layered pairs only ridges; returns how many, though no more are written than fit
-    with one to spare."""
+    """Find edges of pairs of leaves that may be close: ``out``, (candidates, 2); only ridges for a layered pair (see
+    ``narrow_phase``).  Returns how many: if there is no room for all and one more, the last row is overwritten.
+    """
     count, last, size = 0, out.shape[0] - 1, own_edges.shape[0]
-    # boxes around edges, wider by their extra, in their leaves' order
+    # boxes around edges, wider by their extra, in the order of the leaves
     box, ridge = np.empty((6, size)), np.empty(size, np.bool_)
     for m in range(size):
         e = own_edges[m]
@@ -315,6 +349,7 @@ def far_edges(p, leaves, layered, ridges, far, extra, leaf_edges, own_edges, edg
             a, b = p[i, c], p[j, c]
             box[c, m], box[3 + c, m] = min(a, b) - wide, max(a, b) + wide
         ridge[m] = ridges[e]
+    # edges whose boxes are within reach; written without a branch
     for pair in range(leaves.shape[0]):
         leaf, other, any_edge = leaves[pair, 0], leaves[pair, 1], not layered[pair]
         begin, end = leaf_edges[other], leaf_edges[other + 1]
@@ -334,20 +369,25 @@ def far_edges(p, leaves, layered, ridges, far, extra, leaf_edges, own_edges, edg
 
 @apart
 def far_pairs(p, pairs, far, extra, faces):
-    """Pairs of leaves without a common vertex to look into, (pairs, 2), the distance that a plane shows them to have [m] and
-    its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3)."""
+    """Pairs of leaves without a common vertex that may be within ``far``: (pairs, 2), the distance that a plane certifies [m] and
+    its normal, (pairs, 4), and their vertices and triangles that may be close, with the number of the pair, (candidates, 3).
+    """
+    # boxes and balls
     corners, size = pairs.corners, pairs.corners.shape[0]
     box, ball = np.empty((6, size)), np.empty((4, size))
     hulls, wide = np.empty((6, pairs.nodes.shape[0])), np.empty(size)
     enclose(p, corners, pairs.nodes, extra, wide, box, ball, hulls)
+    # pairs of leaves; with more room if there was too little
     found = np.empty((16 * size, 2), np.int32)
     number = far_leaves(pairs, far, ball, box, hulls, found)
     if number >= found.shape[0]:
         found = np.empty((number + 1, 2), np.int32)
         far_leaves(pairs, far, ball, box, hulls, found)
+    # those that no plane rules out
     gaps = np.empty((number, 4))
     number = gaps_of_leaves(p, corners, faces, pairs.leaf_triangles, pairs.own_triangles, far, wide, found, number, gaps)
     leaves = found[:number]
+    # their vertices and triangles
     vertices = np.empty((4 * number, 3), np.int32)
     owned = pairs.leaf_vertices, pairs.own_vertices, pairs.leaf_triangles, pairs.own_triangles
     count = far_vertices(p, leaves, box, far, wide, owned[0], owned[1], owned[2], owned[3], vertices)
@@ -359,7 +399,7 @@ def far_pairs(p, pairs, far, extra, faces):
 
 @apart
 def far_sides(p, pairs, leaves, layered, ridges, far, extra):
-    """Edges of those pairs that may be close, (candidates, 2); of layered ones only ridges."""
+    """Edges of those pairs of leaves that may be close, (candidates, 2); only ridges for a layered pair."""
     sides = np.empty((4 * leaves.shape[0] + 1, 2), np.int32)
     count = far_edges(p, leaves, layered, ridges, far, extra, pairs.leaf_edges, pairs.own_edges, pairs.edges, sides)
     if count >= sides.shape[0]:

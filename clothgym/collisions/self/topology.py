@@ -1,16 +1,19 @@
-"""Which pairs of a sheet's vertices, edges and triangles can touch: all that follows from the mesh alone, made once.
+"""Topology of self-collision: which vertices, edges and triangles of a sheet can touch, and their tree.  It follows from the mesh
+alone.
 
-Triangles are joined to leaves, two across an edge where possible (a grid's quads), and leaves lie in memory along a k-d tree of
-the flat sheet, so that a run of them, a node of the tree, is a compact patch.  A leaf owns its triangles, and each vertex and edge
-belongs to one leaf: a pair of primitives is met in one pair of leaves only (after Curtis, Tamstorf and Manocha 2008).
+Triangles are joined to leaves, two across an edge where possible (the quads of a grid).  Leaves are stored in the order of a k-d
+tree of the flat sheet, so that a run of them, a node of the tree, is a compact patch.  Each vertex, edge and triangle belongs to
+one leaf, so each pair of primitives is found in one pair of leaves only (after Curtis, Tamstorf and Manocha 2008).
 
-Leaves that share a vertex always overlap.  Their primitive pairs that share no vertex, the near pairs, are listed, and are cleared
-in a query by distances between vertices: for points P = sum a_i p_i and Q = sum b_j q_j with weights that sum to one,
+Leaves that share a vertex always overlap.  Their pairs of primitives without a common vertex, the near pairs, are listed instead,
+and a query rules them out by distances between vertices: for points P = sum a_i p_i and Q = sum b_j q_j with weights that sum to
+one,
 
     |P - Q|^2 = sum a_i b_j |p_i - q_j|^2 - sum_{i<k} a_i a_k |p_i - p_k|^2 - sum_{j<l} b_j b_l |q_j - q_l|^2,
 
-so the pair is farther than R apart if all ``|p_i - q_j|^2`` exceed R^2 by the most that the two last sums can be, the slack:
-a quarter of an edge's square for an edge, for a triangle the square of the radius of the smallest circle around it.
+so the pair is farther than R apart if each ``|p_i - q_j|^2`` exceeds R^2 by the largest value of the last two sums, the slack.  The
+largest value of such a sum is a quarter of the squared length for an edge, and for a triangle the squared radius of the smallest
+circle around it.
 """
 
 from __future__ import annotations
@@ -22,34 +25,37 @@ from numpy.typing import NDArray
 
 from clothgym.mesh import ClothMesh
 
-NODE_LEAVES = 8  # in a node that is not halved any more, but for the last one: a vector of float64
-NODE_BEGIN, NODE_END, NODE_NEXT = 0, 1, 2  # of a node: its leaves, and where the tree goes on after all that is in it
-SAMPLES = 16  # vertices whose mean displacement stands for that of the sheet
+NODE_LEAVES = 8  # leaves in a node that is not split further, except the last: a vector of float64
+NODE_BEGIN, NODE_END, NODE_NEXT = (
+    0,
+    1,
+    2,
+)  # columns of a node: its first leaf, one past its last, and the node that follows its subtree
+SAMPLES = 16  # vertices whose mean displacement stands for that of the whole sheet
 
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
 
 
 class Pairs(NamedTuple):
-    """A mesh's primitives in the order of a query; ranges are given by where each begins, with the end at the end.
+    """A mesh's primitives and pairs in the order of a query.  Ranges are given by where each begins, with the total at the end.
 
-    triangles, edges, triangle_edges: vertices of each, (triangles, 3) and (edges, 2), and the edges of each triangle, opposite its
-    corners, (triangles, 3).
+    triangles, edges: vertices of each, (triangles, 3), (edges, 2); triangle_edges: the edge opposite each corner, (triangles, 3).
     edge_triangles: both triangles of each edge, (edges, 2), the same twice on the border.
-    rest_edges: one over the square of its rest length [1/m^2], (edges,).
-    vertex_owner, edge_owner: the triangle that stands for each in contacts with a triangle's border, (particles,), (edges,).
+    rest_edges: 1 / (rest length)^2 of each edge [1/m^2], (edges,).
+    vertex_owner, edge_owner: the triangle that owns each in contacts, (particles,), (edges,).
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
-    leaf_vertices, leaf_edges, leaf_triangles: where what each leaf owns begins, (leaves + 1,), and what it is, ``own_*``.
-    nodes: of the tree, each before its halves, the first of which follows it: see ``NODE_BEGIN``, (nodes, 3).
-    beside: where the nodes that hold leaves beside those of each node that is not halved begin, itself and some after it,
-    (nodes + 1,); ``beside_nodes`` says which, and ``beside_leaves`` which pairs of theirs are none to search: a leaf k of the first
-    and m of the second, which share a vertex or come in this order elsewhere, are bit ``NODE_LEAVES * k + m``.
-    partners: where near pairs of vertices of each first begin, (particles + 1,); partner: the second, and slack: of the primitive
-    pairs they are in, at rest [m^2], (near,).
-    near: where the near primitive pairs of each near pair of vertices begin, (near + 1,); ``near_list`` indexes ``near_pairs``.
+    leaf_vertices, leaf_edges, leaf_triangles: where those of each leaf begin in ``own_*``, (leaves + 1,).
+    nodes: of the tree, each before its two children, the first of which follows it at once: see ``NODE_BEGIN``, (nodes, 3).
+    beside: where the list of adjacent nodes begins for each node without children, itself and later ones, (nodes + 1,).
+    beside_nodes: these lists; beside_leaves: for each entry the pairs of leaves not to be searched, as bits: leaf k of the first
+    node and m of the second, which share a vertex or are found in the other order, are bit ``NODE_LEAVES * k + m``.
+    partners: where near pairs of vertices begin for each first vertex, (particles + 1,); partner: the second vertex; slack: the
+    largest of their primitive pairs, at rest [m^2], (near,).
+    near: where the primitive pairs of each near pair of vertices begin in ``near_list``, which indexes ``near_pairs``, (near + 1,).
     near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
-    edges.
-    samples: (SAMPLES,).
+    two edges.
+    samples: vertices that stand for the whole sheet, (SAMPLES,).
     """
 
     triangles: Int
@@ -81,32 +87,37 @@ class Pairs(NamedTuple):
 
 
 def pairs_of(mesh: ClothMesh) -> Pairs:
-    """The mesh's pairs."""
+    """Primitives, tree and near pairs of a mesh."""
+    # edges, and those of each triangle
     triangles, x = mesh.triangles, mesh.rest_positions
     sides = np.sort(triangles[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
     edges, inverse = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
     triangle_edges = inverse.reshape(-1, 3)
     length2 = ((x[edges[:, 0]] - x[edges[:, 1]]) ** 2).sum(axis=1)
-    members = _leaves(triangles, triangle_edges, length2)
-    order, nodes = _compact(np.array([x[np.unique(triangles[m])].mean(axis=0) for m in members]))
-    members = [members[k] for k in order]
+    # leaves in the order of the tree
+    leaves = _leaves(triangles, triangle_edges, length2)
+    order, nodes = _compact(np.array([x[np.unique(triangles[m])].mean(axis=0) for m in leaves]))
+    leaves = [leaves[k] for k in order]
     leaf_of_triangle = np.zeros(len(triangles), np.int64)
-    for leaf, own in enumerate(members):
+    for leaf, own in enumerate(leaves):
         leaf_of_triangle[own] = leaf
-    # what a triangle stands for: each vertex and edge is that of the first triangle that has it
+    # owners: of each vertex and edge the first triangle that has it, and the leaf of that triangle
     vertex_owner = _first(triangles, len(x))
     edge_owner = _first(triangle_edges, len(edges))
     last = len(triangles) - 1 - _first(triangle_edges[::-1], len(edges))
     vertex_leaf, edge_leaf = leaf_of_triangle[vertex_owner], leaf_of_triangle[edge_owner]
-    corners = np.array([_four(np.unique(triangles[m])) for m in members])
-    around: list[list[int]] = [[] for _ in range(len(x))]
+    # leaves that share a vertex
+    corners = np.array([_four(np.unique(triangles[m])) for m in leaves])
+    leaves_around: list[list[int]] = [[] for _ in range(len(x))]
     for leaf, own in enumerate(corners):
         for vertex in set(own.tolist()):
-            around[vertex].append(leaf)
-    beside = [sorted({other for vertex in set(own.tolist()) for other in around[vertex]}) for own in corners]
-    vertex_triangle, edge_edge = _near_pairs(triangles, edges, members, beside, vertex_leaf, edge_leaf)
+            leaves_around[vertex].append(leaf)
+    beside = [sorted({other for vertex in set(own.tolist()) for other in leaves_around[vertex]}) for own in corners]
+    # near pairs
+    vertex_triangle, edge_edge = _near_pairs(triangles, edges, leaves, beside, vertex_leaf, edge_leaf)
     ends, slack, near, near_list = _near_vertices(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge)
-    counted = [_ranges(np.bincount(of, minlength=len(members))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
+    # what belongs to each leaf, and which leaves are not searched
+    counted = [_ranges(np.bincount(of, minlength=len(leaves))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     begins, beside_nodes, beside_leaves = _beside(np.array(nodes), beside)
     return Pairs(
@@ -140,30 +151,35 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
 
 
 def _int(values: NDArray) -> Int:
+    """As contiguous int32."""
     return np.ascontiguousarray(values, np.int32)
 
 
 def _ranges(counts: NDArray) -> Int:
+    """Where ranges of given lengths begin, with the total at the end."""
     return _int(np.concatenate([[0], np.cumsum(counts)]))
 
 
 def _first(parts: NDArray, count: int) -> NDArray[np.int64]:
-    """The first row in which each of ``count`` numbers stands."""
+    """For each of ``count`` numbers, the first row of ``parts`` that contains it."""
     first = np.full(count, len(parts))
     np.minimum.at(first, parts.ravel(), np.repeat(np.arange(len(parts)), parts.shape[1]))
     return first
 
 
 def _four(vertices: NDArray) -> NDArray:
+    """Three or four vertices as four, the last repeated."""
     return np.concatenate([vertices, np.repeat(vertices[-1:], 4 - len(vertices))])
 
 
 def _leaves(triangles: NDArray, triangle_edges: NDArray, length2: NDArray) -> list[list[int]]:
-    """Triangles joined in pairs across edges, longest edges first; what is left stays alone."""
+    """Triangles joined in pairs across edges, the longest edges first; the others stay single."""
+    # the triangles of each edge
     sides: list[list[int]] = [[] for _ in range(len(length2))]
     for t, own in enumerate(triangle_edges):
         for edge in own:
             sides[edge].append(t)
+    # by length, to nine digits, so that rounding does not change the order
     free = np.ones(len(triangles), bool)
     leaves = []
     for edge in np.lexsort((np.arange(len(length2)), -np.round(length2 / length2.max(), 9))):
@@ -173,56 +189,65 @@ def _leaves(triangles: NDArray, triangle_edges: NDArray, length2: NDArray) -> li
     return leaves + [[t] for t in np.flatnonzero(free).tolist()]
 
 
-def _compact(centres: NDArray) -> tuple[list[int], list[list[int]]]:
-    """An order in which runs are compact, by halving along the longest side, and the tree of halves."""
+def _compact(centers: NDArray) -> tuple[list[int], list[list[int]]]:
+    """The order of leaves in a k-d tree, and its nodes.
+
+    centers: of the leaves [m], (leaves, 3).  Nodes are halved along their longest side, at a multiple of ``NODE_LEAVES``.
+    """
     order: list[int] = []
     nodes: list[list[int]] = []
 
     def halve(part: NDArray) -> None:
+        """Append a node with the leaves ``part``, and its children."""
         begin, node = len(order), len(nodes)
         nodes.append([])
         if len(part) <= NODE_LEAVES:
             order.extend(part.tolist())
         else:
-            along = part[np.argsort(centres[part, np.ptp(centres[part], axis=0).argmax()], kind="stable")]
+            along = part[np.argsort(centers[part, np.ptp(centers[part], axis=0).argmax()], kind="stable")]
             half = -(-len(part) // (2 * NODE_LEAVES)) * NODE_LEAVES
             halve(along[:half])
             halve(along[half:])
         nodes[node] = [begin, len(order), len(nodes)]
 
-    halve(np.arange(len(centres)))
+    halve(np.arange(len(centers)))
     return order, nodes
 
 
 def _beside(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
-    """Pairs of leaves that are not searched, by the nodes that hold them: see ``Pairs.beside``."""
-    whole = np.flatnonzero(nodes[:, NODE_NEXT] == np.arange(len(nodes)) + 1).tolist()
-    node_of = {leaf: k for k in whole for leaf in range(nodes[k, NODE_BEGIN], nodes[k, NODE_END])}
+    """Adjacent nodes without children, and the pairs of their leaves not to be searched, as bits: see ``Pairs.beside``."""
+    # nodes without children, and the node of each leaf
+    childless = np.flatnonzero(nodes[:, NODE_NEXT] == np.arange(len(nodes)) + 1).tolist()
+    node_of = {leaf: k for k in childless for leaf in range(nodes[k, NODE_BEGIN], nodes[k, NODE_END])}
     counts, others, bits = np.zeros(len(nodes), np.int64), [], []
-    for node in whole:
+    # a leaf with itself, with those before it, and with those that share a vertex
+    for node in childless:
         begin, end = nodes[node, [NODE_BEGIN, NODE_END]].tolist()
-        found = {node: 0}
+        bits_of = {node: 0}
         for leaf in range(begin, end):
             for other in {*range(begin, leaf + 1), *(other for other in beside[leaf] if other > leaf)}:
                 bit = NODE_LEAVES * (leaf - begin) + other - int(nodes[node_of[other], NODE_BEGIN])
-                found[node_of[other]] = found.get(node_of[other], 0) | 1 << bit
-        counts[node] = len(found)
-        others += sorted(found)
-        bits += [found[other] for other in sorted(found)]
+                bits_of[node_of[other]] = bits_of.get(node_of[other], 0) | 1 << bit
+        counts[node] = len(bits_of)
+        others += sorted(bits_of)
+        bits += [bits_of[other] for other in sorted(bits_of)]
     return _ranges(counts), _int(np.array(others)), np.array(bits, np.uint64).view(np.int64)
 
 
 def _near_pairs(
-    triangles: NDArray, edges: NDArray, members: list[list[int]], beside: list[list[int]], vertex_leaf: NDArray, edge_leaf: NDArray
+    triangles: NDArray, edges: NDArray, leaves: list[list[int]], beside: list[list[int]], vertex_leaf: NDArray, edge_leaf: NDArray
 ) -> tuple[NDArray, NDArray]:
-    """Pairs of a vertex and a triangle, and of two edges, that share no vertex and whose leaves do, or are the same."""
-    vertices_of = [np.flatnonzero(vertex_leaf == leaf).tolist() for leaf in range(len(members))]
-    edges_of = [np.flatnonzero(edge_leaf == leaf).tolist() for leaf in range(len(members))]
+    """Pairs of a vertex and a triangle, and of two edges, without a common vertex, of leaves that share one or are the same.
+
+    Returns (pairs, 2) each.
+    """
+    vertices_of = [np.flatnonzero(vertex_leaf == leaf).tolist() for leaf in range(len(leaves))]
+    edges_of = [np.flatnonzero(edge_leaf == leaf).tolist() for leaf in range(len(leaves))]
     corner_sets, end_sets = [set(t) for t in triangles.tolist()], [set(e) for e in edges.tolist()]
     vertex_triangle, edge_edge = [], []
     for leaf, others in enumerate(beside):
         for other in others:
-            vertex_triangle += [(v, t) for v in vertices_of[leaf] for t in members[other] if v not in corner_sets[t]]
+            vertex_triangle += [(v, t) for v in vertices_of[leaf] for t in leaves[other] if v not in corner_sets[t]]
             edge_edge += [
                 (e, f) for e in edges_of[leaf] for f in edges_of[other] if (leaf < other or e < f) and other >= leaf
                 and not end_sets[e] & end_sets[f]
@@ -238,16 +263,19 @@ def _near_vertices(
     vertex_triangle: NDArray,
     edge_edge: NDArray,
 ) -> tuple[NDArray, Real, Int, NDArray]:
-    """Pairs of vertices of near pairs, their slack, and for each the near pairs that it is in: where they begin, and which."""
+    """Pairs of vertices of near pairs, their slack [m^2], and the near pairs that each is in: where they begin, and which."""
+    # squared radius of the smallest circle around each triangle: half its longest side if obtuse, else its circumcircle
     a, b, c = np.sort(length2[triangle_edges], axis=1).T
     doubled2 = (2 * (a * b + b * c + c * a) - a * a - b * b - c * c) / 4  # the square of twice the area (Heron)
     circle = np.where(a + b <= c, c / 4, a * b * c / (4 * doubled2))
+    # all pairs of a vertex of the first primitive and one of the second, with the slack and number of their near pair
     v, t = vertex_triangle.T
     e, f = edge_edge.T
     first = [np.repeat(v, 3), edges[e][:, [0, 0, 1, 1]].ravel()]
     second = [triangles[t].ravel(), edges[f][:, [0, 1, 0, 1]].ravel()]
     slack = [np.repeat(circle[t], 3), np.repeat((length2[e] + length2[f]) / 4, 4)]
     which = np.concatenate([np.repeat(np.arange(len(v)), 3), len(v) + np.repeat(np.arange(len(e)), 4)])
+    # each pair of vertices once, with its largest slack, and its near pairs in order
     both = np.sort(np.stack([np.concatenate(first), np.concatenate(second)], axis=1), axis=1)
     ends, pair = np.unique(both, axis=0, return_inverse=True)
     largest = np.zeros(len(ends))
