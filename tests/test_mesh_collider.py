@@ -60,7 +60,7 @@ def test_read_from_a_file(tmp_path):
         with pytest.raises(ValueError, match=message):
             MeshCollider(path=tmp_path / name)
     trimesh.Trimesh(vertices, triangles[1:], process=False).export(tmp_path / "open.ply")
-    with pytest.raises(ValueError, match=r"open.ply' is no solid: the mesh is open"):
+    with pytest.raises(ValueError, match=r"open.ply' is not a solid: the mesh is open"):
         MeshCollider(path=tmp_path / "open.ply")
 
 

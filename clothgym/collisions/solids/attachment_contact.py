@@ -1,7 +1,8 @@
-"""Points that are moved from outside, as hands are, and may not enter solids.
+"""Contact of attachments with solids: points that are moved from outside, and stop at surfaces.
 
-A point goes its way until something is in it; at a surface, without the thickness that cloth keeps, it loses the part of its way
-that leads inward, and slides on with the rest.  Solids that move push it.  What is in a solid already may stay as deep as it is.
+A point follows its displacement until it meets a solid.  At the surface, without the thickness that cloth keeps, it loses the
+inward part of what remains, and slides on with the rest.  Solids that move push it along.  A point that starts inside a solid may
+stay as deep as it is.
 """
 
 from __future__ import annotations
@@ -12,18 +13,19 @@ from clothgym._jit import apart, kernel
 from clothgym.collisions.solids.shapes import COLLIDER_ROWS, R_THICKNESS, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import S_CONTACT, S_SPOT, lay_out, measure, normal_to_world, to_axes
 
-STEPS = 20  # along the way of a point, at most
-SHORTEST = 1 / 16  # of the way is gone in a step at least: a wall that is thinner may be missed
-AT_SURFACE = 1e-5  # [m]: nearer than this is at the surface
+STEPS = 20  # largest number of steps along a displacement
+SHORTEST = 1 / 16  # least share of the displacement in a step: a thinner wall may be missed
+AT_SURFACE = 1e-5  # distance below which a point is at the surface [m]
 
 
 @kernel
-def _room(x, collider, shapes, k, lane, spent, point, rows, scratch):
-    """Distance of a point from one lane's solid, without its thickness [m]; its normal is left in S_CONTACT + 1 and on.
+def _distance(x, collider, shapes, k, lane, spent, point, rows, scratch):
+    """Distance of a point from the solid of one lane, without its thickness [m]; the normal is left in S_CONTACT + 1 and on.
 
-    spent: for how long the solid has moved [s].  point, rows, scratch: scratch, (3, 1, 1), (COLLIDER_ROWS, 1) and (SCRATCH_ROWS,
-    1).
+    x: the point [m], (3,).  spent: time for which the solid has moved [s].  point, rows, scratch: scratch, (3, 1, 1),
+    (COLLIDER_ROWS, 1) and (SCRATCH_ROWS, 1).
     """
+    # the solid's rows, and the point relative to where it has moved
     for r in range(COLLIDER_ROWS):
         rows[r, 0] = collider[r, lane]
     lay_out(rows, scratch)
@@ -37,42 +39,50 @@ def _room(x, collider, shapes, k, lane, spent, point, rows, scratch):
 
 @apart
 def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, scratch):
-    """Take one point along its way, in which solids may be; return whether they changed it.
+    """Move a point by a displacement, and stop it at solids.  Returns whether they changed its way.
 
-    x: where it is [m], (3,), moved on.  way: what it has to go, and then what it has gone [m], (3,).  colliders: rows of a block,
-    (colliders, COLLIDER_ROWS, lanes).  point, rows, scratch: scratch, see ``_room``.
+    x: where the point is [m], (3,); becomes where it ends.  way: its displacement in this control step [m], (3,); becomes the
+    actual one.
+    colliders: rows of a block, (colliders, COLLIDER_ROWS, lanes).  time_step: [s].  point, rows, scratch: scratch, see
+    ``_distance``.
     """
     zero, one = x.dtype.type(0), x.dtype.type(1)
     touching, shortest = x.dtype.type(AT_SURFACE), x.dtype.type(SHORTEST)
     start_x, start_y, start_z = x[0], x[1], x[2]
     changed, deepest, done = False, zero, zero
+    # conservative advancement: no step is longer than the distance to a solid at the speed of approach
     for n in range(STEPS + 1):
         step = one - done
         vx, vy, vz = way[0], way[1], way[2]
         for k in range(colliders.shape[0]):
-            room = _room(x, colliders[k], shapes, k, lane, done * time_step, point, rows, scratch)
+            distance = _distance(x, colliders[k], shapes, k, lane, done * time_step, point, rows, scratch)
             nx, ny, nz = scratch[S_CONTACT + 1, 0], scratch[S_CONTACT + 2, 0], scratch[S_CONTACT + 3, 0]
+            # a point that starts inside may stay as deep; later, one that has become deeper is pushed back
             if n == 0:
-                deepest = min(deepest, room)
-            elif room < deepest:
+                deepest = min(deepest, distance)
+            elif distance < deepest:
                 changed = True
-                x[0] += (deepest - room) * nx
-                x[1] += (deepest - room) * ny
-                x[2] += (deepest - room) * nz
+                x[0] += (deepest - distance) * nx
+                x[1] += (deepest - distance) * ny
+                x[2] += (deepest - distance) * nz
+            # displacement relative to the solid
             rx = vx - rows[R_VELOCITY, 0] * time_step
             ry = vy - rows[R_VELOCITY + 1, 0] * time_step
             rz = vz - rows[R_VELOCITY + 2, 0] * time_step
-            if room > touching:  # nothing is nearer than the distance
+            # away from the surface: shorten the step
+            if distance > touching:
                 closing = np.sqrt(rx * rx + ry * ry + rz * rz)
-                if closing * step > room:
-                    step = min(step, max(room / closing, shortest))
+                if closing * step > distance:
+                    step = min(step, max(distance / closing, shortest))
                 continue
+            # at the surface: lose the inward part, and go on in short steps
             inward = rx * nx + ry * ny + rz * nz
             if inward < zero:
                 vx, vy, vz = vx - inward * nx, vy - inward * ny, vz - inward * nz
                 if done < one:
                     changed = True
                     step = min(step, shortest)
+        # take the step
         if done >= one or n == STEPS:
             break
         x[0] += vx * step
@@ -86,18 +96,20 @@ def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, scra
 
 @apart
 def keep_out(start, way, colliders, shapes, lane, time_step, point, rows, scratch):
-    """Change a way so that a point which goes it from ``start``, (3,), ends no deeper in any solid than it began.
+    """Change a displacement so that a point which starts at ``start``, (3,) [m], ends no deeper in any solid than it began.
 
-    Return whether it was changed; the others are as for ``stop_at_solids``.
+    Returns whether it was changed; the other arguments are those of ``stop_at_solids``.
     """
     zero = start.dtype.type(0)
     end = np.empty(3, start.dtype)
     changed = False
     for k in range(colliders.shape[0]):
-        before = min(_room(start, colliders[k], shapes, k, lane, zero, point, rows, scratch), zero)
+        # depth before and after
+        before = min(_distance(start, colliders[k], shapes, k, lane, zero, point, rows, scratch), zero)
         for c in range(3):
             end[c] = start[c] + way[c]
-        lacking = before - _room(end, colliders[k], shapes, k, lane, time_step, point, rows, scratch)
+        lacking = before - _distance(end, colliders[k], shapes, k, lane, time_step, point, rows, scratch)
+        # push the end out by the difference
         if lacking > start.dtype.type(AT_SURFACE):
             changed = True
             for c in range(3):

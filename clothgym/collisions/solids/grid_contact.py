@@ -1,8 +1,9 @@
-"""Contact of one sheet with solids, where its particles lie side by side: the same as ``particle_contact`` and ``triangle_contact``
-in lanes.
+"""Contact of one sheet with solids, where its particles lie side by side: as ``particle_contact`` and ``triangle_contact`` do in
+lanes.
 
-Particles are measured all at once, from the first that a solid may touch to the last.  Triangles are chosen by the cells of the
-grid: those that may touch are gathered ``COLUMNS`` at a time, where lanes have one triangle each (see ``signed_distance``).
+Particles are measured all at once, from the first to the last that a solid may touch.  Triangles are selected by the cells of the
+grid; those that may touch are gathered ``COLUMNS`` at a time into a scratch array with one triangle in each column (see
+``signed_distance``).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import numpy as np
 
 from clothgym._jit import disjoint, inlined, kernel, uncounted
 from clothgym.collisions.solids.contact_law import RELAXED, TINY, contact_change, touch_change
-from clothgym.collisions.solids.deepest_point import NONE, find_deepest, turn_normal
+from clothgym.collisions.solids.deepest_point import NO_CONTACT, find_deepest, turn_normal
 from clothgym.collisions.solids.shapes import (
     KIND_MESH,
     KIND_PLANE,
@@ -37,18 +38,19 @@ from clothgym.collisions.solids.signed_distance import (
     normal_to_world,
     rounded_box,
 )
-from clothgym.collisions.solids.triangle_contact import SINKS, TOUCH_ROWS, may_touch_triangle, near_in_grid
+from clothgym.collisions.solids.triangle_contact import SINK, TOUCH_ROWS, may_touch_mesh, may_touch_triangle
 
-COLUMNS = 32  # triangles on a scratch
-PARTICLE_ROWS = 9  # of scratch: places in the solid's axes, its distance and normal, how near cells are
+COLUMNS = 32  # triangles in a scratch array
+PARTICLE_ROWS = 9  # rows of scratch: positions in the solid's axes, distance and normal, how near cells are
 P_LOCAL, P_GAP, P_NORMAL, P_NEAR = 0, 3, 4, 7
-NEAREST = 0.58  # of its longest side: no point of a triangle is farther from all its corners (1/sqrt(3) where that is equilateral)
+NEAREST = 0.58  # no point of a triangle is farther from all corners than this share of its longest side (1/sqrt(3) if equilateral)
 
 
 @kernel
 def room_on_sheet(x, triangles, shapes):
-    """Room for contact of one sheet: touches, (most, TOUCH_ROWS), their triangles and solids, (most, 2), how many, (1,); scratch,
-    (PARTICLE_ROWS, particles) and (triangles,); and a scratch, (SCRATCH_ROWS, COLUMNS)."""
+    """Room for contact of one sheet: touches, (most, TOUCH_ROWS), their triangles and solids, (most, 2), how many, (1,); scratch
+    for particles, (PARTICLE_ROWS, particles), and triangles, (triangles,); and for ``signed_distance``, (SCRATCH_ROWS, COLUMNS).
+    """
     solids = 0
     for k in range(shapes.kinds.shape[0]):
         solids += shapes.kinds[k] != KIND_PLANE
@@ -64,7 +66,7 @@ def room_on_sheet(x, triangles, shapes):
 
 @disjoint
 def _heights(x, y, z, px, py, pz, nx, ny, nz, radius, gap):
-    """Signed distance of particles to a plane [m]; returns how many are in it."""
+    """Signed distance of particles to a plane [m]: ``gap``, (particles,).  Returns how many are below it."""
     count, zero = 0, x.dtype.type(0)
     for p in range(x.shape[0]):
         gap[p] = (x[p] - px) * nx + (y[p] - py) * ny + (z[p] - pz) * nz - radius
@@ -73,8 +75,8 @@ def _heights(x, y, z, px, py, pz, nx, ny, nz, radius, gap):
 
 
 @disjoint
-def _squares(x, y, z, px, py, pz, reach2, gap):
-    """How far the square of particles' distance to a solid's point is beyond its reach's; returns how many are not."""
+def _beyond_reach(x, y, z, px, py, pz, reach2, gap):
+    """Squared distance of particles from a solid's point less its squared reach [m^2]: ``gap``.  Returns how many are within."""
     count, zero = 0, x.dtype.type(0)
     for p in range(x.shape[0]):
         dx, dy, dz = x[p] - px, y[p] - py, z[p] - pz
@@ -85,7 +87,7 @@ def _squares(x, y, z, px, py, pz, reach2, gap):
 
 @inlined
 def _span(gap):
-    """From the first to the last of what is below zero."""
+    """Range from the first to one past the last value below zero."""
     first, last = 0, gap.shape[0]
     while first < last and gap[first] >= 0:
         first += 1
@@ -96,14 +98,14 @@ def _span(gap):
 
 @disjoint
 def _to_axis(x, y, z, px, py, pz, ax, ay, az, out):
-    """Particles' places along one axis of a solid [m]."""
+    """Coordinates of particles along one axis of a solid [m]: ``out``, (particles,)."""
     for p in range(out.shape[0]):
         out[p] = (x[p] - px) * ax + (y[p] - py) * ay + (z[p] - pz) * az
 
 
 @disjoint
 def _measure_boxes(x, y, z, hx, hy, hz, radius, gap, nx, ny, nz):
-    """Signed distance [m] and normal, in the solid's axes, at places in these."""
+    """Signed distance [m] and normal of positions in the axes of a rounded box."""
     zero, one = x.dtype.type(0), x.dtype.type(1)
     for p in range(gap.shape[0]):
         gap[p], nx[p], ny[p], nz[p] = rounded_box(x[p], y[p], z[p], hx, hy, hz, radius, zero, one)
@@ -111,7 +113,7 @@ def _measure_boxes(x, y, z, hx, hy, hz, radius, gap, nx, ny, nz):
 
 @disjoint
 def _to_world(nx, ny, nz, xx, xy, xz, yx, yy, yz, zx, zy, zz):
-    """Turn normals from a solid's axes, x, y and z, to the world's."""
+    """Rotate normals from a solid's axes, x, y and z, to the world's."""
     for p in range(nx.shape[0]):
         ax, ay, az = nx[p], ny[p], nz[p]
         nx[p] = ax * xx + ay * yx + az * zx
@@ -121,7 +123,7 @@ def _to_world(nx, ny, nz, xx, xy, xz, yx, yy, yz, zx, zy, zz):
 
 @disjoint
 def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
-    """Correct positions and velocities of particles that touch a solid which moves by s [m/s]."""
+    """Apply the contact law to particles at a solid that moves with velocity s [m/s]."""
     zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
     for p in range(gap.shape[0]):
         mx, my, mz, cx, cy, cz = contact_change(
@@ -137,7 +139,7 @@ def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carr
 
 @disjoint
 def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
-    """The same with one normal for all."""
+    """The same with one normal for all particles."""
     zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
     for p in range(gap.shape[0]):
         mx, my, mz, cx, cy, cz = contact_change(
@@ -153,20 +155,23 @@ def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, frict
 
 @uncounted
 def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """Resolve the contacts of one sheet's particles after a substep of ``h`` [s], and move the solids on by their velocity.
+    """Move the solids on, and resolve one sheet's particles' contacts with them after a substep; see
+    ``particle_contact.resolve_particles``.
 
-    x [m], v [m/s]: (3, particles, 1); w [1/kg]: (particles, 1); colliders: rows of ``shapes``, (colliders, PARTICLE_ROWS, 1); room:
-    of ``room_on_sheet``.  See ``response.resolve_particles``.
+    x: [m], v: [m/s], (3, particles, 1).  w: inverse masses [1/kg], (particles, 1).  colliders: rows, (colliders, COLLIDER_ROWS,
+    1).  h: the substep [s].  room: from ``room_on_sheet``.
     """
     _, _, _, rows, _, scratch = room
     kinds, n = shapes.kinds, x.shape[1]
     r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
     for k in range(kinds.shape[0]):
         c = colliders[k].reshape(colliders.shape[1])
+        # move the solid by its velocity
         for e in range(3):
             c[R_POINT + e] += h * c[R_VELOCITY + e]
         px, py, pz = c[R_POINT], c[R_POINT + 1], c[R_POINT + 2]
         sx, sy, sz, friction = c[R_VELOCITY], c[R_VELOCITY + 1], c[R_VELOCITY + 2], c[R_FRICTION]
+        # a plane: heights, then the particles from the first to the last below it
         if kinds[k] == KIND_PLANE:
             nx, ny, nz = c[R_AXES + 6], c[R_AXES + 7], c[R_AXES + 8]
             if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[R_RADIUS], rows[P_GAP]) > 0:
@@ -176,9 +181,11 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
                     sz, friction, carried,
                 )  # fmt: skip
             continue
-        if _squares(r[0], r[1], r[2], px, py, pz, c[R_REACH2], rows[P_GAP]) == 0:
+        # any other solid: particles within its reach, from the first to the last
+        if _beyond_reach(r[0], r[1], r[2], px, py, pz, c[R_REACH2], rows[P_GAP]) == 0:
             continue
         a, b = _span(rows[P_GAP])
+        # positions in its axes, distances and normals there
         for e in range(3):
             q = R_AXES + 3 * e
             _to_axis(r[0, a:b], r[1, a:b], r[2, a:b], px, py, pz, c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e, a:b])
@@ -190,6 +197,7 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
             )  # fmt: skip
         else:
             _measure_in_scratch(rows, a, b, colliders[k], shapes, k, scratch)
+        # normals in the world, and the contact law
         _to_world(
             nx, ny, nz, c[R_AXES], c[R_AXES + 1], c[R_AXES + 2], c[R_AXES + 3], c[R_AXES + 4], c[R_AXES + 5], c[R_AXES + 6],
             c[R_AXES + 7], c[R_AXES + 8],
@@ -201,7 +209,7 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
 
 @uncounted
 def _measure_in_scratch(rows, first, last, collider, shapes, k, scratch):
-    """Distance and normal of particles, whose places are in rows P_LOCAL, to a mesh, ``COLUMNS`` at a time."""
+    """Distance and normal of particles, whose positions are in rows P_LOCAL, to a mesh, ``COLUMNS`` at a time."""
     lay_out(collider, scratch)
     for begin in range(first, last, scratch.shape[1]):
         count = min(scratch.shape[1], last - begin)
@@ -219,7 +227,7 @@ def _measure_in_scratch(rows, first, last, collider, shapes, k, scratch):
 
 @disjoint
 def _distances(x, y, z, hx, hy, hz, out):
-    """Distance of places in a solid's axes from the box of half sides h [m]."""
+    """Distance of positions in a solid's axes from the box of half sides h [m]: ``out``, (particles,)."""
     zero = x.dtype.type(0)
     for p in range(out.shape[0]):
         ox, oy, oz = max(abs(x[p]) - hx, zero), max(abs(y[p]) - hy, zero), max(abs(z[p]) - hz, zero)
@@ -228,9 +236,11 @@ def _distances(x, y, z, hx, hy, hz, out):
 
 @disjoint
 def _near_cells(x, y, z, out, columns, radius, near):
-    """How far the corners of each cell are from the box of ``_distances`` beyond where one of its points may touch [m], at least.
+    """Distance from the box of ``_distances`` to the points of each cell, at least, less the radius [m]: ``near``, (cells,).
+    Returns how many cells may touch.
 
-    No point of a triangle is farther from its nearest corner than ``NEAREST`` of its longest side.  Returns how many may touch.
+    out: distances of the corners [m].  No point of a triangle is farther from its closest corner than ``NEAREST`` of its longest
+    side.
     """
     count, zero, share = 0, x.dtype.type(0), x.dtype.type(NEAREST)
     xb, xc, xd = x[1:], x[columns:], x[columns + 1 :]
@@ -238,12 +248,14 @@ def _near_cells(x, y, z, out, columns, radius, near):
     zb, zc, zd = z[1:], z[columns:], z[columns + 1 :]
     ob, oc, od = out[1:], out[columns:], out[columns + 1 :]
     for p in range(near.shape[0]):
+        # both diagonals and four sides, squared
         one = (xd[p] - x[p]) * (xd[p] - x[p]) + (yd[p] - y[p]) * (yd[p] - y[p]) + (zd[p] - z[p]) * (zd[p] - z[p])
         two = (xc[p] - xb[p]) * (xc[p] - xb[p]) + (yc[p] - yb[p]) * (yc[p] - yb[p]) + (zc[p] - zb[p]) * (zc[p] - zb[p])
         ab = (xb[p] - x[p]) * (xb[p] - x[p]) + (yb[p] - y[p]) * (yb[p] - y[p]) + (zb[p] - z[p]) * (zb[p] - z[p])
         ac = (xc[p] - x[p]) * (xc[p] - x[p]) + (yc[p] - y[p]) * (yc[p] - y[p]) + (zc[p] - z[p]) * (zc[p] - z[p])
         bd = (xd[p] - xb[p]) * (xd[p] - xb[p]) + (yd[p] - yb[p]) * (yd[p] - yb[p]) + (zd[p] - zb[p]) * (zd[p] - zb[p])
         cd = (xd[p] - xc[p]) * (xd[p] - xc[p]) + (yd[p] - yc[p]) * (yd[p] - yc[p]) + (zd[p] - zc[p]) * (zd[p] - zc[p])
+        # the closest corner less the largest distance from it
         longest = max(max(max(one, two), max(ab, ac)), max(bd, cd))
         nearest = min(min(out[p], ob[p]), min(oc[p], od[p]))
         near[p] = nearest - share * np.sqrt(longest) - radius
@@ -253,7 +265,7 @@ def _near_cells(x, y, z, out, columns, radius, near):
 
 @inlined
 def _gather_corners(rows, triangles, chosen, begin, count, scratch):
-    """Copy the corners of chosen triangles to the scratch; the last fills what is left of it."""
+    """Copy the corners of ``count`` chosen triangles to the columns of the scratch; the last fills those that are left."""
     for l in range(scratch.shape[1]):
         t = chosen[begin + min(l, count - 1)]
         for c in range(3):
@@ -265,18 +277,20 @@ def _gather_corners(rows, triangles, chosen, begin, count, scratch):
 
 @inlined
 def _choose_triangles(rows, triangles, columns, radius, chosen, scratch):
-    """List the triangles that may touch the solid on the scratch, by their cells, and of these by themselves; returns how many."""
+    """List triangles that may touch the solid in the scratch, first by their cells, then each by itself.  Returns how many."""
+    # cells that may touch, and their two triangles
     number, last = 0, rows.shape[1] - columns - 1
     near = rows[P_NEAR, :last]
     out = rows[P_GAP]
     if _near_cells(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], out, columns, radius, near) == 0:
         return 0
     for p in range(last):
-        # a cell at the end of a row is none
+        # at the end of a row there is no cell
         if near[p] < 0 and p % columns < columns - 1:
             t = 2 * (p - p // columns)
             chosen[number], chosen[number + 1] = t, t + 1
             number += 2
+    # of these, the triangles that may touch
     kept = 0
     for begin in range(0, number, scratch.shape[1]):
         count = min(scratch.shape[1], number - begin)
@@ -290,39 +304,44 @@ def _choose_triangles(rows, triangles, columns, radius, chosen, scratch):
 
 @uncounted
 def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
-    """Find where one sheet's triangles touch a solid, which is no plane, or soon may; see ``surface.find_touches``.
+    """Find where triangles of one sheet touch solid k, which is not a plane, or may soon touch it; see
+    ``triangle_contact.find_touches``.
 
-    A grid's triangles come two a cell, row by row.
+    The triangles of a grid come two to a cell, row by row.
     """
     touches, which, count, rows, chosen, scratch = room
     n, c = x.shape[1], collider.reshape(collider.shape[0])
     r = x.reshape((3, n))
+    # without its thickness, and less the depth that triangles may sink in
     lay_out(collider, scratch)
     least = min(c[R_HALF], min(c[R_HALF + 1], c[R_HALF + 2])) + c[R_RADIUS]
-    radius = c[R_RADIUS] - (c[R_THICKNESS] + x.dtype.type(2 * SINKS) * least)
+    radius = c[R_RADIUS] - (c[R_THICKNESS] + x.dtype.type(2 * SINK) * least)
     scratch[R_RADIUS] = radius
+    # positions in the axes of the solid, and distances from its box
     for e in range(3):
         q = R_AXES + 3 * e
         _to_axis(r[0], r[1], r[2], c[R_POINT], c[R_POINT + 1], c[R_POINT + 2], c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e])
     _distances(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2], rows[P_GAP])
     # the first triangle of the second row of cells begins at the second row of particles
     columns = triangles[0, 2] - 1
+    # triangles that may touch, ``COLUMNS`` at a time: the deepest point of each, and the normal there
     number = _choose_triangles(rows, triangles, columns, radius, chosen, scratch)
     for begin in range(0, number, scratch.shape[1]):
-        some = min(scratch.shape[1], number - begin)
-        _gather_corners(rows, triangles, chosen, begin, some, scratch)
-        if not may_touch_triangle(scratch) or (shapes.kinds[k] == KIND_MESH and not near_in_grid(scratch, shapes, k)):
+        filled = min(scratch.shape[1], number - begin)
+        _gather_corners(rows, triangles, chosen, begin, filled, scratch)
+        if not may_touch_triangle(scratch) or (shapes.kinds[k] == KIND_MESH and not may_touch_mesh(scratch, shapes, k)):
             continue
         if not find_deepest(scratch, shapes, k) or not turn_normal(scratch):
             continue
-        # the plane, as how far it is from the solid's point along the normal
+        # the plane, by its offset from the solid's point along the normal
         for l in range(scratch.shape[1]):
             nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-            if scratch[S_CONTACT, l] < scratch.dtype.type(NONE):
+            if scratch[S_CONTACT, l] < scratch.dtype.type(NO_CONTACT):
                 scratch[S_CONTACT, l] -= nx * scratch[S_SPOT, l] + ny * scratch[S_SPOT + 1, l] + nz * scratch[S_SPOT + 2, l]
         normal_to_world(scratch)
-        for l in range(some):
-            if scratch[S_CONTACT, l] >= scratch.dtype.type(NONE):
+        # write the touches
+        for l in range(filled):
+            if scratch[S_CONTACT, l] >= scratch.dtype.type(NO_CONTACT):
                 continue
             for e in range(3):
                 touches[count[0], e] = scratch[S_WEIGHTS + e, l]
@@ -333,14 +352,15 @@ def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
 
 
 @uncounted
-def press_on_sheet(x, v, w, triangles, colliders, room, h, carried):
-    """Resolve the touches of one sheet, one after the other; see ``surface.press``."""
+def press_touches_on_sheet(x, v, w, triangles, colliders, room, h, carried):
+    """Resolve the touches of one sheet, one after the other; see ``triangle_contact.press_touches``."""
     touches, which, count, _, _, _ = room
     n = x.shape[1]
     r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
     zero, one = x.dtype.type(0), x.dtype.type(1)
     tiny, relaxed = x.dtype.type(TINY), x.dtype.type(RELAXED)
     for t in range(count[0]):
+        # the touch, and the signed distance of its point from its plane
         c = colliders[which[t, 1]]
         i, j, k = triangles[which[t, 0], 0], triangles[which[t, 0], 1], triangles[which[t, 0], 2]
         a, b, d = touches[t, 0], touches[t, 1], touches[t, 2]
@@ -350,13 +370,15 @@ def press_on_sheet(x, v, w, triangles, colliders, room, h, carried):
         gap += nz * (a * r[2, i] + b * r[2, j] + d * r[2, k] - c[R_POINT + 2, 0])
         if not gap < zero:
             continue
+        # velocity of the point relative to the solid, and its inverse mass
         ux = a * s[0, i] + b * s[0, j] + d * s[0, k] - c[R_VELOCITY, 0]
         uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[R_VELOCITY + 1, 0]
         uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[R_VELOCITY + 2, 0]
-        yielding = m[i] * a * a + m[j] * b * b + m[k] * d * d
+        inverse_mass = m[i] * a * a + m[j] * b * b + m[k] * d * d
         mx, my, mz, cx, cy, cz = touch_change(
-            gap, nx, ny, nz, ux, uy, uz, yielding, c[R_FRICTION, 0], h, carried, zero, one, tiny, relaxed
+            gap, nx, ny, nz, ux, uy, uz, inverse_mass, c[R_FRICTION, 0], h, carried, zero, one, tiny, relaxed
         )
+        # correct the corners
         for p, weight in ((i, a), (j, b), (k, d)):
             share = m[p] * weight
             r[0, p] += share * mx
@@ -369,15 +391,17 @@ def press_on_sheet(x, v, w, triangles, colliders, room, h, carried):
 
 @uncounted
 def resolve_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """The same for the whole sheet.
+    """``resolve_particles_on_sheet``, then the sheet between the particles.
 
-    triangles: of the sheet; look: whether to look anew where it touches between its particles.
+    triangles: (triangles, 3).  look: whether to search for touches in this substep.
     """
     resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room)
     count, kinds = room[2], shapes.kinds
+    # search for touches with all solids but planes, which touch particles first
     if look:
         count[0] = 0
         for k in range(kinds.shape[0]):
             if kinds[k] != KIND_PLANE:
                 find_touches_on_sheet(x, triangles, shapes, k, colliders[k], room)
-    press_on_sheet(x, v, w, triangles, colliders, room, h, carried)
+    # resolve them
+    press_touches_on_sheet(x, v, w, triangles, colliders, room, h, carried)

@@ -1,4 +1,4 @@
-"""A collider of any closed shape."""
+"""A collider with the shape of a closed mesh."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from clothgym.triangles import read_triangles
 
 @dataclass(frozen=True, eq=False)
 class MeshCollider(Collider):
-    """A solid whose surface is a closed mesh of triangles, from a file or from arrays.
+    """A solid whose surface is a closed triangle mesh, from a file or from arrays.
 
-    The cloth feels a grid of signed distances that is made once: edges are rounded, and details are lost, at the size of its cells,
-    which have the mesh's longest side divided by ``resolution``.  Walls should be at least two cells thick.
+    Kernels read a grid of signed distances that is built once.  Edges are rounded, and details are lost, at the size of its cells,
+    which is the mesh's longest side divided by ``resolution``.  Walls should be at least two cells thick.
 
     Attributes:
-        path: a mesh file in metres, which trimesh reads.
-        vertices: [m], (vertices, 3), and triangles between them, (triangles, 3), counter-clockwise seen from outside.
-        center: where the mesh's origin is [m].
+        path: a mesh file in meters, which trimesh reads.
+        vertices: [m], (vertices, 3); triangles: between them, (triangles, 3), counter-clockwise seen from outside.
+        center: position of the mesh's origin [m].
         rotation: a quaternion (w, x, y, z) of any length.
-        scale: the mesh is this many times as large.
+        scale: factor on the mesh's size.
         resolution: cells along the longest side.
 
     Raises:
         ImportError: a path without trimesh: ``pip install clothgym[mesh]``.
-        ValueError: what ``Collider`` refuses, neither or both of path and arrays, or no closed surface (see ``checked_solid``).
+        ValueError: as for ``Collider``; neither or both of path and arrays; a surface that is not closed (``checked_solid``).
     """
 
     kind: ClassVar[int] = KIND_MESH
@@ -58,12 +58,12 @@ class MeshCollider(Collider):
         count("MeshCollider resolution", self.resolution)
         if not isinstance(self.path, (str, Path, type(None))):
             kind = type(self.path).__name__
-            raise ValueError(f"MeshCollider path is of type {kind}: must be a file's; give arrays as vertices=..., triangles=...")
+            raise ValueError(f"MeshCollider path is of type {kind}: must be a file name, give arrays as vertices=, triangles=")
         if (self.path is None) == (self.vertices is None or self.triangles is None) or (
             self.path is not None and (self.vertices is not None or self.triangles is not None)
         ):
-            raise ValueError("MeshCollider: give the path of a file, or vertices and triangles")
-        self.grid  # noqa: B018 - a mesh that is no solid is refused here
+            raise ValueError("MeshCollider: give either the path of a file, or vertices and triangles")
+        self.grid  # noqa: B018 - a mesh that is not a solid is refused here
 
     def __repr__(self) -> str:
         shown = (f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if f.name not in ("vertices", "triangles"))
@@ -81,26 +81,27 @@ class MeshCollider(Collider):
 
     @cached_property
     def grid(self) -> DistanceGrid:
+        """The distances to the surface, from a cache if it has them."""
         x, triangles = self.surface
         with self._named():
             return _grid(*_frozen(x, triangles), self.resolution)
 
     @contextmanager
     def _named(self) -> Iterator[None]:
-        """Name the file in what is wrong with its mesh."""
+        """Add the file's name to an error about its mesh."""
         try:
             yield
         except ValueError as error:
             if self.path is None:
                 raise
-            raise ValueError(f"{str(self.path)!r} is no solid: {error}") from error
+            raise ValueError(f"{str(self.path)!r} is not a solid: {error}") from error
 
     def world_vertices(self) -> NDArray[np.float64]:
-        """Where the vertices are as long as the solid has not moved [m], (vertices, 3)."""
+        """Positions of the vertices as long as the solid has not moved [m], (vertices, 3)."""
         return self.surface[0] @ turned("rotation", self.rotation) + np.asarray(self.center)
 
     def fits(self, other: Collider) -> bool:
-        """Whether it is of the same mesh: all environments share one grid of distances."""
+        """Whether the other has the same mesh: all environments share one distance grid."""
         return isinstance(other, MeshCollider) and other.grid is self.grid
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
@@ -110,7 +111,7 @@ class MeshCollider(Collider):
 
 
 class _Bytes:
-    """An array that a cache can look up by what it holds."""
+    """An array that a cache can look up by its contents."""
 
     def __init__(self, array: NDArray) -> None:
         self.array = np.ascontiguousarray(array)

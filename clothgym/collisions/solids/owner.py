@@ -18,12 +18,12 @@ from clothgym.state import Layout, State
 
 
 class Solids:
-    """Solids, each in its place in every environment.
+    """The colliders of a batch, each with its own pose in every environment.
 
     Attributes:
-        colliders: as they were given.
+        colliders: as given.
         shapes: what all environments share.
-        rows, homes: what the kernels know of each now, and at a reset, (block, colliders, COLLIDER_ROWS, lane).
+        rows, homes: numbers that kernels read, now and after a reset, (blocks, colliders, COLLIDER_ROWS, lanes).
     """
 
     def __init__(self, layout: Layout, colliders: Sequence[Collider], time_step: float, dtype: np.dtype) -> None:
@@ -33,24 +33,24 @@ class Solids:
         self.homes: NDArray
 
     def described(self) -> NDArray[np.float64]:
-        """The rows of the colliders as they were given, (colliders, COLLIDER_ROWS)."""
+        """Rows of the colliders as given, (colliders, COLLIDER_ROWS)."""
         return np.array([c.rows() for c in self.colliders]).reshape(-1, COLLIDER_ROWS)
 
     def restore(self, state: State) -> None:
-        """Take over a state's part."""
+        """Take over what a state holds of the colliders."""
         self.rows = self.layout.to_blocks(state.colliders, self.dtype)
         self.homes = self.layout.to_blocks(state.collider_homes, self.dtype)
 
     def public(self) -> dict[str, NDArray]:
-        """A state's part, as fresh copies."""
+        """What a state holds of the colliders, as fresh copies."""
         return {"colliders": self.layout.to_public(self.rows), "collider_homes": self.layout.to_public(self.homes)}
 
     def begin(self, block: NDArray, lane: NDArray) -> None:
-        """Put solids that have moved back to where they began."""
+        """Move the solids of some environments back to where they began."""
         self.rows[block, :, :, lane] = self.homes[block, :, :, lane]
 
     def replace(self, index: int, others: Sequence[Collider], block: NDArray, lane: NDArray) -> None:
-        """Put others of the same family in place of a collider, one an environment."""
+        """Replace collider ``index`` by others of the same kind, one for each environment."""
         check_replacement(self.colliders, index, others, len(block))
         self.rows[block, index, :, lane] = self.homes[block, index, :, lane] = np.array([c.rows() for c in others])
 
@@ -69,28 +69,30 @@ class Solids:
         self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 
     def end_step(self) -> None:
-        """What was on its way to a target has arrived, and goes on as it was told."""
+        """Colliders have reached their targets: each goes on with its velocity for afterwards."""
         self.rows[:, :, R_VELOCITY : R_VELOCITY + 3] = self.rows[:, :, R_AFTER : R_AFTER + 3]
 
     def positions(self) -> NDArray:
-        """Where each is [m]: the centre, or a plane's point, (num_envs, colliders, 3)."""
+        """Position of each collider [m]: its center, or a point of a plane, (num_envs, colliders, 3)."""
         return self.layout.to_public(self.rows[:, :, R_POINT : R_POINT + 3])
 
     def contacts(self, x: NDArray) -> Contacts:
-        """Signed distance of each particle to the nearest collider [m], and which it is; x in blocks."""
+        """Signed distance from each particle to the nearest collider [m], and which one that is; x: in blocks [m]."""
         return contacts(self.layout, x, self.shapes, self.rows)
 
     def penetration(self, x: NDArray, surface: SurfaceArrays) -> NDArray:
-        """How deep the deepest point of the sheet's triangles is in the colliders' surface [m], (num_envs,); x in blocks."""
+        """Depth of the deepest point of the sheet's triangles in the colliders [m], (num_envs,); x: in blocks [m]."""
         out = np.zeros((self.layout.blocks, self.layout.lanes), x.dtype)
         deepest(0, self.layout.blocks, x, surface.triangles, self.shapes, self.rows, out)
         return self.layout.to_public(out)
 
 
 def _shapes(colliders: Sequence[Collider], dtype: np.dtype) -> Shapes:
+    """The kinds and distance grids of the colliders, for the kernels."""
     nodes: list[NDArray] = [np.zeros((0, 4))]
     first, sizes, corners, cells = [], [], [], []
     count = 0
+    # all grids lie in one array, one after the other; other kinds have none
     for collider in colliders:
         first.append(count)
         grid = collider.grid if isinstance(collider, MeshCollider) else None

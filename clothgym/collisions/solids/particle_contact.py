@@ -1,7 +1,7 @@
-"""Contact of sheets with solids: no penetration, no inward velocity, Coulomb friction (see ``contact_law``).
+"""Contact of sheets with solids in lanes: of the particles here, of the triangles in ``triangle_contact``.
 
-Applied after each substep to the positions and velocities that the integrator left, of the particles and of the sheet between them
-(``triangle_contact``).  For one sheet whose particles lie side by side the same is in ``grid_contact``.
+The contact law (``contact_law``) is applied after each substep to the positions and velocities that the integrator left.  For one
+sheet whose particles lie side by side the same is in ``grid_contact``.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from clothgym.collisions.solids.grid_contact import resolve_on_sheet, resolve_pa
 from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_POINT, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import (
     S_CONTACT,
+    S_INVERSE_MASS,
     S_MOTION,
     S_SPOT,
-    S_YIELDING,
     SCRATCH_ROWS,
     Shapes,
     lay_out,
@@ -32,35 +32,39 @@ from clothgym.collisions.solids.signed_distance import (
     normal_to_world,
     to_axes,
 )
-from clothgym.collisions.solids.triangle_contact import any_near, find_touches, press_touches, room_for_touches
+from clothgym.collisions.solids.triangle_contact import find_touches, may_touch_sheet, press_touches, room_for_touches
 from clothgym.state import Layout
 
 
 @inlined
 def _push_particle_out(x, v, w, p, carried, scratch):
-    """Correct the position and velocity of particle ``p``, for the contact on the scratch."""
+    """Apply the contact law to particle p, for the distance and normal in S_CONTACT."""
     zero = x.dtype.type(0)
     one = x.dtype.type(1)
     tiny = x.dtype.type(TINY)
+    # its velocity and inverse mass
     for c in range(3):
         for l in range(x.shape[2]):
             scratch[S_MOTION + c, l] = v[c, p, l]
     for l in range(x.shape[2]):
-        scratch[S_YIELDING, l] = w[p, l]
+        scratch[S_INVERSE_MASS, l] = w[p, l]
+    # the changes: of position to S_SPOT, of velocity to S_MOTION
     for l in range(x.shape[2]):
         nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
         ux = scratch[S_MOTION, l] - scratch[R_VELOCITY, l]
         uy = scratch[S_MOTION + 1, l] - scratch[R_VELOCITY + 1, l]
         uz = scratch[S_MOTION + 2, l] - scratch[R_VELOCITY + 2, l]
         mx, my, mz, cx, cy, cz = contact_change(
-            scratch[S_CONTACT, l], nx, ny, nz, ux, uy, uz, scratch[S_YIELDING, l], scratch[R_FRICTION, l], carried, zero, one, tiny
-        )
+            scratch[S_CONTACT, l], nx, ny, nz, ux, uy, uz, scratch[S_INVERSE_MASS, l], scratch[R_FRICTION, l], carried, zero, one,
+            tiny,
+        )  # fmt: skip
         scratch[S_SPOT, l] = mx
         scratch[S_SPOT + 1, l] = my
         scratch[S_SPOT + 2, l] = mz
         scratch[S_MOTION, l] = cx
         scratch[S_MOTION + 1, l] = cy
         scratch[S_MOTION + 2, l] = cz
+    # apply them
     for c in range(3):
         for l in range(x.shape[2]):
             x[c, p, l] += scratch[S_SPOT + c, l]
@@ -69,7 +73,7 @@ def _push_particle_out(x, v, w, p, carried, scratch):
 
 
 def _resolve_solid(x, v, w, collider, shapes, k, carried, scratch):
-    """Resolve the contacts of one block's particles with the solid on the scratch."""
+    """Resolve the contacts of one block's particles with solid k, whose rows are in the scratch."""
     for p in range(x.shape[1]):
         if may_touch(x, p, collider):  # noqa: F821
             to_axes(x, p, scratch, S_SPOT)
@@ -78,7 +82,7 @@ def _resolve_solid(x, v, w, collider, shapes, k, carried, scratch):
             _push_particle_out(x, v, w, p, carried, scratch)
 
 
-# one for each family: a branch inside the loop costs a single environment as much as the contact itself
+# one for each kind: a branch in the loop costs a single environment as much as the contact itself
 _resolve_plane = specialize(_resolve_solid, "resolve_plane", may_touch=may_touch_plane, measure_solid=measure_plane)
 _resolve_rounded_box = specialize(
     _resolve_solid, "resolve_rounded_box", may_touch=may_touch_solid, measure_solid=measure_rounded_box
@@ -88,20 +92,21 @@ _resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_s
 
 @apart
 def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """Resolve the contacts of one block's particles after a substep of ``h`` [s], and move the solids on by their velocity.
+    """Move the solids of one block on, and resolve its particles' contacts with them after a substep.
 
-    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes), held particles are left alone; colliders: rows of
-    ``shapes``, (colliders, COLLIDER_ROWS, lanes); carried: how long the velocity that friction takes has moved the positions
-    already [s];
-    room: of ``room_in_lanes``.  The others are for ``resolve``.
+    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes); attached particles are left alone.
+    colliders: rows, (colliders, COLLIDER_ROWS, lanes).  h: the substep [s].  carried: time for which the velocity has already moved
+    the positions [s].  room: from ``room_in_lanes``.  triangles and look are for ``resolve``.
     """
     kinds, scratch = shapes.kinds, room[1]
     for k in range(kinds.shape[0]):
         collider = colliders[k]
+        # move the solid by its velocity
         for c in range(3):
             for l in range(x.shape[2]):
                 collider[R_POINT + c, l] += h * collider[R_VELOCITY + c, l]
         lay_out(collider, scratch)
+        # its contacts
         if kinds[k] == KIND_PLANE:
             _resolve_plane(x, v, w, collider, shapes, k, carried, scratch)
         elif kinds[k] == KIND_ROUNDED_BOX:
@@ -112,35 +117,37 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, r
 
 @apart
 def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """The same for the whole sheet.
+    """``resolve_particles``, then the sheet between the particles.
 
-    triangles: of the sheet; look: whether to look anew where it touches between its particles.
+    triangles: (triangles, 3).  look: whether to search for touches in this substep.
     """
     resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room)
     touches, scratch = room
     kinds = shapes.kinds
+    # search for touches with all solids but planes, which touch particles first
     if look:
         touches[2][0] = 0
         for k in range(kinds.shape[0]):
-            if kinds[k] != KIND_PLANE and any_near(x, colliders[k], scratch):
+            if kinds[k] != KIND_PLANE and may_touch_sheet(x, colliders[k], scratch):
                 lay_out(colliders[k], scratch)
                 find_touches(x, triangles, shapes, k, touches, scratch)
+    # resolve them
     press_touches(x, v, w, triangles, colliders, touches, h, carried, scratch)
 
 
 @kernel
 def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """The same where there are no solids."""
+    """``resolve`` without solids."""
 
 
 @kernel
 def room_in_lanes(x, triangles, shapes):
-    """Room for contact of one block, in lanes: touches, and a scratch."""
+    """Room for contact of one block, in lanes: for its touches, and scratch, (SCRATCH_ROWS, lanes)."""
     return room_for_touches(x, triangles, shapes), np.empty((SCRATCH_ROWS, x.shape[2]), x.dtype)
 
 
-# the names that the main loop calls, for contact with the sheet, with its particles alone, and with nothing: in lanes, and for one
-# sheet whose particles lie side by side
+# contact with the sheet, with its particles alone, and with nothing: in lanes (False), and for one sheet whose particles lie side
+# by side (True)
 KERNELS = {
     False: {"sheet": resolve, "particles": resolve_particles, "nothing": resolve_nothing},
     True: {"sheet": resolve_on_sheet, "particles": resolve_particles_on_sheet, "nothing": resolve_nothing},
@@ -149,12 +156,12 @@ ROOM = {False: room_in_lanes, True: room_on_sheet}
 
 
 def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
-    """Kernels of contact by the names that the main loop calls them by."""
+    """Kernels of contact, by the names under which the main loop calls them."""
     return {"resolve": KERNELS[by_particle][contact], "room_for_contact": ROOM[by_particle]}
 
 
 def needed(contact: str, kinds: NDArray) -> str:
-    """The least of ``KERNELS`` that does for solids of these kinds: less is to be compiled.  A plane touches particles first."""
+    """The least of ``KERNELS`` that solids of these kinds need, so that less is compiled; a plane touches particles first."""
     if not len(kinds):
         return "nothing"
     return contact if np.any(kinds != KIND_PLANE) else "particles"
@@ -162,7 +169,7 @@ def needed(contact: str, kinds: NDArray) -> str:
 
 @kernel
 def signed_distances(first, last, x, shapes, colliders, out):
-    """Signed distance of every particle to every collider [m], (blocks, colliders, particles, lanes)."""
+    """Signed distance of each particle to each collider [m]: ``out``, (blocks, colliders, particles, lanes)."""
     for b in range(first, last):
         scratch = np.empty((SCRATCH_ROWS, x.shape[3]), x.dtype)
         for k in range(colliders.shape[1]):
@@ -173,14 +180,14 @@ def signed_distances(first, last, x, shapes, colliders, out):
 
 
 class Contacts(NamedTuple):
-    """Contact of particles with colliders: signed distance to the nearest [m], and which it is, (num_envs, particles)."""
+    """Signed distance of particles to the nearest collider [m], inf without any, and its index, or -1, (num_envs, particles)."""
 
     distance: NDArray
     collider: NDArray
 
 
 def contacts(layout: Layout, x: NDArray, shapes: Shapes, colliders: NDArray) -> Contacts:
-    """Those of a batch; x and colliders in blocks."""
+    """Signed distances of a batch; x, (blocks, 3, particles, lanes) [m], and colliders in blocks."""
     count = colliders.shape[1]
     if not count:
         shape = (layout.num_envs, x.shape[2])

@@ -1,4 +1,4 @@
-"""How deep the sheet's surface is in the solids, without the thickness that contact keeps; on request only."""
+"""Penetration: how deep the sheet's surface lies in the solids, without the thickness that contact keeps; on request only."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from clothgym.collisions.solids.signed_distance import (
     to_axes,
 )
 
-FINENESS = 4  # points of a triangle with weights in quarters: 15
+FINENESS = 4  # parts of a triangle's sides: 15 points with weights in quarters
 
 
 @kernel
 def deepest(first, last, x, triangles, shapes, colliders, out):
-    """Depth of the deepest point of each lane's triangles in any collider [m], at least 0, (blocks, lanes).
+    """Depth of the deepest point of each lane's triangles in any collider [m], at least 0: ``out``, (blocks, lanes).
 
-    Of the triangle's points with weights in quarters, the deepest is where ``find_deepest`` begins; the deeper of both counts.
+    Of the points of a triangle with weights in quarters, the deepest is where ``find_deepest`` starts.  The deeper of both counts.
     """
     zero = x.dtype.type(0)
     for b in range(first, last):
@@ -35,6 +35,7 @@ def deepest(first, last, x, triangles, shapes, colliders, out):
         for k in range(colliders.shape[1]):
             lay_out(colliders[b, k], scratch)
             for t in range(triangles.shape[0]):
+                # the triangle in the solid's axes, and the deepest of fifteen points
                 for c in range(3):
                     to_axes(x[b], triangles[t, c], scratch, S_CORNERS + 3 * c)
                 scratch[S_CLEAR] = 0
@@ -42,17 +43,19 @@ def deepest(first, last, x, triangles, shapes, colliders, out):
                 for i in range(FINENESS + 1):
                     for j in range(FINENESS + 1 - i):
                         _sample(scratch, i, j, shapes, k, start)
+                # from there to the deepest of all; at a plane that is a corner
                 scratch[S_SPOT : S_SPOT + 3] = start[1:4]
                 if shapes.kinds[k] != KIND_PLANE and find_deepest(scratch, shapes, k):
                     for l in range(x.shape[3]):
                         start[0, l] = min(start[0, l], scratch[S_CONTACT, l])
+                # depth below the surface itself
                 for l in range(x.shape[3]):
                     out[b, l] = max(out[b, l], max(-(start[0, l] + scratch[R_THICKNESS, l]), zero))
 
 
 @kernel
 def _sample(scratch, i, j, shapes, k, best):
-    """Keep the point with weights ``i`` and ``j`` quarters where it is deeper than the best: distance and place, (4, lanes)."""
+    """Replace ``best``, distance and position, (4, lanes), where the point with weights i, j and the rest in quarters is deeper."""
     u, v = scratch.dtype.type(i / FINENESS), scratch.dtype.type(j / FINENESS)
     w = scratch.dtype.type((FINENESS - i - j) / FINENESS)
     for c in range(3):

@@ -1,8 +1,8 @@
-"""Colliders as people describe them, and as rows of numbers for the kernel.
+"""Colliders as users describe them, and as rows of numbers for the kernels.
 
-Sphere, capsule and box are one shape: a box with half sides b, swept by a ball of radius r.  A sphere has b = 0, a capsule
-b = (0, 0, half its straight part), a box r = 0.  One distance function serves them all without a branch, and each lane of a
-batch may have another shape in the same slot.  Thickness adds to r.
+Sphere, capsule and box are one shape, a rounded box: a box with half sides b, swept by a ball of radius r.  A sphere has b = 0, a
+capsule b = (0, 0, half its straight part), a box r = 0.  One distance function serves them all without a branch, and each lane of
+a batch may have another of these shapes in the same slot.  The thickness is added to r.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import finite, members, number, vector
 
-# rows of a collider: a point of it, its axes (x axis, y axis, z axis), half sides b, radius r with the thickness in it, friction,
-# velocity, the square of the distance from the point beyond which nothing can touch it, thickness, and the velocity that it will
-# have after the next control step
+# rows of a collider: a point of it; its x, y and z axes; half sides b; radius r with the thickness; friction; velocity; squared
+# distance from the point beyond which nothing touches it; thickness; velocity after the next control step
 R_POINT, R_AXES, R_HALF, R_RADIUS, R_FRICTION, R_VELOCITY, R_REACH2, R_THICKNESS, R_AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
 COLLIDER_ROWS = 25
 
@@ -32,16 +31,16 @@ UNTURNED: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Collider:
-    """What all colliders share.
+    """Base of all colliders.
 
     Attributes:
         friction: Coulomb's coefficient between cloth and solid.
         thickness: distance at which the cloth rests on the surface [m].
-        velocity: of the solid [m/s]; it moves, and drags the cloth.  ``Simulation.move_colliders`` changes it.
+        velocity: of the solid, which carries the cloth along [m/s].  ``Simulation.move_colliders`` changes it.
 
     Raises:
-        ValueError: a size that is not positive, a friction or thickness below zero, a vector that is not three finite
-            numbers, or a direction or rotation of length zero.
+        ValueError: a size that is not positive, a negative friction or thickness, a vector that is not three finite numbers, or a
+            direction or rotation of length zero.
     """
 
     kind: ClassVar[int]
@@ -67,7 +66,7 @@ class Collider:
                 raise ValueError(f"{type(self).__name__} {name}={size!r}: must be positive")
 
     def rows(self) -> NDArray[np.float64]:
-        """The numbers the kernel reads, (COLLIDER_ROWS,)."""
+        """The numbers that kernels read, (COLLIDER_ROWS,)."""
         rows = np.zeros(COLLIDER_ROWS)
         rows[R_AXES], rows[R_AXES + 4], rows[R_AXES + 8] = 1, 1, 1
         rows[R_FRICTION] = self.friction
@@ -78,17 +77,17 @@ class Collider:
         return rows
 
     def fits(self, other: Collider) -> bool:
-        """Whether the other can take its place in some environments of a batch."""
+        """Whether the other can take this one's place in some environments of a batch."""
         return other.kind == self.kind
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
-        """Write the rows that are the shape's own."""
+        """Write the rows that depend on the shape."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Plane(Collider):
-    """A half-space: the solid lies below ``point`` against ``normal``."""
+    """A half-space: the solid lies on the side of ``point`` that ``normal`` points away from."""
 
     kind: ClassVar[int] = KIND_PLANE
     point: Vector = (0.0, 0.0, 0.0)
@@ -97,7 +96,7 @@ class Plane(Collider):
     def __post_init__(self) -> None:
         super().__post_init__()
         if np.linalg.norm(self.normal) == 0:
-            raise ValueError(f"Plane normal={self.normal!r}: must have a length")
+            raise ValueError(f"Plane normal={self.normal!r}: must not be zero")
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         rows[R_POINT : R_POINT + 3] = self.point
@@ -137,7 +136,7 @@ class Capsule(Collider):
         if self.height < 2 * self.radius:
             raise ValueError(f"Capsule height={self.height!r}: must be at least twice the radius {self.radius!r}")
         if np.linalg.norm(self.axis) == 0:
-            raise ValueError(f"Capsule axis={self.axis!r}: must have a length")
+            raise ValueError(f"Capsule axis={self.axis!r}: must not be zero")
 
     def _shape(self, rows: NDArray[np.float64]) -> None:
         rows[R_POINT : R_POINT + 3] = self.center
@@ -148,9 +147,9 @@ class Capsule(Collider):
 
 @dataclass(frozen=True)
 class Box(Collider):
-    """A box; its thickness rounds the edges.
+    """A box, whose edges the thickness rounds.
 
-    It is turned by ``yaw`` about z [rad], and then by ``rotation``, a quaternion (w, x, y, z) of any length.
+    It is rotated by ``yaw`` about z [rad], and then by ``rotation``, a quaternion (w, x, y, z) of any length.
     """
 
     kind: ClassVar[int] = KIND_ROUNDED_BOX
@@ -172,7 +171,7 @@ class Box(Collider):
 
 
 def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:
-    """The axes of a solid that a quaternion (w, x, y, z) of any length has turned, (3, 3), an axis a row.
+    """Axes of a solid rotated by a quaternion (w, x, y, z) of any length, (3, 3), one axis in each row.
 
     Raises:
         ValueError: not four finite numbers, or all zero.
@@ -192,13 +191,13 @@ def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:
 
 @lru_cache
 def _axes_of(*quaternion: float) -> NDArray[np.float64]:
-    """The same; not to be written to."""
+    """The same from a cache: do not write to it."""
     return turned("rotation", quaternion)
 
 
 @lru_cache
 def _axes_along(*direction: float) -> NDArray[np.float64]:
-    """Axes of which the third has the given direction, x axis, y axis, z axis, (9,); not to be written to."""
+    """x, y and z axis, the third along the given direction, (9,), from a cache: do not write to it."""
     z = np.array(direction) / np.linalg.norm(direction)
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
@@ -206,16 +205,16 @@ def _axes_along(*direction: float) -> NDArray[np.float64]:
 
 
 def check_index(colliders: Sequence[Collider], index: int) -> None:
-    """Refuse an index that no collider has."""
+    """Raise ValueError for an index that no collider has."""
     if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(colliders):
         raise ValueError(f"index={index!r}: this simulation has {len(colliders)} colliders")
 
 
 def check_replacement(colliders: Sequence[Collider], index: int, others: Sequence[Collider], envs: int) -> None:
-    """Refuse solids, one an environment, that cannot take the place of collider ``index``.
+    """Refuse solids, one for each environment, that cannot take the place of collider ``index``.
 
     Raises:
-        ValueError: there is no such collider, the number is wrong, or they are of another family.
+        ValueError: there is no such collider, the number is wrong, or they are of another kind.
     """
     check_index(colliders, index)
     members("colliders", others, Collider, f"{envs} colliders, one for each environment")

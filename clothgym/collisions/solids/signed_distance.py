@@ -1,11 +1,11 @@
 """Signed distance to one solid and its outward normal, in lanes.
 
-A solid is known by rows of numbers that each lane has for itself (``shapes``), and a mesh also by a grid of distances that all
-lanes share (``distance_grid``).
+A solid is described by rows of numbers, one value for each lane (``shapes``), and a mesh also by a distance grid that all lanes
+share (``distance_grid``).
 
-The kernels work at a scratch: one array, (SCRATCH_ROWS, lanes), that begins with a copy of the solid's rows and goes on with
-points, normals and what else they need.  Loops over rows of one array are vectorised; over those of many, LLVM would have to test
-too many pairs for overlap at run time, and gives up.
+The kernels work in a scratch array, (SCRATCH_ROWS, lanes), which starts with a copy of the solid's rows, followed by points,
+normals and other intermediate results.  Loops over rows of one array are vectorized; over rows of many arrays LLVM would have to
+test too many pairs for overlap at run time, and gives up.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from clothgym.collisions.solids.shapes import (
     R_REACH2,
 )
 
-# the scratch's rows after the solid's: a triangle's corners, a point, and one of the solid's core, all in its axes; barycentric
-# weights; signed distance and normal of contact; depth of the core; a velocity with its inverse mass; what surely does not touch
+# rows of the scratch after those of the solid: a triangle's corners, a point, and a point of the solid's core, all in its axes;
+# barycentric weights; signed distance and normal of contact; depth of the core; a velocity; an inverse mass; whether the lane is
+# clear, that is surely without contact; and the point before the last two rounds of a search
 S_CORNERS, S_SPOT, S_CORE, S_WEIGHTS = COLLIDER_ROWS, COLLIDER_ROWS + 9, COLLIDER_ROWS + 12, COLLIDER_ROWS + 15
-S_CONTACT, S_RHO, S_MOTION, S_YIELDING, S_CLEAR = (
+S_CONTACT, S_RHO, S_MOTION, S_INVERSE_MASS, S_CLEAR = (
     COLLIDER_ROWS + 18,
     COLLIDER_ROWS + 22,
     COLLIDER_ROWS + 23,
@@ -40,15 +41,15 @@ S_CONTACT, S_RHO, S_MOTION, S_YIELDING, S_CLEAR = (
 S_BEFORE, S_BETWEEN = COLLIDER_ROWS + 28, COLLIDER_ROWS + 31
 SCRATCH_ROWS = COLLIDER_ROWS + 34
 
-FAINT = 1e-3  # a gradient of the grid that is shorter than this has no direction to speak of
+LEAST_GRADIENT = 1e-3  # length below which the grid's gradient has no reliable direction
 
 
 class Shapes(NamedTuple):
-    """What the kernels must know of the colliders beside their rows.
+    """What kernels read of the colliders besides their rows.
 
-    kinds: the family of each, (colliders,).
-    nodes: distance [m] and gradient at the nodes of all grids, (nodes, 4), and each grid's first one, (colliders,).
-    sizes: nodes of each grid along x, y, z, (colliders, 3).  corners: its lowest corner in the solid's axes [m], (colliders, 3).
+    kinds: of each, (colliders,).
+    nodes: distance [m] and gradient at the nodes of all grids, (nodes, 4); first: index of each grid's first node, (colliders,).
+    sizes: nodes of each grid along x, y and z, (colliders, 3); corners: its lowest corner in the solid's axes [m], (colliders, 3).
     cells: its spacing [m], (colliders,).
     """
 
@@ -62,7 +63,7 @@ class Shapes(NamedTuple):
 
 @inlined
 def may_touch_plane(x, p, collider):
-    """Whether particle ``p`` of any lane is below a plane.  It only decides whether work can be skipped."""
+    """Whether particle p of any lane is below a plane; only used to skip work."""
     near = False
     for l in range(x.shape[2]):
         height = x.dtype.type(0)
@@ -74,7 +75,7 @@ def may_touch_plane(x, p, collider):
 
 @inlined
 def may_touch_solid(x, p, collider):
-    """Whether particle ``p`` of any lane is inside another solid's bound."""
+    """Whether particle p of any lane is within the bounding sphere of a solid that is not a plane; only used to skip work."""
     near = False
     for l in range(x.shape[2]):
         dx = x[0, p, l] - collider[R_POINT, l]
@@ -86,7 +87,7 @@ def may_touch_solid(x, p, collider):
 
 @kernel
 def lay_out(collider, scratch):
-    """Copy a solid's rows to the scratch, the same to all columns if it is one environment's; the scratch is clear of nothing."""
+    """Copy a solid's rows, (rows, lanes), to the scratch, those of a single lane to all columns; mark all lanes as not clear."""
     last = collider.shape[1] - 1
     for r in range(collider.shape[0]):
         for l in range(scratch.shape[1]):
@@ -97,7 +98,7 @@ def lay_out(collider, scratch):
 
 @inlined
 def to_axes(x, p, scratch, at):
-    """Write particle ``p`` of x, in the world, (3, particles, lanes), to three rows of the scratch, in the solid's axes."""
+    """Write particle p of x, (3, particles, lanes) [m], in the solid's axes to three rows of the scratch from ``at`` on."""
     for c in range(3):
         for l in range(scratch.shape[1]):
             scratch[at + c, l] = x[c, p, l] - scratch[R_POINT + c, l]
@@ -110,7 +111,7 @@ def to_axes(x, p, scratch, at):
 
 @inlined
 def normal_to_world(scratch):
-    """Turn the normal of contact from the solid's axes to the world's."""
+    """Rotate the normal in S_CONTACT from the solid's axes to the world's."""
     for l in range(scratch.shape[1]):
         nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
         scratch[S_CONTACT + 1, l] = nx * scratch[R_AXES, l] + ny * scratch[R_AXES + 3, l] + nz * scratch[R_AXES + 6, l]
@@ -120,10 +121,10 @@ def normal_to_world(scratch):
 
 @kernel
 def measure(scratch, at, shapes, k, within):
-    """Write signed distance [m] and outward unit normal, in the solid's axes, of the point in three rows of the scratch to
-    S_CONTACT.
+    """Signed distance [m] and outward unit normal, in the solid's axes, of the point in three rows of the scratch from ``at`` on,
+    to S_CONTACT.
 
-    A mesh leaves out the normal where the distance is not less than ``within``, and lanes that are clear.
+    A mesh leaves out the normal where the distance is not below ``within`` [m], and skips lanes that are clear.
     """
     kind = shapes.kinds[k]
     if kind == KIND_PLANE:
@@ -136,7 +137,7 @@ def measure(scratch, at, shapes, k, within):
 
 @inlined
 def measure_plane(scratch, at, shapes, k, within):
-    """The height above it."""
+    """``measure`` at a plane: the height above it."""
     for l in range(scratch.shape[1]):
         scratch[S_CONTACT, l] = scratch[at + 2, l] - scratch[R_RADIUS, l]
         scratch[S_CONTACT + 1, l] = 0
@@ -146,22 +147,25 @@ def measure_plane(scratch, at, shapes, k, within):
 
 @inlined
 def measure_mesh(scratch, at, shapes, k, within):
-    """What its grid says."""
+    """``measure`` at a mesh, by its grid."""
     _, nodes, first, sizes, corners, cells = shapes
     _measure_in_grid(scratch, at, nodes[first[k] :], sizes[k], corners[k], cells[k], within)
 
 
 @inlined
 def rounded_box(qx, qy, qz, hx, hy, hz, radius, zero, one):
-    """Signed distance and normal of a point q, with a = |q| - h: outside the inner box the distance is ``|max(a, 0)| - r``, inside
-    it ``max(a) - r``."""
+    """Signed distance [m] and outward normal of a point q at a rounded box with half sides h and radius r.
+
+    With a = |q| - h, the distance is ``|max(a, 0)| - r`` outside the inner box and ``max(a) - r`` inside it.
+    """
+    # distances to the faces of the inner box
     ax, ay, az = abs(qx) - hx, abs(qy) - hy, abs(qz) - hz
     ox, oy, oz = max(ax, zero), max(ay, zero), max(az, zero)
     outside = np.sqrt(ox * ox + oy * oy + oz * oz)
     deepest = max(ax, max(ay, az))
     beyond = outside > zero
     scale = one / outside if beyond else one
-    # inside, the normal is that of the nearest face
+    # inside, the normal is that of the closest face; outside, it points from the closest point
     fx = one if ax >= deepest else zero
     fy = one if (ay >= deepest and ax < deepest) else zero
     fz = one - fx - fy
@@ -173,7 +177,7 @@ def rounded_box(qx, qy, qz, hx, hy, hz, radius, zero, one):
 
 @inlined
 def measure_rounded_box(scratch, at, shapes, k, within):
-    """See ``rounded_box``."""
+    """``measure`` at a rounded box."""
     zero, one = scratch.dtype.type(0), scratch.dtype.type(1)
     for l in range(scratch.shape[1]):
         hx, hy, hz, radius = scratch[R_HALF, l], scratch[R_HALF + 1, l], scratch[R_HALF + 2, l], scratch[R_RADIUS, l]
@@ -185,8 +189,8 @@ def measure_rounded_box(scratch, at, shapes, k, within):
 
 
 @kernel
-def _between(grid, node, ny, nz, tx, ty, tz, c):
-    """Trilinear value of column ``c`` in the cell above ``node``."""
+def _interpolate(grid, node, ny, nz, tx, ty, tz, c):
+    """Trilinear value of column c in the cell above ``node``, at t from 0 to 1; ny, nz: nodes along y and z."""
     low = grid[node, c] + tz * (grid[node + 1, c] - grid[node, c])
     high = grid[node + nz, c] + tz * (grid[node + nz + 1, c] - grid[node + nz, c])
     near = low + ty * (high - low)
@@ -198,38 +202,42 @@ def _between(grid, node, ny, nz, tx, ty, tz, c):
 
 @kernel
 def _measure_in_grid(scratch, at, grid, size, corner, cell, within):
-    """Trilinear distance and, where that is less than ``within``, gradient; lanes that are clear are passed over.
+    """Trilinear distance and, where that is below ``within``, normalized gradient, to S_CONTACT; lanes that are clear are skipped.
 
-    Beyond the grid, with c the nearest point of it, ``sqrt(d(c)^2 + |q - c|^2)``, which is never more than the distance: the
-    angle at c between q and the surface is at least a right one.
+    Outside the grid, with c its closest point, ``sqrt(d(c)^2 + |q - c|^2)``.  That is never more than the distance: the angle at c
+    between q and the surface is at least a right angle.
     """
-    zero, one, faint = scratch.dtype.type(0), scratch.dtype.type(1), scratch.dtype.type(FAINT)
+    zero, one, faint = scratch.dtype.type(0), scratch.dtype.type(1), scratch.dtype.type(LEAST_GRADIENT)
     nx, ny, nz = size[0], size[1], size[2]
     last_x, last_y, last_z = scratch.dtype.type(nx - 1), scratch.dtype.type(ny - 1), scratch.dtype.type(nz - 1)
     per_cell = one / cell
     for l in range(scratch.shape[1]):
         if scratch[S_CLEAR, l] != zero:
             continue
+        # the point in cells from the corner
         gx, gy = (scratch[at, l] - corner[0]) * per_cell, (scratch[at + 1, l] - corner[1]) * per_cell
         gz = (scratch[at + 2, l] - corner[2]) * per_cell
-        # what is not finite ends at zero
+        # its closest point in the grid; NaN becomes zero
         cx, cy, cz = gx if gx > zero else zero, gy if gy > zero else zero, gz if gz > zero else zero
         cx, cy, cz = cx if cx < last_x else last_x, cy if cy < last_y else last_y, cz if cz < last_z else last_z
+        # the cell, and the position within it
         i, j, k = min(int(cx), nx - 2), min(int(cy), ny - 2), min(int(cz), nz - 2)
         tx, ty, tz = cx - scratch.dtype.type(i), cy - scratch.dtype.type(j), cz - scratch.dtype.type(k)
         node = (i * ny + j) * nz + k
-        distance = _between(grid, node, ny, nz, tx, ty, tz, 0)
+        # the distance, and what lies outside the grid
+        distance = _interpolate(grid, node, ny, nz, tx, ty, tz, 0)
         dx, dy, dz = (gx - cx) * cell, (gy - cy) * cell, (gz - cz) * cell
         beyond = dx * dx + dy * dy + dz * dz
         if beyond > zero:
             inner = max(distance, zero)
             distance = np.sqrt(inner * inner + beyond)
         scratch[S_CONTACT, l] = distance - scratch[R_RADIUS, l]
+        # the normal
         ux, uy, uz = zero, zero, one
         if scratch[S_CONTACT, l] < within:
-            ux = _between(grid, node, ny, nz, tx, ty, tz, 1)
-            uy = _between(grid, node, ny, nz, tx, ty, tz, 2)
-            uz = _between(grid, node, ny, nz, tx, ty, tz, 3)
+            ux = _interpolate(grid, node, ny, nz, tx, ty, tz, 1)
+            uy = _interpolate(grid, node, ny, nz, tx, ty, tz, 2)
+            uz = _interpolate(grid, node, ny, nz, tx, ty, tz, 3)
             if beyond > zero:
                 ux, uy, uz = inner * ux + dx, inner * uy + dy, inner * uz + dz
             length = np.sqrt(ux * ux + uy * uy + uz * uz)
@@ -242,7 +250,7 @@ def _measure_in_grid(scratch, at, grid, size, corner, cell, within):
 
 @kernel
 def measure_in_world(x, p, scratch, shapes, k):
-    """Write signed distance [m], and outward unit normal where it is negative, of particle ``p`` to S_CONTACT."""
+    """Signed distance [m] of particle p to S_CONTACT, and its outward unit normal in the world where it is negative."""
     to_axes(x, p, scratch, S_SPOT)
     measure(scratch, S_SPOT, shapes, k, x.dtype.type(0))
     normal_to_world(scratch)
