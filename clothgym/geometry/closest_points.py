@@ -1,4 +1,4 @@
-"""Closest points, in scalars."""
+"""Closest points on triangles and segments, in scalars."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from clothgym._jit import kernel
 def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
     """Barycentric weights of the point of triangle abc closest to p (Ericson, Real-Time Collision Detection, 2005, 5.1.5).
 
-    An edge without length is passed over: the others say the same.
+    An edge without length is skipped: the others give the same point.
     """
+    # the regions of the corners a, b and c
     abx, aby, abz = bx - ax, by - ay, bz - az
     acx, acy, acz = cx - ax, cy - ay, cz - az
     apx, apy, apz = px - ax, py - ay, pz - az
@@ -28,6 +29,7 @@ def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
     d6 = acx * cpx + acy * cpy + acz * cpz
     if d6 >= 0.0 and d5 <= d6:
         return 0.0, 0.0, 1.0
+    # the regions of the edges ab, ca and bc
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0 and d1 > d3:
         t = d1 / (d1 - d3)
@@ -40,6 +42,7 @@ def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
     if va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
         t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
         return 0.0, 1.0 - t, t
+    # the inside
     scale = 1.0 / (va + vb + vc)
     v, w = vb * scale, vc * scale
     return 1.0 - v - w, v, w
@@ -47,7 +50,7 @@ def closest_on_triangle(px, py, pz, ax, ay, az, bx, by, bz, cx, cy, cz):
 
 @kernel
 def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
-    """Where on segments ab and cd they are closest, each from 0 to 1 (Ericson 2005, 5.1.9)."""
+    """Parameters s, t in [0, 1] of the closest points of segments ab and cd (Ericson 2005, 5.1.9)."""
     ux, uy, uz = bx - ax, by - ay, bz - az
     vx, vy, vz = dx - cx, dy - cy, dz - cz
     rx, ry, rz = ax - cx, ay - cy, az - cz
@@ -56,9 +59,10 @@ def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
     f = vx * rx + vy * ry + vz * rz
     c = ux * rx + uy * ry + uz * rz
     b = ux * vx + uy * vy + uz * vz
+    # on the lines, with the first point within its segment
     denominator = a * e - b * b
     s = min(max((b * f - c * e) / denominator, 0.0), 1.0) if denominator > 0.0 else 0.0
-    # of an edge without length the end does
+    # clamp the second point, then recompute the first; a segment without length is its end
     t = (b * s + f) / e if e > 0.0 else -1.0
     if t < 0.0:
         t = 0.0
@@ -71,11 +75,11 @@ def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
 
 @kernel
 def segments_apart(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz, reach):
-    """Whether a plane along segment ab, square to the way from its line to the middle of cd, shows that cd is farther from it than
-    ``reach`` [m]; without a division.
+    """Whether a plane certifies that segments ab and cd are farther apart than ``reach`` [m], without a division.
 
-    With u = b - a, c and d from a, and w = u.u (c + d) - u u.(c + d), which is square to u: w.w = u.u (w.c + w.d), and cd is
-    beyond if the lesser of w.c and w.d is positive, and its square above reach^2 w.w.
+    The plane is parallel to ab and perpendicular to the vector from its line to the middle of cd.  With u = b - a, c and d taken
+    from a, and w = u.u (c + d) - u u.(c + d), which is perpendicular to u: w.w = u.u (w.c + w.d), and cd is farther away if the
+    smaller of w.c and w.d is positive and its square above reach^2 w.w.
     """
     ux, uy, uz = bx - ax, by - ay, bz - az
     cx, cy, cz, dx, dy, dz = cx - ax, cy - ay, cz - az, dx - ax, dy - ay, dz - az

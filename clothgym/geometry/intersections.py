@@ -1,17 +1,17 @@
-"""Exact number of intersecting triangles of a sheet: what self-collision has to keep at zero, counted without its help.
+"""Intersecting triangles of a sheet, counted exactly: what self-collision must keep at zero, computed independently of it.
 
 A pair of triangles counts
 
-* if they share no vertex and have a point in common: touching counts;
+* if they share no vertex and have a point in common; touching counts;
 * if they share one vertex and have another point in common;
-* if they share an edge and lie folded flat on each other: in one plane, on the same side of the edge.
+* if they share an edge and are folded flat onto each other: in one plane, on the same side of the edge.
 
-Each decision is the one that exact arithmetic on the given coordinates would take.  float64 decides nearly all of them: a grid of
-cells finds the pairs whose boxes overlap, projections on separating axes clear those that are apart by more than their rounding
-error, and signs of orientations larger than theirs (Shewchuk 1997, Adaptive precision floating-point arithmetic, section 4.3)
-confirm crossings.  What is left goes to integers, which floating-point coordinates are when scaled by a power of two.
+Each decision is the one that exact arithmetic on the given coordinates would make.  float64 decides nearly all of them: cells of a
+grid find the pairs whose boxes overlap, projections on separating axes rule out pairs that are apart by more than the rounding
+error, and signs of orientations larger than their error bound (Shewchuk 1997, Adaptive precision floating-point arithmetic, section
+4.3) confirm crossings.  The rest is decided in integers, which floating-point coordinates are when scaled by a power of two.
 
-A triangle without area counts as the segment or point that it is; if the vertex that it shares with another lies within its
+A triangle without area counts as the segment or point that it is.  If the vertex that it shares with another lies within its
 opposite side, the pair counts.
 """
 
@@ -25,14 +25,14 @@ from clothgym.checks import finite
 from clothgym.geometry import exact_predicates
 from clothgym.geometry.exact_predicates import UNSURE
 
-# rounding errors, as shares of what is summed: of orientations (7 units of 2^-53 would do), of the difference of two projections,
-# of the product of two normals; and what underflow may add to them
+# bounds of rounding errors, relative to the sum of absolute values: of orientations (7 units of 2^-53 are enough), of the
+# difference of two projections, of the product of two normals; and what underflow may add
 ORIENTATION, PROJECTION, NORMALS, TINY = 1e-15, 4e-15, 4e-15, 1e-290
-PAIRS = 256  # room for pairs at first; kernels tell how many there are
+PAIRS = 256  # initial room for pairs; kernels return how many there are
 
 
 def find_intersections(triangles: ArrayLike, positions: ArrayLike) -> NDArray[np.int64]:
-    """All intersecting pairs: environment and both triangles, (pairs, 3), in this order.
+    """All intersecting pairs: environment and two triangles, (pairs, 3), in this order.
 
     Args:
         triangles: of the mesh, (triangles, 3).
@@ -47,11 +47,13 @@ def find_intersections(triangles: ArrayLike, positions: ArrayLike) -> NDArray[np
     if x.ndim != 3 or x.shape[2] != 3 or x.shape[1] <= corners.max(initial=-1):
         need = f"(num_envs, particles, 3) with at least {corners.max(initial=-1) + 1} particles"
         raise ValueError(f"positions have shape {np.shape(positions)}: must be {need}")
+    # pairs that intersect or may; with more room if there was too little
     pairs = np.empty((PAIRS, 4), np.int64)
     found = find_pairs(x, corners, pairs)
     if found > len(pairs):
         pairs = np.empty((found, 4), np.int64)
         find_pairs(x, corners, pairs)
+    # those that floating point cannot decide
     pairs = pairs[:found]
     intersecting = pairs[:, 3] == 1
     for row in np.flatnonzero(pairs[:, 3] == UNSURE):
@@ -62,24 +64,24 @@ def find_intersections(triangles: ArrayLike, positions: ArrayLike) -> NDArray[np
 
 
 def count_intersections(triangles: ArrayLike, positions: ArrayLike) -> NDArray[np.int64]:
-    """Number of intersecting pairs of triangles, (num_envs,); arguments and errors as of ``find_intersections``."""
+    """Number of intersecting pairs of triangles, (num_envs,); arguments and errors as for ``find_intersections``."""
     sheets = len(positions) if np.ndim(positions) == 3 else 1  # type: ignore[arg-type]
     return np.bincount(find_intersections(triangles, positions)[:, 0], minlength=sheets)
 
 
 def first_intersection(triangles: ArrayLike, positions: ArrayLike) -> tuple[int, int, int] | None:
-    """Environment and two triangles that intersect, for a message; None if there are none.  Arguments and errors as of
-    ``find_intersections``."""
+    """Environment and two triangles of one intersection, or None; arguments and errors as for ``find_intersections``."""
     pairs = find_intersections(triangles, positions)
     return tuple(pairs[0].tolist()) if len(pairs) else None
 
 
 @kernel
 def find_pairs(x, triangles, pairs):
-    """Write environment, triangles and 1 or UNSURE of pairs that intersect or may do so, as far as there is room; their number.
+    """Find pairs of triangles that intersect or may: environment, both triangles, and 1 or UNSURE, ``pairs``, (room, 4).  Returns
+    how many there are; only those for which there is room are written.
 
-    x [m]: (num_envs, particles, 3); pairs: (room, 4).  A cell is as wide as the largest box, so that boxes that overlap have their
-    lower corners in the same cell or in neighbours.
+    x: [m], (num_envs, particles, 3).  A cell is as wide as the largest box, so boxes that overlap have their lower corners in the
+    same cell or in adjacent ones.
     """
     count = triangles.shape[0]
     low, high = np.empty((count, 3)), np.empty((count, 3))
@@ -88,6 +90,7 @@ def find_pairs(x, triangles, pairs):
     work = np.empty((12, 3))
     found = 0
     for env in range(x.shape[0] if count > 0 else 0):
+        # bounding boxes, sorted into cells
         size = 0.0
         for t in range(count):
             i, j, k = triangles[t]
@@ -97,7 +100,7 @@ def find_pairs(x, triangles, pairs):
                 size = max(size, high[t, c] - low[t, c])
         starts = _sort_into_cells(low, size * (1 + 1e-6), origin, cells, cell, order)
         for t in range(count):
-            # of each pair of neighbouring cells and of each pair within a cell one order
+            # each pair of adjacent cells, and each pair within a cell, in one order only
             for dx in range(-1, 2):
                 for dy in range(-1, 2):
                     for dz in range(-1, 2):
@@ -112,12 +115,13 @@ def find_pairs(x, triangles, pairs):
                             other = order[n]
                             if within and other <= t:
                                 continue
+                            # boxes that overlap, then the triangles
                             overlap = low[t, 0] <= high[other, 0] and low[other, 0] <= high[t, 0]
                             overlap &= low[t, 1] <= high[other, 1] and low[other, 1] <= high[t, 1]
                             overlap &= low[t, 2] <= high[other, 2] and low[other, 2] <= high[t, 2]
                             if overlap:
                                 first, second = min(t, other), max(t, other)
-                                verdict = _verdict(x[env], triangles[first], triangles[second], work)
+                                verdict = _decide(x[env], triangles[first], triangles[second], work)
                                 if verdict != 0:
                                     if found < pairs.shape[0]:
                                         pairs[found, 0], pairs[found, 1], pairs[found, 2] = env, first, second
@@ -128,8 +132,14 @@ def find_pairs(x, triangles, pairs):
 
 @kernel
 def _sort_into_cells(low, size, origin, cells, cell, order):
-    """Sort boxes into cells at least ``size`` wide, by their lower corners; where each cell begins in ``order``."""
+    """Sort boxes into cells at least ``size`` wide by their lower corners ``low``, (boxes, 3).  Returns where each cell begins in
+    ``order``.
+
+    origin, cells: become the grid's corner and its cells along each axis, (3,).  cell: becomes the cell of each box, (boxes, 3).
+    order: becomes the boxes, cell by cell, (boxes,).
+    """
     count = low.shape[0]
+    # the grid: cells wide enough that there are not many more than boxes
     extent = np.empty(3)
     for c in range(3):
         origin[c] = low[:, c].min()
@@ -139,13 +149,16 @@ def _sort_into_cells(low, size, origin, cells, cell, order):
         size *= 1.3
     for c in range(3):
         cells[c] = np.int64(extent[c] / size) + 1
+    # count the boxes of each cell
     starts = np.zeros(cells[0] * cells[1] * cells[2] + 1, np.int64)
     for t in range(count):
         for c in range(3):
             cell[t, c] = np.int64((low[t, c] - origin[c]) / size)
         starts[(cell[t, 0] * cells[1] + cell[t, 1]) * cells[2] + cell[t, 2] + 1] += 1
+    # where each cell begins
     for n in range(1, starts.shape[0]):
         starts[n] += starts[n - 1]
+    # the boxes of each
     fill = starts.copy()
     for t in range(count):
         place = (cell[t, 0] * cells[1] + cell[t, 1]) * cells[2] + cell[t, 2]
@@ -155,9 +168,9 @@ def _sort_into_cells(low, size, origin, cells, cell, order):
 
 
 @apart
-def _verdict(x, first, second, work):
-    """Whether two triangles intersect: 1, 0 or UNSURE."""
-    # shared vertices come first in both
+def _decide(x, first, second, work):
+    """Whether two triangles, three indices into x each, intersect: 1, 0 or UNSURE.  work: scratch, (12, 3)."""
+    # corners, in both triangles those that are shared first
     shared = 0
     a, b = work[0:3], work[3:6]
     i, j = 2, 2
@@ -177,6 +190,7 @@ def _verdict(x, first, second, work):
             for c in range(3):
                 b[j, c] = x[second[n], c]
             j -= 1
+    # the cases of the module
     if shared == 0:
         return _triangles(a, b, work[6:])
     if shared == 1:
@@ -194,14 +208,16 @@ def _verdict(x, first, second, work):
 
 @kernel
 def _apart(p, q, work):
-    """Whether a segment or triangle p and a triangle q are surely disjoint; (2 or 3, 3) and (3, 3)."""
+    """Whether segment or triangle p, (2 or 3, 3), and triangle q, (3, 3), are surely disjoint: whether an axis separates them."""
     edges, normals, axis = work[0:3], work[3:5], work[5]
+    # largest component relative to q[0], for the rounding error
     size = 0.0
     for n in range(3):
         for c in range(3):
             size = max(size, abs(q[n, c] - q[0, c]))
             if n < p.shape[0]:
                 size = max(size, abs(p[n, c] - q[0, c]))
+    # their normals
     planes = 1 if p.shape[0] == 2 else 2
     for n in range(planes):
         corners = q if n == 0 else p
@@ -210,7 +226,7 @@ def _apart(p, q, work):
         _cross(edges[0], edges[1], normals[n])
         if _separates(normals[n], p, q, size):
             return True
-    # within a plane: across the sides of both
+    # in the planes, perpendicular to each side
     sides_of_p = 1 if p.shape[0] == 2 else 3
     for n in range(planes):
         for e in range(3 + sides_of_p):
@@ -230,7 +246,7 @@ def _apart(p, q, work):
 
 @kernel
 def _side(p, q, e, out):
-    """Side e of q, or e - 3 of p."""
+    """The vector along side e of q, or side e - 3 of p: ``out``, (3,)."""
     corners = q if e < 3 else p
     start = e % 3
     end = (start + 1) % corners.shape[0]
@@ -240,6 +256,7 @@ def _side(p, q, e, out):
 
 @kernel
 def _cross(a, b, out):
+    """``out`` = a x b, (3,) each."""
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
@@ -247,9 +264,9 @@ def _cross(a, b, out):
 
 @kernel
 def _separates(axis, p, q, size):
-    """Whether the projections on an axis are apart by more than their rounding; it need not be exact to prove it.
+    """Whether the projections on an axis are farther apart than their rounding error; the axis itself need not be exact.
 
-    size: largest component of corners relative to q[0].
+    size: largest component of the corners relative to q[0].
     """
     p_low, p_high, q_low, q_high = np.inf, -np.inf, np.inf, -np.inf
     for n in range(p.shape[0]):
@@ -264,8 +281,9 @@ def _separates(axis, p, q, size):
 
 @kernel
 def _wedges_apart(a, b):
-    """Whether triangles with the common corner a[0] = b[0] surely lie on two sides of a plane through it: that across the
-    difference of their mean directions."""
+    """Whether a plane through the common corner a[0] = b[0] surely separates two triangles: the one perpendicular to the difference
+    of their mean directions from there.
+    """
     size = 0.0
     axis_x, axis_y, axis_z = 0.0, 0.0, 0.0
     for n in range(1, 3):
@@ -287,7 +305,8 @@ def _wedges_apart(a, b):
 
 @apart
 def _triangles(a, b, work):
-    """Whether two triangles without a common vertex intersect: whether a side of one meets the other."""
+    """Whether two triangles without a common vertex intersect, that is whether a side of one meets the other: 1, 0 or UNSURE."""
+    # one lies on one side of the plane of the other
     a0, a1, a2 = _orientation(b[0], b[1], b[2], a[0]), _orientation(b[0], b[1], b[2], a[1]), _orientation(b[0], b[1], b[2], a[2])
     if a0 == a1 and a0 == a2 and (a0 == 1 or a0 == -1):
         return 0
@@ -296,10 +315,12 @@ def _triangles(a, b, work):
         return 0
     if a0 == 0 and a1 == 0 and a2 == 0:
         return _in_one_plane(a, b, work)
+    # separating axes are tried once: here, or below
     unsure = max(a0, a1, a2, b0, b1, b2) == UNSURE
     if unsure and _apart(a, b, work):
         return 0
-    verdict = 0
+    # each side of one against the other
+    answer = 0
     for n in range(3):
         m = (n + 1) % 3
         over, under = (a0, a1) if n == 0 else (a1, a2) if n == 1 else (a2, a0)
@@ -308,30 +329,31 @@ def _triangles(a, b, work):
         two = _pierces(b[n], b[m], a, over, under)
         if one == 1 or two == 1:
             return 1
-        verdict = max(verdict, one, two)
-    return 0 if verdict == UNSURE and not unsure and _apart(a, b, work) else verdict
+        answer = max(answer, one, two)
+    return 0 if answer == UNSURE and not unsure and _apart(a, b, work) else answer
 
 
 @kernel
 def _segment_triangle(p, t, work):
     """Whether a segment, (2, 3), meets a triangle, (3, 3): 1, 0 or UNSURE."""
-    over, under = _orientation(t[0], t[1], t[2], p[0]), _orientation(t[0], t[1], t[2], p[1])
-    if over == 0 and under == 0:
+    side_p, side_q = _orientation(t[0], t[1], t[2], p[0]), _orientation(t[0], t[1], t[2], p[1])
+    if side_p == 0 and side_q == 0:
         return _in_one_plane(p, t, work)
-    unsure = over == UNSURE or under == UNSURE
+    unsure = side_p == UNSURE or side_q == UNSURE
     if unsure and _apart(p, t, work):
         return 0
-    verdict = _pierces(p[0], p[1], t, over, under)
-    return 0 if verdict == UNSURE and not unsure and _apart(p, t, work) else verdict
+    answer = _pierces(p[0], p[1], t, side_p, side_q)
+    return 0 if answer == UNSURE and not unsure and _apart(p, t, work) else answer
 
 
 @kernel
 def _pierces(p, q, t, over, under):
-    """Whether segment pq, whose ends lie ``over`` and ``under`` the plane of a triangle, meets it: 1, 0 or UNSURE."""
+    """Whether segment pq meets triangle t: 1, 0 or UNSURE.  over, under: which sides of its plane p and q are on."""
     if over == UNSURE or under == UNSURE or (over == 0 and under == 0):
         return UNSURE
     if over == under:
         return 0
+    # its line passes all sides of the triangle on the same side
     one, two, three = _orientation(p, q, t[0], t[1]), _orientation(p, q, t[1], t[2]), _orientation(p, q, t[2], t[0])
     if (one == 1 or two == 1 or three == 1) and (one == -1 or two == -1 or three == -1):
         return 0
@@ -340,7 +362,7 @@ def _pierces(p, q, t, over, under):
 
 @kernel
 def _orientation(a, b, c, d):
-    """Sign of ``det(a - d, b - d, c - d)``, or UNSURE."""
+    """Sign of ``det(a - d, b - d, c - d)``, or UNSURE where it is below its rounding error."""
     ax, ay, az = a[0] - d[0], a[1] - d[1], a[2] - d[2]
     bx, by, bz = b[0] - d[0], b[1] - d[1], b[2] - d[2]
     cx, cy, cz = c[0] - d[0], c[1] - d[1], c[2] - d[2]
@@ -357,10 +379,13 @@ def _orientation(a, b, c, d):
 
 @kernel
 def _in_one_plane(p, q, work):
-    """Whether a segment or triangle p and a triangle q that lie in one plane intersect: 1, 0 or UNSURE; exact sides tell if the
-    plane is x, y or z = constant."""
+    """Whether segment or triangle p and triangle q in one plane intersect: 1, 0 or UNSURE.
+
+    In a plane x, y or z = constant the signs of turns decide.
+    """
     for k in range(3):
         level = p[0, k] == q[0, k] and p[1, k] == q[0, k] and q[1, k] == q[0, k] and q[2, k] == q[0, k]
+        # a side of one with all of the other beyond it
         if level and (p.shape[0] == 2 or p[2, k] == q[0, k]):
             i, j = (k + 1) % 3, (k + 2) % 3
             one = _divides(q, p, i, j)
@@ -375,14 +400,15 @@ def _in_one_plane(p, q, work):
 
 @kernel
 def _divides(t, others, i, j):
-    """Whether a side of a triangle or segment t has all other points strictly beyond it, in the plane of axes i and j: 1, 0 or
-    UNSURE."""
-    verdict = 0
+    """Whether a side of triangle or segment t has all other points strictly beyond it, in the plane of axes i and j: 1, 0 or
+    UNSURE.
+    """
+    answer = 0
     for n in range(3 if t.shape[0] == 3 else 1):
         m = (n + 1) % 3
         inner = _turn(t[n], t[m], t[3 - n - m], i, j) if t.shape[0] == 3 else -_turn(t[n], t[m], others[0], i, j)
         if inner != 1 and inner != -1:
-            verdict = UNSURE
+            answer = UNSURE
             continue
         beyond, within = 0, 0
         for o in range(others.shape[0]):
@@ -392,13 +418,13 @@ def _divides(t, others, i, j):
         if beyond == others.shape[0]:
             return 1
         if within == 0:
-            verdict = UNSURE
-    return verdict
+            answer = UNSURE
+    return answer
 
 
 @kernel
 def _turn(a, b, c, i, j):
-    """Sign of the turn from a by b to c in the plane of axes i and j, or UNSURE."""
+    """Sign of the turn from a via b to c in the plane of axes i and j, or UNSURE."""
     left, right = (a[i] - c[i]) * (b[j] - c[j]), (a[j] - c[j]) * (b[i] - c[i])
     error = ORIENTATION * (abs(left) + abs(right)) + TINY
     if left - right > error:
@@ -408,7 +434,8 @@ def _turn(a, b, c, i, j):
 
 @kernel
 def _folded_flat(a, b, c, d):
-    """Whether triangles abc and abd lie on each other: 1, 0 or UNSURE."""
+    """Whether triangles abc and abd are folded flat onto each other: 1, 0 or UNSURE."""
+    # product of their normals: negative if they open out
     dot, summed = 0.0, 0.0
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
@@ -419,6 +446,7 @@ def _folded_flat(a, b, c, d):
     error = NORMALS * summed + TINY
     if dot < -error:
         return 0
+    # and whether they lie in one plane
     sign = _orientation(a, b, c, d)
     if sign == 1 or sign == -1:
         return 0

@@ -44,7 +44,7 @@ class Memory(NamedTuple):
     a query is due [m^2], -1 where one is due, (blocks, particles, lanes).
     lag: from each attached particle to where its attachment would have it [m], (blocks, 3, particles, lanes); behind: the largest,
     (blocks, lanes).
-    contacts: how many, (blocks, lanes); particles, coefficients: see ``contact_memory``, (blocks, lanes, room, 4) and (..., C_SIZE);
+    contacts: how many, (blocks, lanes); particles, coefficients: see ``contact_memory``, (blocks, lanes, room, 4), (..., C_SIZE).
     impulses: of each contact per substep [N s], (..., 3); pressed: the change of each particle's velocity by these [m/s], (blocks,
     3, particles, lanes).
     waited: substeps since the last sweep over the contacts; span: substeps between two sweeps; aged: substeps since the active
