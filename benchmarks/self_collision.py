@@ -6,7 +6,7 @@
 
 Sections of ``results/self_collision.json``:
 
-* manoeuvres: those of ``clothgym.starts`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
+* maneuvers: those of ``clothgym.starts`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
   intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation told.  Modes:
   "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
@@ -32,14 +32,14 @@ from clothgym import ClothMesh, Simulation, disc, grid
 from clothgym._jit import kernel
 from clothgym.geometry.intersections import count_intersections
 from clothgym.lab.bench import machine
-from clothgym.starts import MANOEUVRES, Manoeuvre
+from clothgym.starts import MANEUVERS, Maneuver
 
 Row = dict[str, Any]
 Case = tuple[Callable[..., Row], Row]
 
 RESULT = Path(__file__).parent / "results" / "self_collision.json"
 SEEDS, FRAME = 5, 1 / 60
-DRAGGING = 10.0  # seconds of the manoeuvres without end
+DRAGGING = 10.0  # seconds of the maneuvers without end
 MESHES: dict[str, Callable[[], ClothMesh]] = {
     "13x13": lambda: grid(13, 13, 1.0, 1.0),
     "25x25": lambda: grid(25, 25, 1.0, 1.0),
@@ -90,39 +90,37 @@ def push_apart(x, v, held, rest, diameter):
                             v[b, c, j, l] += stop * d
 
 
-def with_spheres(name: str, mesh: ClothMesh, seeds: range, thickness: float, diameter: float) -> Iterator[Manoeuvre]:
-    """A manoeuvre after each of its frames, with particles as balls; a control step is a substep, between which they push."""
+def with_spheres(name: str, mesh: ClothMesh, seeds: range, thickness: float, diameter: float) -> Iterator[Maneuver]:
+    """A maneuver after each of its frames, with particles as balls; a control step is a substep, between which they push."""
     substeps = Simulation(mesh, time_step=FRAME).substeps
-    manoeuvre = MANOEUVRES[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME / substeps, substeps=1)
-    simulation = manoeuvre.simulation
+    maneuver = MANEUVERS[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME / substeps, substeps=1)
+    simulation = maneuver.simulation
     held = np.zeros((len(seeds), mesh.num_particles), bool)
-    while not over(manoeuvre):
+    while not over(maneuver):
         for _ in range(substeps):
-            manoeuvre.step()
+            maneuver.step()
             held[:, simulation.anchors] = simulation.attached
             blocks = simulation.layout.to_blocks(held, np.dtype(bool))
             push_apart(simulation.view.x, simulation.view.v, blocks, mesh.rest_positions, diameter)
-        yield manoeuvre
+        yield maneuver
 
 
-def with_simulation(name: str, mesh: ClothMesh, seeds: range, thickness: float, options: Row) -> Iterator[Manoeuvre]:
-    """A manoeuvre after each of its frames."""
-    manoeuvre = MANOEUVRES[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME, **options)
-    while not over(manoeuvre):
-        manoeuvre.step()
-        yield manoeuvre
+def with_simulation(name: str, mesh: ClothMesh, seeds: range, thickness: float, options: Row) -> Iterator[Maneuver]:
+    """A maneuver after each of its frames."""
+    maneuver = MANEUVERS[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME, **options)
+    while not over(maneuver):
+        maneuver.step()
+        yield maneuver
 
 
-def over(manoeuvre: Manoeuvre) -> bool:
-    return manoeuvre.over or manoeuvre.time >= (DRAGGING if "drag" in type(manoeuvre).__name__.lower() else np.inf) - 1e-9
+def over(maneuver: Maneuver) -> bool:
+    return maneuver.over or maneuver.time >= (DRAGGING if "drag" in type(maneuver).__name__.lower() else np.inf) - 1e-9
 
 
-def measure_manoeuvre(
-    manoeuvre: str, mesh: str, mode: str, thickness_mm: float, seeds: int = SEEDS, seconds: float = np.inf
-) -> Row:
+def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, seeds: int = SEEDS, seconds: float = np.inf) -> Row:
     """Frames of all seeds, and of how many each, and in how many something intersected."""
     sheet, thickness = MESHES[mesh](), thickness_mm / 1000
-    given = manoeuvre, sheet, range(seeds), thickness
+    given = maneuver, sheet, range(seeds), thickness
     if "spheres" in mode:
         spacing = float(sheet.springs.rest_length.min())
         frames = with_spheres(*given, 0.9 * spacing if "covering" in mode else thickness)
@@ -131,7 +129,7 @@ def measure_manoeuvre(
         frames = with_simulation(*given, option)
     begun = time.perf_counter()
     bad, worst, count, gap, lag, clamped = np.zeros(seeds, int), 0, 0, np.inf, 0.0, 0
-    for state in tqdm(frames, desc=f"{manoeuvre}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False):
+    for state in tqdm(frames, desc=f"{maneuver}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False):
         found = count_intersections(sheet.triangles, state.simulation.positions)
         bad += found > 0
         worst = max(worst, int(found.max()))
@@ -173,14 +171,14 @@ def cases() -> dict[str, list[Case]]:
     """All cases, those of coarse sheets first."""
     rows: list[Row] = []
     for mesh in MESHES:
-        for name in MANOEUVRES:
+        for name in MANEUVERS:
             for thickness in THICKNESSES:
                 modes = ["strict"]
                 if mesh == COMPARED:
                     modes += ["fast"] + (["none", "spheres", "covering spheres"] if thickness == THICKNESSES[0] else [])
-                rows += [{"manoeuvre": name, "mesh": mesh, "mode": mode, "thickness_mm": thickness} for mode in modes]
+                rows += [{"maneuver": name, "mesh": mesh, "mode": mode, "thickness_mm": thickness} for mode in modes]
     return {
-        "manoeuvres": [(measure_manoeuvre, row) for row in rows],
+        "maneuvers": [(measure_maneuver, row) for row in rows],
         "drape": [(measure_drape, {"target": target}) for target in TARGETS],
     }
 
@@ -221,10 +219,10 @@ ABOUT = {
 def quick() -> None:
     """Whether it runs: a second of each case on a coarse sheet."""
     rows = []
-    for name in tqdm(MANOEUVRES, unit="case"):
+    for name in tqdm(MANEUVERS, unit="case"):
         for mode in ("none", "spheres", "fast", "strict"):
-            key = {"manoeuvre": name, "mesh": "13x13", "mode": mode, "thickness_mm": 8}
-            rows.append(key | measure_manoeuvre(**key, seeds=1, seconds=1.0))
+            key = {"maneuver": name, "mesh": "13x13", "mode": mode, "thickness_mm": 8}
+            rows.append(key | measure_maneuver(**key, seeds=1, seconds=1.0))
     print(table(rows))
     print(table([{"target": target} | measure_drape(target, steps=200) for target in TARGETS]))
 

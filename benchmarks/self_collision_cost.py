@@ -35,7 +35,7 @@ from tqdm import tqdm
 from clothgym import ClothMesh, Plane, Simulation, grid
 from clothgym.geometry.intersections import count_intersections
 from clothgym.lab.bench_mujoco import COTTON, DROP, FRAME, ROWS, SECONDS, SIDE, THIN, mujoco_model, start_of
-from clothgym.starts import FRICTION, Drag, EdgeDrop, Fold, Heap, Manoeuvre, ZFold
+from clothgym.starts import FRICTION, Drag, EdgeDrop, Fold, Heap, Maneuver, ZFold
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -46,17 +46,17 @@ THICKNESS, LANES = 0.008, 64
 MODES = ("none", "fast", "strict")
 WARM, TIMED = 20, 60  # frames of a state
 ROUNDS = 2  # of an episode; of each frame the faster run counts
-SETTLING = 4.0  # seconds after a manoeuvre
+SETTLING = 4.0  # seconds after a maneuver
 # what strict mode may cost, over none
 LIMITS = {"hanging": 1.5, "flat": 1.5, "settled heap": 3.0, "settled three-layer fold": 6.0}
 LIMITS |= {"falling": 10.0, "folding": 10.0, "dragging at 1 m/s": 10.0}
 ALONE_LIMIT = 2.6
-EPISODES: dict[str, Callable[..., Manoeuvre]] = {
+EPISODES: dict[str, Callable[..., Maneuver]] = {
     "falling": EdgeDrop,
     "folding": Fold,
     "dragging at 1 m/s": partial(Drag, speed=1.0, seconds=10.0),
 }
-SETTLED: dict[str, Callable[..., Manoeuvre]] = {"settled heap": Heap, "settled three-layer fold": partial(ZFold, leaves=3)}
+SETTLED: dict[str, Callable[..., Maneuver]] = {"settled heap": Heap, "settled three-layer fold": partial(ZFold, leaves=3)}
 SPACING = 1 / 24  # of the sheets that grow [m]
 SIDES = (13, 17, 25, 35, 49, 71, 100)
 LEAF = 8  # cells of a leaf of the folded sheet that grows
@@ -105,11 +105,11 @@ def row_of(seconds: dict[str, float], envs: int, limit: float) -> Row:
 @lru_cache
 def settled(name: str, side: int, envs: int) -> NDArray:
     """Sheets that have come to rest in strict mode [m], (envs, particles, 3)."""
-    manoeuvre = SETTLED[name](grid(side, side, 1.0, 1.0), seeds=range(envs), thickness=THICKNESS, **option("strict"))
-    while not manoeuvre.over:
-        manoeuvre.step()
-    manoeuvre.simulation.step(round(SETTLING / FRAME))
-    return manoeuvre.simulation.positions
+    maneuver = SETTLED[name](grid(side, side, 1.0, 1.0), seeds=range(envs), thickness=THICKNESS, **option("strict"))
+    while not maneuver.over:
+        maneuver.step()
+    maneuver.simulation.step(round(SETTLING / FRAME))
+    return maneuver.simulation.positions
 
 
 @lru_cache
@@ -133,17 +133,17 @@ def of_a_state(mesh: ClothMesh, x: NDArray, envs: int, anchors: list[int], frame
     return {mode: statistics.median(times) for mode, times in interleaved(steps, frames).items()}
 
 
-def of_an_episode(make: Callable[[str], Manoeuvre], seconds: float = np.inf) -> dict[str, float]:
+def of_an_episode(make: Callable[[str], Maneuver], seconds: float = np.inf) -> dict[str, float]:
     """Mean seconds of a frame, by mode; of each frame the faster of several runs counts, and the hands' scripts do not."""
     best: dict[str, NDArray] = {}
     for _ in range(ROUNDS):
-        manoeuvres = {mode: make(mode) for mode in MODES}
+        maneuvers = {mode: make(mode) for mode in MODES}
         times: dict[str, list[float]] = {mode: [] for mode in MODES}
         steps = {}
-        for mode, manoeuvre in manoeuvres.items():
-            manoeuvre.simulation.step = _clocked(manoeuvre.simulation.step, times[mode])  # type: ignore[method-assign]
-            steps[mode] = manoeuvre.step
-        first = manoeuvres["none"]
+        for mode, maneuver in maneuvers.items():
+            maneuver.simulation.step = _clocked(maneuver.simulation.step, times[mode])  # type: ignore[method-assign]
+            steps[mode] = maneuver.step
+        first = maneuvers["none"]
         interleaved(steps, round(min(first.seconds, seconds) / first.simulation.time_step))
         for mode in MODES:
             best[mode] = np.minimum(best.get(mode, np.inf), times[mode])
@@ -211,12 +211,12 @@ def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECON
 def measure_ours(engine: str, contact: str, lanes: int, seconds: float = SECONDS) -> Row:
     """A batch of sheets on one core."""
     mesh = grid(ROWS, ROWS, SIDE, SIDE)
-    manoeuvre = EdgeDrop(mesh, COTTON, seeds=range(lanes), thickness=THIN, **option(contact, THIN))
-    simulation = manoeuvre.simulation
+    maneuver = EdgeDrop(mesh, COTTON, seeds=range(lanes), thickness=THIN, **option(contact, THIN))
+    simulation = maneuver.simulation
     simulation.step()  # loads the kernels
     best, counts = np.full(round(seconds / FRAME), np.inf), []
     for _ in range(ROUNDS):
-        simulation.reset(positions=manoeuvre.start - (0, 0, 0.1 * SIDE - DROP))
+        simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {lanes}", leave=False):
             begun = time.perf_counter()
             simulation.step()

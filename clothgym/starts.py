@@ -1,12 +1,12 @@
-"""Floor 6: what crumples, folds and wrings a sheet: manoeuvres for tests and benchmarks, and crumpled, folded and rumpled starts.
+"""Floor 6: crumpled, folded and rumpled sheets to start from, and the maneuvers that make them, for tests and benchmarks, too.
 
-A manoeuvre is a batch of sheets above a floor, one seed an environment, and a script for their anchors:
+A maneuver is a batch of sheets above a floor, one seed for each environment, and a script for their anchors or grippers:
 
-    heap = MANOEUVRES["heap"](grid(25, 25, 1.0, 1.0), seeds=range(5), self_collision="strict")
+    heap = MANEUVERS["heap"](grid(25, 25, 1.0, 1.0), seeds=range(5), self_collision="strict")
     while not heap.over:
         heap.step()
 
-Lengths scale with the sheet's side, its larger extent at rest; durations are those of a sheet of about a metre.
+Lengths scale with the sheet's side, its larger extent at rest; durations suit a sheet of about one meter.
 """
 
 from __future__ import annotations
@@ -27,28 +27,28 @@ from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.simulation import Simulation
 
-FRICTION = 0.5  # of the floor
-TILT = np.radians(3)  # a seed turns the start by about that
-ROUGHNESS = 1e-3  # and shifts each particle by about that, in shortest springs
-CALM = 5.0  # rate of the linear drag that brings starts to rest [1/s]
-REST_SPEED = 5e-3  # root of the mean squared speed at which a start is at rest [m/s]
-MOST_SETTLING, TREMBLING = 20.0, 0.05  # seconds of settling after which that speed will do: squeezed folds keep trembling
+FRICTION = 0.5  # coefficient between cloth and floor
+TILT = np.radians(3)  # angle by which a seed tilts the start, about [rad]
+ROUGHNESS = 1e-3  # and displacement of each particle, about, in lengths of the shortest spring
+SETTLING_DRAG = 5.0  # rate of the linear drag under which starts come to rest [1/s]
+REST_SPEED = 5e-3  # rms speed below which a start is at rest [m/s]
+LONG_SETTLING, TREMBLING = 20.0, 0.05  # after so long [s] this speed counts as rest [m/s]: squeezed folds keep trembling
 
 
-class Manoeuvre:
-    """A batch of sheets that something happens to.
+class Maneuver:
+    """A scripted maneuver with a batch of sheets.
 
     Args:
         mesh: the sheet, flat at rest.
         material: the fabric.
-        seeds: one an environment; it varies the start slightly, and whatever is drawn at random.
-        thickness: distance that layers of the start keep, and that hands leave between layers [m].
+        seeds: one for each environment; a seed varies the start slightly, and whatever is drawn at random.
+        thickness: distance between layers at the start, and that anchors leave between layers [m].
         options: of ``Simulation``, ``self_collision`` for instance.
 
     Attributes:
         simulation: the batch.
-        seconds: how long it lasts.
-        time: passed since its start [s].
+        seconds: duration [s].
+        time: since the start [s].
     """
 
     seconds: float
@@ -65,13 +65,15 @@ class Manoeuvre:
         if not isinstance(mesh, ClothMesh):
             raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, as grid() and disc() make")
         if own := {"num_envs", "colliders", "anchors", "grippers"} & set(options):
-            raise ValueError(f"{', '.join(sorted(own))}: a manoeuvre has its own")
+            raise ValueError(f"{', '.join(sorted(own))}: set by the maneuver itself, leave them out")
+        # the sheet, centered at the origin, and a random generator for each environment
         self.mesh = mesh
         self.random = [np.random.default_rng(seed) for seed in checks.indices("seeds", seeds, 2**63 - 1, "seeds")]
         self.thickness = positive("thickness", thickness)
         self.rest = mesh.rest_positions - (mesh.rest_positions.max(axis=0) + mesh.rest_positions.min(axis=0)) / 2
         self.side = float(np.ptp(self.rest, axis=0).max())
         self.frames = 0
+        # the batch, at its varied start
         world = {"colliders": [Plane(friction=FRICTION)], "anchors": self._anchors().tolist(), "grippers": self.grippers}
         self.simulation = Simulation(mesh, material, num_envs=len(self.random), **world, **options)
         self.start = self._varied(*self._start())
@@ -80,31 +82,35 @@ class Manoeuvre:
 
     @property
     def time(self) -> float:
+        """Time since the start [s]."""
         return self.frames * self.simulation.time_step
 
     @property
     def over(self) -> bool:
+        """Whether the maneuver has ended."""
         return self.time >= self.seconds - 1e-9
 
     def step(self) -> None:
-        """One control step."""
+        """Advance by one control step."""
         self._steer(self.time + self.simulation.time_step)
         self.simulation.step()
         self.frames += 1
 
     def _anchors(self) -> NDArray:
-        """Particles that are held, in the order of ``held``."""
+        """Particles that are anchored, in the order of ``held``."""
         return np.zeros(0, np.int64)
 
     def _start(self) -> tuple[NDArray, float]:
-        """Positions of the start [m], (particles, 3), and the height of the lowest over the floor."""
+        """Positions at the start [m], (particles, 3), and the height of the lowest above the floor [m]."""
         raise NotImplementedError
 
     def _steer(self, time: float) -> None:
-        """Tell the hands where to be at that time."""
+        """Move the anchors or grippers to their targets for this time [s]."""
 
     def _varied(self, x: NDArray, height: float) -> NDArray:
-        """Each environment's start: turned a little, made a little uneven, and put at its height."""
+        """The start of each environment: slightly tilted and uneven, with its lowest particle at ``height``, (num_envs, particles,
+        3).
+        """
         short = self.mesh.springs.rest_length.min()
         sheets = []
         for random in self.random:
@@ -114,13 +120,13 @@ class Manoeuvre:
         return np.array(sheets)
 
     def _near(self, x: float, y: float) -> int:
-        """The particle nearest to a place on the border of the sheet's box: (1, 1) is a corner, (1, 0) the middle of a side."""
+        """The particle nearest to a point of the sheet's bounding box: (1, 1) is a corner, (1, 0) the middle of a side."""
         place = np.array([x, y, 0]) * np.ptp(self.rest, axis=0) / 2
         return int(np.argmin(np.linalg.norm(self.rest - place, axis=1)))
 
 
-class EdgeDrop(Manoeuvre):
-    """A sheet that stands upright falls on its edge."""
+class EdgeDrop(Maneuver):
+    """An upright sheet falls on its edge."""
 
     seconds = 5.0
 
@@ -128,10 +134,10 @@ class EdgeDrop(Manoeuvre):
         return self.rest[:, [0, 2, 1]] * (1, -1, 1), 0.1 * self.side
 
 
-class ZFold(Manoeuvre):
-    """A sheet folded to and fro falls.
+class ZFold(Maneuver):
+    """A sheet folded in zigzag falls.
 
-    Its height rises evenly along the sheet, so that it is the graph of a function over an upright plane and cannot intersect.
+    Its height rises evenly along the sheet, so it is the graph of a function over an upright plane and does not intersect itself.
     """
 
     seconds = 5.0
@@ -143,15 +149,17 @@ class ZFold(Manoeuvre):
     def _start(self) -> tuple[NDArray, float]:
         along, lowest = self.rest[:, 0] - self.rest[:, 0].min(), 0.1 * self.side
         length = np.ptp(self.rest[:, 0])
+        # creases at even distances, on a grid along columns of particles
         creases = np.linspace(0, length, self.leaves + 1)
         spacing = float(np.median(self.mesh.springs.rest_length[self.mesh.springs.kind <= 2]))
         if self.mesh.shape is None:
-            slope = 0.5  # creases go through triangles: less of a slope would shorten them much more
+            slope = 0.5  # creases cut through triangles, which a smaller slope would shorten much more
         else:
             columns = np.unique(along.round(9))
             creases = np.unique(columns[np.abs(columns[:, None] - creases).argmin(axis=0)])
-            # the columns beside a crease are twice the slope apart
+            # next to a crease two columns are twice slope times spacing apart
             slope = min(max(0.13, 0.75 * self.thickness / spacing), 0.9)
+        # the leaf of each particle, and its position across the leaves
         leaf = np.clip(np.searchsorted(creases, along, side="right") - 1, 0, len(creases) - 2)
         within = along - creases[leaf]
         across = np.concatenate([[0.0], np.cumsum(np.diff(creases) * np.where(np.arange(len(creases) - 1) % 2, -1, 1))])
@@ -159,8 +167,8 @@ class ZFold(Manoeuvre):
         return np.stack([x - x.mean(), self.rest[:, 1], slope * along], axis=1), lowest
 
 
-class Heap(Manoeuvre):
-    """A sheet that hangs by a corner is let go."""
+class Heap(Maneuver):
+    """A sheet that hangs by a corner is released."""
 
     seconds, release = 7.0, 3.0
 
@@ -177,12 +185,12 @@ class Heap(Manoeuvre):
             self.simulation.release()
 
 
-class Fold(Manoeuvre):
-    """A sheet on the floor is folded in half by its corners, across and along in turn."""
+class Fold(Maneuver):
+    """A sheet on the floor is folded in half by its corners, in alternating directions."""
 
     carrying, holding, resting = 1.5, 0.3, 0.7  # [s]
-    # by fold: the direction of the carried side, and directions from the middle of what is held there; later folds hold corners
-    # of all layers, and the ends of creases, which lie where the middle of a side was
+    # for each fold the direction of the side that is carried, and the directions of the particles held there; later folds hold the
+    # corners of all layers, and the ends of creases, which were the middle of a side
     FOLDS = (
         ((0, 1), ((-1, 1), (1, 1))),
         ((1, 0), ((1, -1), (1, 0), (1, 1))),
@@ -192,7 +200,7 @@ class Fold(Manoeuvre):
     def __init__(self, *args: Any, times: int = 1, **options: Any) -> None:
         self.times = checks.count("times", times)
         if times > len(self.FOLDS):
-            raise ValueError(f"times={times!r}: a sheet is folded {len(self.FOLDS)} times at most")
+            raise ValueError(f"times={times!r}: a sheet can be folded {len(self.FOLDS)} times at most")
         self.seconds = (self.carrying + self.holding + self.resting) * times + 1.5
         self.directions = sorted({d for _, held in self.FOLDS[:times] for d in held})
         super().__init__(*args, **options)
@@ -208,7 +216,7 @@ class Fold(Manoeuvre):
 
     def _varied(self, x: NDArray, height: float) -> NDArray:
         sheets = super()._varied(x, height)
-        sheets[:, :, 2] = height  # a sheet that stands on a corner would slip
+        sheets[:, :, 2] = height  # flat: standing on a corner it would slip
         return sheets
 
     def _steer(self, time: float) -> None:
@@ -218,6 +226,7 @@ class Fold(Manoeuvre):
         direction, held = self.FOLDS[int(fold)]
         anchors = [self.directions.index(d) for d in held]
         step = self.simulation.time_step
+        # a new fold attaches its anchors where their particles are; afterwards they are released
         if passed <= step:
             for anchor in anchors:
                 self.simulation.attach(None, [anchor])
@@ -226,7 +235,7 @@ class Fold(Manoeuvre):
         elif passed > self.carrying + self.holding:
             self.simulation.release()
             return
-        # all that is held turns about the crease
+        # held particles turn about the crease
         angle = np.pi * _eased(min(passed / self.carrying, 1.0))
         out = self.held[:, :, :2] @ np.array(direction) - self.axis[:, None]
         up = self.held[:, :, 2] - (self.top + self.thickness)[:, None]
@@ -237,19 +246,19 @@ class Fold(Manoeuvre):
         self.simulation.move_anchors(self.targets)
 
     def _crease(self, direction: NDArray) -> NDArray[np.float64]:
-        """Where each sheet is folded, along the direction [m], (num_envs,): about the middle of what is there now."""
+        """Position of each crease along the direction [m], (num_envs,): near the middle of the sheet as it lies."""
         along = self.simulation.positions[:, :, :2].astype(np.float64) @ direction
         return (along.max(axis=1) + along.min(axis=1)) / 2 + self.miss
 
 
-class Wring(Manoeuvre):
-    """Two opposite edges are turned against each other, by some particles in their middle, and brought nearer.
+class Wring(Maneuver):
+    """Two opposite edges are twisted against each other, each by particles around its middle, and moved closer.
 
     Args:
-        turns: of one against the other.
-        turning: how long that takes [s]; then they are held.
-        share: of the edges that is held.
-        approach: how much nearer they are at the end, in their distance.
+        turns: of one edge against the other.
+        turning: duration of the twist [s], after which the edges are held.
+        share: of each edge that is held.
+        approach: share of their distance by which the edges have moved closer at the end.
     """
 
     holding = 2.0  # [s]
@@ -263,7 +272,7 @@ class Wring(Manoeuvre):
 
     def _anchors(self) -> NDArray:
         x, y = self.rest[:, 0], self.rest[:, 1]
-        # of a disc the rims within a fifth of the radius
+        # on a disc the rim within a fifth of the radius
         reach = 1e-6 if self.mesh.shape is not None else 0.1 * self.side
         width = (0.5 * self.share + 1e-6) * self.side
         edges = [np.flatnonzero((end * x >= x.max() - reach) & (np.abs(y) <= width)) for end in (-1, 1)]
@@ -274,6 +283,7 @@ class Wring(Manoeuvre):
         return self.rest, 0.7 * self.side
 
     def _steer(self, time: float) -> None:
+        # opposite angles about the axis of the sheet
         share = min(time / self.turning, 1.0)
         middle = self.held.mean(axis=1, keepdims=True)
         offset = self.held - middle
@@ -284,11 +294,12 @@ class Wring(Manoeuvre):
         self.simulation.move_anchors(middle + turned)
 
 
-class Drag(Manoeuvre):
-    """A sheet is dragged about above the floor by a corner that makes for random places.
+class Drag(Maneuver):
+    """A sheet above the floor is dragged by a corner from one random point to the next.
 
     Args:
         speed: of the corner [m/s].
+        seconds: duration [s].
     """
 
     def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
@@ -304,6 +315,7 @@ class Drag(Manoeuvre):
 
     def _steer(self, time: float) -> None:
         for env, random in enumerate(self.random):
+            # the length of path in this control step, which may pass several points
             left = self.speed * self.simulation.time_step
             while left > 0:
                 way = self.goal[env] - self.target[env]
@@ -316,13 +328,13 @@ class Drag(Manoeuvre):
         self.simulation.move_anchors(self.target[:, None])
 
 
-class PickAndDrop(Manoeuvre):
-    """A sheet on the floor is picked up at a random place, carried some way and dropped, a few times.
+class PickAndDrop(Maneuver):
+    """A sheet on the floor is picked up at a random point, carried and dropped, several times.
 
     Args:
-        picks: how often.
+        picks: how many times.
         lift: lowest and highest height to which it is lifted, in sides.
-        carry: how far it is carried along x and y at most, in sides.
+        carry: largest distance along x and y, in sides.
     """
 
     grippers = (Gripper(speed=1.0),)
@@ -343,6 +355,7 @@ class PickAndDrop(Manoeuvre):
     def _steer(self, time: float) -> None:
         passed = (time - 1e-9) % self.turn
         grippers, step = self.simulation.grippers, self.simulation.time_step
+        # a new pick: a random particle and a random goal
         if passed <= step:
             x = self.simulation.positions.astype(np.float64)
             self.taken = np.array([x[env, random.integers(len(self.rest))] for env, random in enumerate(self.random)])
@@ -350,12 +363,13 @@ class PickAndDrop(Manoeuvre):
             self.goal = np.array([random.uniform(low, high) for random in self.random]) * self.side
             self.goal[:, 2] += self.taken[:, 2]
             grippers.place(self.taken[:, None])
+        # close, carry, and open
         share = _eased(min(max(passed - self.closing, 0.0) / self.lifting, 1.0))
         opening = float(passed > self.closing + self.lifting)
         grippers.move((self.taken + share * (self.goal - self.taken))[:, None], np.full((len(self.random), 1), opening))
 
 
-MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
+MANEUVERS: dict[str, Callable[..., Maneuver]] = {
     "edge drop": EdgeDrop,
     "z-fold": ZFold,
     "heap": Heap,
@@ -367,7 +381,7 @@ MANOEUVRES: dict[str, Callable[..., Manoeuvre]] = {
     "drag at 1 m/s": Drag,
     "drag at 3 m/s": partial(Drag, speed=3.0),
 }
-STARTS: dict[str, Callable[..., Manoeuvre]] = {
+STARTS: dict[str, Callable[..., Maneuver]] = {
     "crumpled": partial(PickAndDrop, lift=(0.7, 1.1), carry=0.2),
     "folded": partial(Fold, times=2),
     "rumpled": PickAndDrop,
@@ -388,63 +402,66 @@ def make(
     Args:
         mesh: the sheet, flat at rest.
         material: the fabric.
-        kind: "crumpled" (lifted high at a random place and dropped, twice), "folded" (in half, twice) or "rumpled" (lifted a
+        kind: "crumpled" (lifted high at a random point and dropped, twice), "folded" (in half, twice) or "rumpled" (lifted a
             little, twice).
-        count: how many.
-        seed: the sheet i of seed s is the first of seed s + i.
-        thickness: of the cloth at self-contact [m].
+        count: number of sheets.
+        seed: sheet i of seed s is the first sheet of seed s + i.
+        thickness: of the cloth in self-contact [m].
         options: of ``Simulation``; ``self_collision`` is "strict" with that thickness unless given.
 
     Raises:
-        ValueError: an unknown kind, or whatever ``Simulation`` does not take.
-        RuntimeError: a sheet that is not at rest after ``MOST_SETTLING`` seconds, or that intersects itself.
+        ValueError: an unknown kind, or what ``Simulation`` refuses.
+        RuntimeError: a sheet that moves faster than ``TREMBLING`` after ``LONG_SETTLING``, or that intersects itself.
     """
     one_of("kind", kind, *STARTS)
     checks.count("count", count)
     checks.count("seed", seed, least=0)
     options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options
-    manoeuvre = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
-    while not manoeuvre.over:
-        manoeuvre.step()
-    simulation = manoeuvre.simulation
-    simulation.set_parameters(air_drag=CALM * simulation.material.density)
-    # each sheet as it is when it comes to rest, which does not depend on the others
+    # the maneuver, and then drag
+    maneuver = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
+    while not maneuver.over:
+        maneuver.step()
+    simulation = maneuver.simulation
+    simulation.set_parameters(air_drag=SETTLING_DRAG * simulation.material.density)
+    # take each sheet when it comes to rest, which does not depend on the others
     x, moving = simulation.positions, np.ones(count, bool)
     while moving.any():
-        late = manoeuvre.time > manoeuvre.seconds + MOST_SETTLING
+        late = maneuver.time > maneuver.seconds + LONG_SETTLING
         speed = np.where(moving, np.sqrt((simulation.velocities.astype(np.float64) ** 2).sum(axis=2).mean(axis=1)), 0)
         if late and speed.max() > TREMBLING:
             raise RuntimeError(
-                f"{kind} sheet of seed {seed + int(speed.argmax())} moves at {speed.max():.2g} m/s: take another seed or fabric"
+                f"{kind} sheet of seed {seed + int(speed.argmax())} does not come to rest, it moves at {speed.max():.2g} m/s: take "
+                "another seed or fabric"
             )
-        calm = moving & (speed <= (TREMBLING if late else REST_SPEED))
-        x[calm] = simulation.positions[calm]
-        moving &= ~calm
+        settled = moving & (speed <= (TREMBLING if late else REST_SPEED))
+        x[settled] = simulation.positions[settled]
+        moving &= ~settled
         simulation.step(6)
-        manoeuvre.frames += 6
+        maneuver.frames += 6
+    # intersections
     found = find_intersections(mesh.triangles, x)
     if len(found):
         env, first, second = found[0].tolist()
         raise RuntimeError(
             f"{kind} sheet of seed {seed + env} intersects itself {np.sum(found[:, 0] == env)} times, at triangles {first} and "
-            f"{second} for instance: take self_collision='strict', and a thickness that fits the mesh"
+            f"{second} for instance: use self_collision='strict', and a thickness that fits the mesh"
         )
     return x
 
 
 def _eased(share: float) -> float:
-    """From 0 to 1 without a jerk at the ends."""
+    """Smooth progress from 0 to 1 for a share of the duration from 0 to 1."""
     return (1 - float(np.cos(np.pi * share))) / 2
 
 
 def _rotation(axis: NDArray, angle: float) -> NDArray[np.float64]:
-    """Rotation about an axis, (3, 3), after Rodrigues."""
+    """Rotation matrix about an axis, (3, 3), by Rodrigues' formula; angle: [rad]."""
     cross = np.cross(np.eye(3), axis / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def _rim(triangles: NDArray) -> NDArray:
-    """Edges of one triangle only, (edges, 2)."""
+    """Edges that belong to one triangle only, (edges, 2)."""
     edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     edges, times = np.unique(edges, axis=0, return_counts=True)
     return edges[times == 1]

@@ -21,7 +21,7 @@ from clothgym.envs.pictures import draw, renderer_of
 from clothgym.render.camera import Camera
 from clothgym.render.renderer import Renderer
 from clothgym.render.solids import Solid
-from clothgym.starts import MANOEUVRES
+from clothgym.starts import MANEUVERS
 
 HERE = Path(__file__).parent
 SIZE = 300
@@ -108,7 +108,7 @@ def draw_contact() -> None:
         cloth.step(150)
         frames.append(picture(mesh, cloth.positions, camera, [solid]))
     for mode in (False, "strict"):
-        heap = MANOEUVRES["heap"](grid(33, 33, 1.0, 1.0), seeds=[3], self_collision=mode)
+        heap = MANEUVERS["heap"](grid(33, 33, 1.0, 1.0), seeds=[3], self_collision=mode)
         while not heap.over:
             heap.step()
         x = heap.simulation.positions - heap.simulation.positions[:, :, :2].mean(axis=1, keepdims=True) @ np.eye(2, 3)

@@ -12,7 +12,7 @@ from clothgym.collisions.self.impulses import FASTEST, _correct
 from clothgym.collisions.self.narrow_phase import query
 from clothgym.collisions.self.topology import pairs_of
 from clothgym.contact_memory import C_SIZE, G_SIZE, REPORT_SIZE
-from clothgym.starts import MANOEUVRES
+from clothgym.starts import MANEUVERS
 
 
 def count_intersections(triangles, x):
@@ -132,7 +132,7 @@ SHORT = {"z-fold": 60, "heap": 150, "wring": 400, "drag at 3 m/s": 200}
 
 def bad_frames(name, mode, mesh, thickness=None, frames=None, every=1, seeds=(0,)):
     setting = {"mode": mode} if thickness is None else {"mode": mode, "thickness": thickness}
-    made = MANOEUVRES[name](mesh, seeds=seeds, self_collision=setting, **({} if thickness is None else {"thickness": thickness}))
+    made = MANEUVERS[name](mesh, seeds=seeds, self_collision=setting, **({} if thickness is None else {"thickness": thickness}))
     bad = 0
     for frame in range(frames or SHORT[name]):
         made.step()
@@ -171,7 +171,7 @@ def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
     monkeypatch.setitem(contact_memory.ROWS, "constraints", 0)
     mesh = sheet(9)
     option = {"mode": "strict", "thickness": 0.012}
-    wring = MANOEUVRES["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)
+    wring = MANEUVERS["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)
     gap = np.inf
     for _ in range(240):
         wring.step()
@@ -186,7 +186,7 @@ def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
 def test_a_jam_does_not_carry_hands_away():
     """Cloth that may not move stays between the hands that pull at it, which cannot go on: none of it gets out of their reach."""
     option = {"mode": "strict", "thickness": 0.012}
-    wring = MANOEUVRES["impossible wring"](sheet(9), seeds=[1, 2], thickness=0.012, time_step=1 / 60, self_collision=option)
+    wring = MANEUVERS["impossible wring"](sheet(9), seeds=[1, 2], thickness=0.012, time_step=1 / 60, self_collision=option)
     for _ in range(200):
         wring.step()
         assert np.abs(wring.simulation.positions).max() < 0.8  # the hands' way is within 0.75 m; 20 m where a jam carried them
@@ -277,7 +277,7 @@ def test_three_layers_on_a_table_rest_at_their_thickness():
 
 def test_a_large_heap_comes_to_rest():
     """It trembles at 60 to 110 mm/s where contacts push apart what cannot give way."""
-    heap = MANOEUVRES["heap"](clothgym.grid(25, 25, 1, 1), seeds=range(4), self_collision={"mode": "strict", "thickness": 0.008})
+    heap = MANEUVERS["heap"](clothgym.grid(25, 25, 1, 1), seeds=range(4), self_collision={"mode": "strict", "thickness": 0.008})
     while not heap.over:
         heap.step()
     heap.simulation.step(240)

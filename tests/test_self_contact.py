@@ -7,12 +7,12 @@ from exact_intersections import intersecting_pairs
 from folded import SIDE, sheet, three_layers
 
 import clothgym
-from clothgym.starts import MANOEUVRES
+from clothgym.starts import MANEUVERS
 
 
 def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     mesh = sheet(13)
-    made = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict")
+    made = MANEUVERS["z-fold"](mesh, seeds=range(2), self_collision="strict")
     for _ in range(25):
         made.step()
     first = made.simulation
@@ -21,7 +21,7 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     assert not state.self_contact["members"][state.self_contact["members"][:, :, 1] == 4][:, 7:].any()
     state.save(tmp_path / "state.npz")
     first.step(20)
-    other = MANOEUVRES["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
+    other = MANEUVERS["z-fold"](mesh, seeds=range(2), self_collision="strict").simulation
     other.set_state(clothgym.State.load(tmp_path / "state.npz"))
     other.step(20)
     np.testing.assert_array_equal(first.positions, other.positions)
@@ -49,7 +49,7 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     ],
 )
 def test_a_state_with_contacts_of_another_sheet_is_refused_and_changes_nothing(name, spoil, message):
-    made = MANOEUVRES["z-fold"](sheet(13), self_collision="strict")
+    made = MANEUVERS["z-fold"](sheet(13), self_collision="strict")
     for _ in range(25):
         made.step()
     state, before = made.simulation.get_state(), made.simulation.positions
@@ -126,7 +126,7 @@ def test_what_changes_hands_owes_the_new_one_nothing():
 
 def test_what_collides_with_itself_does_not_sink_into_the_floor():
     """It has the last word in a substep, and pushes what lies below down: by less than a tenth of the cloth's thickness."""
-    drop, deepest = MANOEUVRES["edge drop"](clothgym.grid(13, 13, 1.0, 1.0), self_collision="strict", time_step=1 / 60), 0.0
+    drop, deepest = MANEUVERS["edge drop"](clothgym.grid(13, 13, 1.0, 1.0), self_collision="strict", time_step=1 / 60), 0.0
     thickness = drop.simulation._contact.thickness
     while drop.time < 3:
         drop.step()
@@ -137,8 +137,8 @@ def test_what_collides_with_itself_does_not_sink_into_the_floor():
 
 def test_an_environment_does_not_feel_its_batch():
     mesh = sheet(9)
-    together = MANOEUVRES["z-fold"](mesh, seeds=range(19), self_collision="strict")
-    alone = MANOEUVRES["z-fold"](mesh, seeds=[7], self_collision="strict")
+    together = MANEUVERS["z-fold"](mesh, seeds=range(19), self_collision="strict")
+    alone = MANEUVERS["z-fold"](mesh, seeds=[7], self_collision="strict")
     for _ in range(30):
         together.step()
         alone.step()

@@ -1,4 +1,4 @@
-"""The rows of the table that take seconds: episodes of the tasks, manoeuvres, MuJoCo, and whole processes."""
+"""The rows of the table that take seconds: episodes of the tasks, maneuvers, MuJoCo, and whole processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from clothgym.lab.bench_table import Row, beat, row_of
 from clothgym.mesh import grid
 from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
-from clothgym.starts import Fold, Manoeuvre, ZFold
+from clothgym.starts import Fold, Maneuver, ZFold
 
 DRAPE = "ClothDrape-v0"
 MANY, STEPS = 128, 100  # environments and steps of an episode
@@ -193,13 +193,13 @@ def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> floa
 # --- sheets that touch themselves ---------------------------------------------------------------------------------------------
 
 
-def frames(manoeuvres: Mapping[str, Manoeuvre], count: int) -> dict[str, float]:
+def frames(maneuvers: Mapping[str, Maneuver], count: int) -> dict[str, float]:
     """Mean milliseconds of a frame of each, the physics alone, in turns frame by frame."""
-    watches = {name: Stopwatch(manoeuvre.simulation) for name, manoeuvre in manoeuvres.items()}
+    watches = {name: Stopwatch(maneuver.simulation) for name, maneuver in maneuvers.items()}
     for frame in range(count):
-        for manoeuvre in manoeuvres.values():
-            manoeuvre.step()
-        beat(f"{', '.join(manoeuvres)}: frame {frame + 1} of {count}")
+        for maneuver in maneuvers.values():
+            maneuver.step()
+        beat(f"{', '.join(maneuvers)}: frame {frame + 1} of {count}")
     return {name: 1e3 * watch.seconds / count for name, watch in watches.items()}
 
 

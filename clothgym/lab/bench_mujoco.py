@@ -67,10 +67,10 @@ def measure_mujoco(contact: str, steps: int, seconds: float = SECONDS) -> float:
 def measure_ours(lanes: int, seconds: float = SECONDS) -> float:
     """Frames/s of a batch in strict mode on one core."""
     contact = {"mode": "strict", "thickness": THIN}
-    manoeuvre = EdgeDrop(grid(ROWS, ROWS, SIDE, SIDE), COTTON, range(lanes), THIN, self_collision=contact, threads=1)
-    simulation = manoeuvre.simulation
+    maneuver = EdgeDrop(grid(ROWS, ROWS, SIDE, SIDE), COTTON, range(lanes), THIN, self_collision=contact, threads=1)
+    simulation = maneuver.simulation
     simulation.step()  # loads what is compiled
-    simulation.reset(positions=manoeuvre.start - (0, 0, 0.1 * SIDE - DROP))
+    simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
     return lanes / _mean_seconds(f"falling, {lanes}", simulation.step, seconds)
 
 
