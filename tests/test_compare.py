@@ -107,7 +107,7 @@ def test_the_picture_shows_each_stable_sheet(tiny):
     assert [np.mean(np.abs(p - panels[1]).max(axis=-1) > 20) > 0.05 for p in panels] == [True, False, True, True]
     for panel, owner in zip(panels, (None, None, "verlet", "xpbd")):
         seen = [
-            name for name in ("verlet", "xpbd", "implicit_euler", "rk4") if coloured(panel, compare_pictures.COLOURS[name]) > 0.02
+            name for name in ("verlet", "xpbd", "implicit_euler", "rk4") if coloured(panel, compare_pictures.COLORS[name]) > 0.02
         ]
         assert seen == ([owner] if owner else [])
 
@@ -118,7 +118,7 @@ def test_the_plot_shows_each_line(tiny):
 
     folder, _ = tiny
     plot = 255 * pyplot.imread(folder / "work_precision.png")
-    found = {name for name, colour in compare_pictures.COLOURS.items() if coloured(plot, colour, 0.03) > 1e-4}
+    found = {name for name, colour in compare_pictures.COLORS.items() if coloured(plot, colour, 0.03) > 1e-4}
     assert {"verlet", "xpbd"} <= found and not found & {"rk4", "semi_implicit_euler", "projective_dynamics"}
 
 
@@ -150,7 +150,7 @@ def test_an_interrupted_run_goes_on(tmp_path, monkeypatch, capsys):
     assert len(measured) == 3 + 4
     capsys.readouterr()
     compare.run(plan._replace(scene=replace(plan.scene, altitude=0.6)), tmp_path)
-    assert len(measured) == 7 + 4 and "measuring anew" in capsys.readouterr().err
+    assert len(measured) == 7 + 4 and "measuring again" in capsys.readouterr().err
 
 
 def test_wrong_names_give_the_right_ones(capsys, tmp_path):
@@ -177,7 +177,7 @@ def test_a_missing_matplotlib_is_told_before_anything_is_measured(tmp_path, monk
 def test_the_first_choice_of_options_is_the_default():
     for name, choices in compare.CHOICES.items():
         assert choices[0].items() <= INTEGRATORS[name].options.items()
-    assert set(compare_pictures.COLOURS) == set(INTEGRATORS)
+    assert set(compare_pictures.COLORS) == set(INTEGRATORS)
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)

@@ -1,4 +1,4 @@
-"""The rows of the table that take milliseconds: passes over one sheet, or over a few in lanes."""
+"""Rows of the table that take milliseconds each: passes over one sheet, or over several in lanes."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from clothgym.simulation import Simulation
 from clothgym.triangles import disc
 
 SIDES, BATCHES = (17, 25, 50, 100), (16, 64, 128)
-STEP = 1e-5  # of what is measured by the substep, where nothing is large enough to be unstable [s]
-ENOUGH = 1_500_000  # springs, substeps and environments of a call
-DRAPE_SUBSTEPS = 50  # of a control step of ClothDrape-v0
-SHARED = 1.15  # what may come on top of a plain step
-NUMBERS = 13  # float32 of a particle in the state that a substep works on: x, v, f, what pushes, and w
+STEP = 1e-5  # substep of the passes, too short to be unstable [s]
+ENOUGH = 1_500_000  # springs times substeps times environments in a call, about
+DRAPE_SUBSTEPS = 50  # in a control step of ClothDrape-v0
+SHARED = 1.15  # goal: time of a plain step times this
+NUMBERS = 13  # float32 values of a particle that a substep reads and writes: x, v, f, external force, and w
 
 
 def hanging(mesh: ClothMesh, num_envs: int = 1, damping_time: float = 1e-4, **world: Any) -> Simulation:
-    """Sheets that hang upright by their upper corners, or by the ends of a disc's rim, slightly uneven."""
+    """Slightly uneven sheets that hang upright by their upper corners, a disc by particles of its rim."""
     held = mesh.corners[2:] if mesh.shape is not None else (mesh.num_particles - 4, mesh.num_particles - 1)
     fabric = Material.preset("cotton", damping_time=damping_time, air_drag=0.72)
     world = {"anchors": held, "air_density": 0.0, "threads": 1, "on_divergence": "ignore", **world}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is timed need not be accurate
+        warnings.simplefilter("ignore")  # timings need no accuracy
         simulation = Simulation(mesh, fabric, num_envs, **world)
     ripple = np.random.default_rng(0).normal(scale=1e-4, size=(num_envs, mesh.num_particles, 3))
     simulation.reset(positions=mesh.rest_positions[:, [0, 2, 1]] + ripple)
@@ -48,7 +48,7 @@ def hanging(mesh: ClothMesh, num_envs: int = 1, damping_time: float = 1e-4, **wo
 
 
 def pass_of(mesh: ClothMesh, spring: Work = SPRING) -> Work:
-    """What a substep of springs alone must do."""
+    """Work of a substep with springs alone."""
     return spring.times(len(mesh.springs.kind)).plus(PARTICLE.times(mesh.num_particles))
 
 
@@ -56,7 +56,7 @@ def bare(
     group: str, what: str, mesh: ClothMesh, num_envs: int = 1, passes: int = 1, work: Work | None = None, wanted: str = "",
     goal: tuple[float, Case] | None = None, **world: Any,
 ) -> Case:  # fmt: skip
-    """Substeps alone: ns of a pass over the springs, a spring and environment."""
+    """A case of substeps alone: ns of a pass over the springs, per spring and environment."""
     springs = len(mesh.springs.kind)
     substeps = max(8, ENOUGH // (springs * num_envs * passes))
     simulation = hanging(mesh, num_envs, time_step=substeps * STEP, substeps=substeps, **world)
@@ -73,7 +73,7 @@ def bare(
 
 @cache
 def plain(side: int) -> Case:
-    """The plain step that all is held against."""
+    """The plain step, with which all others are compared."""
     sheet = PlainSheet(side)
     steps = max(8, ENOUGH // sheet.springs)
     work, visits = pass_of(grid(side, side, 1.0, 1.0)), steps * sheet.springs
@@ -83,7 +83,7 @@ def plain(side: int) -> Case:
     )  # fmt: skip
 
 
-DRAPE = grid(17, 17, 0.6, 0.6)  # the sheet of ClothDrape-v0, and what a substep of it works on
+DRAPE = grid(17, 17, 0.6, 0.6)  # the sheet of ClothDrape-v0, and its working set
 DRAPE_SPRINGS, DRAPE_SIZE = len(DRAPE.springs.kind), 4 * DRAPE.num_particles * NUMBERS
 
 
@@ -95,24 +95,26 @@ def control_step(
     work: Work | None,
     ahead: int = 0,
     world: dict[str, Any] | None = None,
-    **told: Any,
+    **shown: Any,
 ) -> Case:
-    """A control step of that sheet, with no solids, in us an environment; ahead: steps before the first."""
+    """A case of control steps of that sheet without solids, in us per environment; ahead: warm-up steps."""
     simulation = hanging(DRAPE, num_envs, time_step=1 / 30, substeps=DRAPE_SUBSTEPS, **(world or {}))
     simulation.step(1 + ahead)
     visits = DRAPE_SUBSTEPS * DRAPE_SPRINGS * num_envs
     return Case(
-        group, f"{what}, {_told(num_envs)}", simulation.step, 1e6 / num_envs, unit, visits=visits, work=work,
-        springs=DRAPE_SPRINGS, size=DRAPE_SIZE, **told,
+        group, f"{what}, {_each(num_envs)}", simulation.step, 1e6 / num_envs, unit, visits=visits, work=work,
+        springs=DRAPE_SPRINGS, size=DRAPE_SIZE, **shown,
     )  # fmt: skip
 
 
 @cache
 def base(num_envs: int) -> Case:
+    """That sheet with springs alone."""
     return control_step("springs", "control step of ClothDrape-v0's sheet, springs alone", num_envs, "us", pass_of(DRAPE), goal=115)
 
 
-def _told(num_envs: int) -> str:
+def _each(num_envs: int) -> str:
+    """How a row calls a batch."""
     return "one" if num_envs == 1 else f"each of {num_envs}"
 
 
@@ -127,7 +129,7 @@ def springs() -> Iterator[Case]:
         yield bare("springs", what, mesh, passes=passes, goal=(SHARED, plain(25)), integrator=name)
     for num_envs in (1, 64):
         yield bare(
-            "springs", f"explicit, a disc of 631, {_told(num_envs)}", disc(0.5, 14), num_envs, wanted="no slower than before"
+            "springs", f"explicit, a disc of 631, {_each(num_envs)}", disc(0.5, 14), num_envs, wanted="no slower than before"
         )
     yield from (base(1), base(128))
 
@@ -137,7 +139,7 @@ def springs() -> Iterator[Case]:
 
 def bending() -> Iterator[Case]:
     n = DRAPE.num_particles
-    # no skip springs
+    # without skip springs
     springs = SPRING.times(int(np.sum(DRAPE.springs.kind <= SHEAR))).plus(PARTICLE.times(n))
     models = (("quadratic", STENCIL.times(n), 1.15), ("hinge", HINGE.times(len(DRAPE.hinges.weight)), 5.0))
     for model, work, times in models:
@@ -158,14 +160,14 @@ def air() -> Iterator[Case]:
 
 
 def limiter() -> Iterator[Case]:
-    told: dict[str, Any] = {"wanted": "no slower than before", "beyond": base(1)}
+    shown: dict[str, Any] = {"wanted": "no slower than before", "beyond": base(1)}
     cases: tuple[tuple[str, dict[str, Any]], ...] = (
         ("nothing to limit", {}),
         ("ten times the weight", {"gravity": (0.0, 0.0, -98.1)}),
     )
     for what, changes in cases:
         world = {"strain_limit": 0.1, **changes}
-        yield control_step("limiter", f"strain limit of 10 %, {what}", 1, "us more", None, 60, world, **told)
+        yield control_step("limiter", f"strain limit of 10 %, {what}", 1, "us more", None, 60, world, **shown)
 
 
 # --- other methods ------------------------------------------------------------------------------------------------------------
@@ -200,7 +202,7 @@ def gauss_seidel() -> Iterator[Case]:
     for what, integrator, damping_time, spring in cases:
         for num_envs in (1, 64, 128):
             yield bare(
-                "gauss_seidel", f"{what}, {_told(num_envs)}, 25 x 25", mesh, num_envs, wanted="no slower than before",
+                "gauss_seidel", f"{what}, {_each(num_envs)}, 25 x 25", mesh, num_envs, wanted="no slower than before",
                 work=pass_of(mesh, spring), integrator=integrator, damping_time=damping_time,
             )  # fmt: skip
 

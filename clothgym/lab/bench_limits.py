@@ -1,14 +1,13 @@
-"""What the table is held against: a plain step of one sheet, and what the machine can do at most.
+"""What the table's rows are compared with: a plain step of one sheet, and the limits of the machine.
 
-The plain step takes the particles of one grid as the vector: springs of a kind join each particle with the one a constant number of
-places further on, so a kind is one loop, and what a particle gets is one sum over the kinds.  It has no contact, no hands and no
-choice of anything.
+The plain step vectorizes over the particles of one grid: springs of one kind join each particle with the one a constant number of
+places further on, so each kind is one loop, and the force on a particle is one sum over the kinds.  It has no contact, no
+attachments and no options.
 
-A roofline: of a pass over springs it is counted how many operations and roots it must do and how many bytes it must move for each
-spring; a machine that does so many of each in a second cannot be faster than the slowest of the three allows (Williams, Waterman
-and Patterson 2009).
+A roofline: for each spring the operations, the roots and the bytes moved of a pass are counted.  A machine that does a given number
+of each per second cannot be faster than the slowest of the three allows (Williams, Waterman and Patterson 2009).
 
-What is compiled here calls nothing of other files, so this file's own stamp is all that the cache must heed.
+Kernels here call nothing from other files, so their cache depends on this file alone.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from clothgym._jit import apart, inlined
 # --- a plain step -------------------------------------------------------------------------------------------------------------
 
 KINDS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))  # rows and columns from one end of a spring to the other
-TINY = 1e-30  # [m^2]: springs whose places wrap around a row's end join ends that may coincide, and have no stiffness
+TINY = 1e-30  # for springs that wrap around the end of a row: they have no stiffness, and their ends may coincide [m^2]
 
 
 @inlined
 def _pull(x0, x1, x2, y0, y1, y2, v0, v1, v2, w0, w1, w2, stiffness, rest, tau, f0, f1, f2, count):
-    """Forces of the springs of a kind on their first ends [N]: from ``x``, ``v`` to ``y``, ``w``."""
+    """Forces of the springs of one kind on their first ends [N]; first ends at ``x``, ``v``, second ends at ``y``, ``w``."""
     one, tiny = rest.dtype.type(1), rest.dtype.type(TINY)
     r, t = rest[0], tau[0]
     for p in range(count):
@@ -43,16 +42,18 @@ def _pull(x0, x1, x2, y0, y1, y2, v0, v1, v2, w0, w1, w2, stiffness, rest, tau, 
 
 @apart
 def plain_steps(x, v, f, push, w, places, stiffness, rest, tau, parts, gravity, h, keep, steps):
-    """So many semi-implicit steps of ``h`` [s].
+    """``steps`` semi-implicit steps of ``h`` [s].
 
-    x [m], v [m/s], f, push [N]: (3, particles); w [1/kg]: (particles,); places: from a spring's one end to the other, (kinds,);
-    stiffness [N/m]: of the spring that begins at a particle, (kinds, particles); rest [m]: (kinds,); tau: damping time [s], (1,).
-    parts: (3, kinds, margin + particles), zero in the margin, which is at least the largest of places.
+    x [m], v [m/s], f, push [N]: (3, particles); push: external forces.  w [1/kg]: (particles,).  places: from one end of a spring
+    to the other, by kind, (kinds,).  stiffness [N/m]: of the spring that starts at a particle, (kinds, particles).  rest [m]:
+    (kinds,).  tau: damping time [s], (1,).  parts: scratch, (3, kinds, margin + particles), zero in the margin, which is at least
+    the largest of places.
     """
     n = x.shape[1]
     margin = parts.shape[2] - n
     zero = x.dtype.type(0)
     for _ in range(steps):
+        # forces of all springs, by kind
         f[:] = push
         for k in range(6):
             o = places[k]
@@ -65,7 +66,7 @@ def plain_steps(x, v, f, push, w, places, stiffness, rest, tau, parts, gravity, 
             a0, a1, a2, a3, a4, a5 = g[0, margin:], g[1, margin:], g[2, margin:], g[3, margin:], g[4, margin:], g[5, margin:]
             b0, b1, b2 = g[0, margin - places[0] :], g[1, margin - places[1] :], g[2, margin - places[2] :]
             b3, b4, b5 = g[3, margin - places[3] :], g[4, margin - places[4] :], g[5, margin - places[5] :]
-            # what a particle gets: of each kind the spring that ends there, then the one that begins there
+            # the force on a particle: for each kind, the spring that ends there, then the one that starts there
             for p in range(n):
                 ends = fc[p] - b0[p] + a0[p] - b1[p] + a1[p] - b2[p] + a2[p]
                 fc[p] = ends - b3[p] + a3[p] - b4[p] + a4[p] - b5[p] + a5[p]
@@ -77,11 +78,11 @@ def plain_steps(x, v, f, push, w, places, stiffness, rest, tau, parts, gravity, 
 
 
 class PlainSheet:
-    """A sheet of a metre and 150 g that hangs by two corners, and its plain steps of 10 microseconds.
+    """A sheet of 1 m and 150 g that hangs by two corners, and its plain steps of 10 microseconds.
 
     Attributes:
         springs: their number, without those that wrap around.
-        bytes: of all its arrays.
+        bytes: size of all its arrays.
     """
 
     def __init__(self, side: int) -> None:
@@ -106,6 +107,7 @@ class PlainSheet:
         self.bytes = sum(array.nbytes for array in arrays)
 
     def step(self, steps: int) -> None:
+        """Advance by ``steps`` plain steps."""
         f4 = np.float32
         plain_steps(
             self.x, self.v, self.f, self.push, self.w, self.places, self.stiffness, self.rest, self.tau, self.parts, self.gravity,
@@ -115,14 +117,14 @@ class PlainSheet:
 
 # --- what the machine can do --------------------------------------------------------------------------------------------------
 
-LINKS = 3  # multiply-adds of an element between its load and its store: few, so that many chains are on their way at once
+LINKS = 3  # multiply-adds of an element between its load and its store: few, so that many chains are in flight at once
 LEVELS = ("L1", "L2", "L3", "memory")
-SIZES = {"L1": 32 << 10, "L2": 512 << 10, "L3": 16 << 20}  # where the system does not tell [bytes]
+SIZES = {"L1": 32 << 10, "L2": 512 << 10, "L3": 16 << 20}  # where the system does not report them [bytes]
 
 
 @apart
 def multiply_and_add(a, factor, term, rounds):
-    """``LINKS`` multiplications and additions of each element in registers, so many times: as many chains as there are elements."""
+    """``LINKS`` multiply-adds of each element in registers, ``rounds`` times: one chain for each element."""
     for _ in range(rounds):
         for i in range(a.shape[0]):
             t = a[i]
@@ -133,7 +135,7 @@ def multiply_and_add(a, factor, term, rounds):
 
 @apart
 def divide_by_roots(a, rounds):
-    """A square root and a division of each element, so many times."""
+    """A square root and a division of each element, ``rounds`` times."""
     one = a.dtype.type(1)
     for _ in range(rounds):
         for i in range(a.shape[0]):
@@ -142,14 +144,14 @@ def divide_by_roots(a, rounds):
 
 @apart
 def stream(a, b, c, factor, rounds):
-    """``a = b + factor c``: two loads and a store of each element, so many times."""
+    """``a = b + factor c``: two loads and a store of each element, ``rounds`` times."""
     for _ in range(rounds):
         for i in range(a.shape[0]):
             a[i] = b[i] + factor * c[i]
 
 
 def seconds(call: Callable[[], object], repeats: int = 5) -> float:
-    """Least processor time of this thread of several calls, after one to warm up [s]."""
+    """Shortest processor time of several calls in this thread, after one to warm up [s]."""
     call()
     times = []
     for _ in range(repeats):
@@ -160,7 +162,7 @@ def seconds(call: Callable[[], object], repeats: int = 5) -> float:
 
 
 def cache_sizes() -> dict[str, int]:
-    """Of a core's data caches [bytes]."""
+    """Sizes of a core's data caches [bytes]."""
     sizes = dict(SIZES)
     for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
         kind, level, size = ((folder / name).read_text().strip() for name in ("type", "level", "size"))
@@ -170,9 +172,9 @@ def cache_sizes() -> dict[str, int]:
 
 
 def measure_limits() -> dict[str, Any]:
-    """Operations, inverse roots (a root and a division), and bytes from each level that a core does in a second, in float32.
+    """Operations, inverse roots (a root and a division), and bytes from each level per second and core, in float32.
 
-    A third of a cache is streamed through for each of three arrays, of half its size in all; of memory six times the last cache.
+    The three arrays that are streamed through fill half a cache together, and in memory six times the last cache.
     """
     f4 = np.float32
     a = np.full(1024, 0.5, f4)
@@ -183,7 +185,7 @@ def measure_limits() -> dict[str, Any]:
     for level in LEVELS:
         whole = sizes[level] // 2 if level in sizes else min(6 * sizes["L3"], 256 << 20)
         length = whole // (3 * 4)
-        arrays = [np.zeros(length + 16 * k, f4)[16 * k :] for k in range(3)]  # not all at one place of a page
+        arrays = [np.zeros(length + 16 * k, f4)[16 * k :] for k in range(3)]  # at different offsets within a page
         rounds = max(1, (64 << 20) // whole)
         bandwidth[level] = 12 * length * rounds / seconds(lambda: stream(*arrays, f4(0.5), rounds))  # noqa: B023
     return {"operations/s": arithmetic, "inverse roots/s": roots, "bytes/s": bandwidth, "cache bytes": sizes}
@@ -193,10 +195,11 @@ def measure_limits() -> dict[str, Any]:
 
 
 class Work(NamedTuple):
-    """What must be done for each element (a spring, a hinge, a particle or a triangle), in float32.
+    """Work for each element (a spring, a hinge, a particle or a triangle), in float32.
 
     operations: additions and multiplications.  roots: inverse roots, and other divisions.  numbers: loaded and stored in all;
-    streamed: those that no loop has just had, and that come from as far away as all of the sheet lies.
+    streamed: those that no loop has just touched, which come from the cache level that holds the whole sheet.  formula: the counts
+    in words.
     """
 
     operations: float
@@ -206,10 +209,12 @@ class Work(NamedTuple):
     formula: str
 
     def times(self, count: float) -> Work:
+        """The work of ``count`` elements."""
         counts = (self.operations * count, self.roots * count, self.numbers * count, self.streamed * count)
         return Work(*counts, f"{count:g} x ({self.formula})")
 
     def plus(self, other: Work) -> Work:
+        """The work of both."""
         operations, roots = self.operations + other.operations, self.roots + other.roots
         numbers, streamed = self.numbers + other.numbers, self.streamed + other.streamed
         return Work(operations, roots, numbers, streamed, f"{self.formula} + {other.formula}")
@@ -235,14 +240,14 @@ DAMPED_PROJECTION = Work(52, 2, 24, 24, "spring: 9 d and u, 6 |d|^2, 5 u.d, 11 f
 
 
 def level_of(size: float, sizes: dict[str, int]) -> str:
-    """The first level that holds so many bytes."""
+    """The first level that holds that many bytes."""
     return next((level for level in LEVELS[:-1] if size <= sizes[level]), "memory")
 
 
 def stand(ns: float, work: Work, springs: int, size: float, limits: dict[str, Any]) -> dict[str, Any]:
-    """Where a substep stands: shares of what the machine can do at most, and which is largest.
+    """How close a substep is to the limits: its share of each, and which is largest.
 
-    ns: that it takes for each spring; work: that it must do in all; size: of what it works on [bytes].
+    ns: time for each spring.  work: of the whole substep.  springs: their number.  size: working set [bytes].
     """
     level = level_of(size, limits["cache bytes"])
     numbers = work.numbers if level == "L1" else work.streamed

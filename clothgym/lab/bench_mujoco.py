@@ -1,4 +1,4 @@
-"""A sheet of half a metre that falls 5 cm on its edge, by MuJoCo 4 and by us: frames a second."""
+"""A sheet of half a meter that falls 5 cm onto its edge, in MuJoCo 4 and here: frames per second."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from clothgym.starts import EdgeDrop
 
 FRAME, ROWS, SIDE, SECONDS, DROP, THIN = 1 / 60, 25, 0.5, 2.0, 0.05, 0.004
 COTTON = Material.preset("cotton")
-YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # where the preset comes from: [Pa], [m]
+YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # from the source of the preset: [Pa], [m]
 
 
 def mujoco_model(contact: str, steps: int) -> Any:
-    """The scene with MuJoCo's ``ipc`` contacts, or its ordinary ones, and so many steps a frame."""
+    """The scene with MuJoCo's ``ipc`` contacts or its ordinary ones, with ``steps`` steps per frame."""
     import mujoco
 
     spacing = SIDE / (ROWS - 1)
@@ -46,7 +46,7 @@ def mujoco_model(contact: str, steps: int) -> Any:
 
 
 def start_of(model: Any) -> Any:
-    """Data at the start, slightly uneven."""
+    """Data at the start, with the sheet slightly uneven."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -69,12 +69,13 @@ def measure_ours(lanes: int, seconds: float = SECONDS) -> float:
     contact = {"mode": "strict", "thickness": THIN}
     maneuver = EdgeDrop(grid(ROWS, ROWS, SIDE, SIDE), COTTON, range(lanes), THIN, self_collision=contact, threads=1)
     simulation = maneuver.simulation
-    simulation.step()  # loads what is compiled
+    simulation.step()  # loads compiled code
     simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
     return lanes / _mean_seconds(f"falling, {lanes}", simulation.step, seconds)
 
 
 def _mean_seconds(name: str, frame: Callable[[], object], seconds: float) -> float:
+    """Mean processor time of a frame [s], over ``seconds`` of simulated time."""
     count, total = round(seconds / FRAME), 0.0
     for k in range(count):
         begun = time.thread_time()

@@ -1,8 +1,8 @@
-"""One scene, several integrators: what each costs, and how far it is from the converged answer.
+"""One scene, several integrators: what each costs, and how far it is from the converged solution.
 
-The reference is the same sheet with the same material, solved by ``rk4`` in float64 with many substeps; with half of these it
-shows how converged it is.  Errors are root-mean-square distances of particles at the scene's end.  Costs are processor time of
-one thread, the median of several control steps, with the integrators in turn, so that noise hits all alike.
+The reference is the same sheet with the same material, solved by ``rk4`` in float64 with many substeps; a run with half as many
+shows how well it has converged.  Errors are root-mean-square distances of particles at the end of the scene.  Costs are processor
+time of one thread, the median of several control steps, with the integrators in turn, so that disturbances affect all alike.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from clothgym.simulation import Simulation
 
 Row = dict[str, Any]
 
-BURST = 10.0  # strain of a sheet that has blown up, if not as far as to be flagged as diverged
+BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
 LANES = 64  # sheets in the batch that is timed
-VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting, and the seconds after which fewer of them will do
-# what of an integrator's options is tried: the first is its default
+VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; fewer, but so many, once they have taken so long [s]
+# options of an integrator to try, its default first
 CHOICES: dict[str, tuple[dict[str, int], ...]] = {
     "implicit_euler": ({"newton_iterations": 1}, {"newton_iterations": 3}),
     "projective_dynamics": ({"iterations": 10}, {"iterations": 3}),
@@ -39,7 +39,7 @@ CHOICES: dict[str, tuple[dict[str, int], ...]] = {
 
 
 class Setting(NamedTuple):
-    """What is measured: an integrator, its options, the substeps of a control step, and a variant of the scene, if any."""
+    """One configuration to measure: integrator, options, substeps of a control step, and a variant of the scene or ""."""
 
     integrator: str
     options: Mapping[str, int]
@@ -54,14 +54,14 @@ class Setting(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A scene and what is tried on it; ``quick`` tries less."""
+    """A scene and the integrators to try on it; ``quick`` tries fewer settings."""
 
     scene: Scene
     names: tuple[str, ...]
     quick: bool = False
 
     def settings(self) -> list[Setting]:
-        """By integrator, option and substeps; then the scene's variants, at the picture's substeps."""
+        """All settings, by integrator, option and substeps; then the scene's variants, with the substeps of the picture."""
         scene = self.scene
         tried = [n for place, n in enumerate(scene.substeps) if n == scene.shown or place % 2 or not self.quick]
         of = {name: CHOICES.get(name, ({},))[: 1 if self.quick else None] for name in self.names}
@@ -70,7 +70,7 @@ class Plan(NamedTuple):
         ]
 
     def shown(self) -> list[Setting]:
-        """Those in the picture."""
+        """The settings in the picture."""
         settings = [s for s in self.settings() if s.substeps == self.scene.shown]
         return [s for s in settings if s.options == CHOICES.get(s.integrator, ({},))[0]]
 
@@ -94,7 +94,7 @@ def rms_mm(a: NDArray, b: NDArray) -> float:
 
 
 def angular_momentum(s: Simulation) -> NDArray:
-    """About the centre of mass [kg m^2/s], (3,)."""
+    """Angular momentum about the center of mass [kg m^2/s], (3,)."""
     state = s.get_state()
     mass = 1 / state.free_inverse_mass[0].astype(np.float64)
     x, v = (a[0].astype(np.float64) - np.average(a[0], axis=0, weights=mass) for a in (state.positions, state.velocities))
@@ -102,7 +102,7 @@ def angular_momentum(s: Simulation) -> NDArray:
 
 
 def reference(scene: Scene) -> tuple[NDArray, Row]:
-    """The converged sheet [m], (particles, 3), and what is known of it."""
+    """The converged sheet [m], (particles, 3), and a description of the run."""
     ends = []
     for substeps in (scene.reference_substeps // 2, scene.reference_substeps):
         s = scene.simulation("rk4", substeps, dtype="float64")
@@ -113,7 +113,7 @@ def reference(scene: Scene) -> tuple[NDArray, Row]:
 
 
 def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple[Row, NDArray | None]:
-    """A row of the table but for the costs, and the sheet at the end if the run was stable."""
+    """A row of the table without costs, and the sheet at the end [m], (particles, 3), if the run was stable."""
     s = setting.simulation(scene)
     largest, _ = s.largest_substep()
     row: Row = setting._asdict() | {
@@ -139,7 +139,7 @@ def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple
 
 
 def costs(scene: Scene, settings: Sequence[Setting], num_envs: int) -> list[float]:
-    """Seconds of a control step of each setting's batch: medians over visits in turn."""
+    """Median time of a control step of each setting's batch [s]; the batches take turns."""
     batches = [setting.simulation(scene, num_envs) for setting in settings]
     times: list[list[float]] = [[] for _ in batches]
     for s in batches:
@@ -147,14 +147,14 @@ def costs(scene: Scene, settings: Sequence[Setting], num_envs: int) -> list[floa
     for visit in range(VISITS):
         for s, taken in zip(batches, times):
             if visit < AT_LEAST or sum(taken) < ENOUGH:
-                begun = time.thread_time()  # not the clock's: what else the machine does is no cost of ours
+                begun = time.thread_time()  # processor time: other work of the machine is not counted
                 s.step()
                 taken.append(time.thread_time() - begun)
     return [statistics.median(taken) for taken in times]
 
 
 def add_costs(scene: Scene, rows: Sequence[Row]) -> None:
-    """Fill in the costs of rows that are measured together."""
+    """Measure the costs of these rows together, and add them."""
     settings = [Setting(*(row[name] for name in Setting._fields)) for row in rows]
     together, alone = costs(scene, settings, LANES), costs(scene, settings, 1)
     for row, setting, batch, single in zip(rows, settings, together, alone):
@@ -172,7 +172,7 @@ def add_costs(scene: Scene, rows: Sequence[Row]) -> None:
 
 
 class Record:
-    """The results in a folder: written after every row, found again by the next run."""
+    """The results in a folder: written after each row, and read by the next run."""
 
     def __init__(self, folder: Path, scene: Scene, fresh: bool) -> None:
         self.path, self.sheets_path = folder / "results.json", folder / "sheets.npz"
@@ -187,10 +187,10 @@ class Record:
         if fresh or not (self.path.exists() and self.sheets_path.exists()):
             return
         earlier = json.loads(self.path.read_text())
-        # rows of another machine, version or scene would compare nothing
+        # rows of another machine, version or scene cannot be compared
         here = [(r["scene"], {k: v for k, v in r["machine"].items() if k != "date"}) for r in (earlier, self.results)]
         if here[0] != here[1]:
-            print(f"{self.path} is of another scene, version or machine: measuring anew", file=sys.stderr)
+            print(f"{self.path} is of another scene, version or machine: measuring again", file=sys.stderr)
             return
         self.results = earlier
         with np.load(self.sheets_path, allow_pickle=False) as file:
@@ -200,7 +200,7 @@ class Record:
         return next((row for row in self.results["rows"] if setting.matches(row)), None)
 
     def write(self) -> None:
-        """Sheets first: a row that is there has its sheet."""
+        """Write sheets first, so that each row that is there has its sheet."""
         part = self.sheets_path.with_name("part.npz")
         np.savez(part, **self.sheets)  # type: ignore[arg-type]
         part.replace(self.sheets_path)
@@ -214,10 +214,10 @@ def sheet_name(setting: Setting) -> str:
 
 
 def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
-    """Measure what the folder does not have yet, and draw; returns the results.
+    """Measure what the folder lacks, draw the pictures, and return the results.
 
     Raises:
-        ImportError: matplotlib is missing; nothing has been measured then.
+        ImportError: matplotlib is missing; nothing has been measured.
     """
     from clothgym.lab import compare_pictures
 
@@ -251,7 +251,7 @@ def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
 
 
 def _to_be_timed(rows: Sequence[Row]) -> Iterator[list[Row]]:
-    """Stable rows without a cost, those with as many substeps together."""
+    """Stable rows without costs, in groups with the same substeps."""
     for substeps in sorted({row["substeps"] for row in rows}):
         group = [row for row in rows if row["substeps"] == substeps and row["stable"] and "ms_batch" not in row]
         if group:
@@ -276,8 +276,8 @@ COLUMNS = {
 }
 
 
-def told(options: Mapping[str, int], variant: str = "") -> str:
-    """Options and variant as a table has them."""
+def described(options: Mapping[str, int], variant: str = "") -> str:
+    """Options and variant as shown in a table."""
     return ", ".join([f"{name.replace('_', ' ')} {value}" for name, value in options.items()] + [variant] * bool(variant))
 
 
@@ -287,7 +287,12 @@ def table(results: Row) -> str:
     columns = {key: column for key, column in COLUMNS.items() if any(key in row for row in rows)}
     lines = [["integrator", "options", "substeps", "auto", "stable", *(title for title, _, _ in columns.values())]]
     for row in rows:
-        cells = [row["integrator"], told(row["options"], row["variant"]), str(row["substeps"]), str(row["auto_substeps"] or "none")]
+        cells = [
+            row["integrator"],
+            described(row["options"], row["variant"]),
+            str(row["substeps"]),
+            str(row["auto_substeps"] or "none"),
+        ]
         cells.append(("yes" if row["consistent"] else "inconsistent") if row["stable"] else "NO")
         lines.append(cells + [form.format(scale * row[key]) if key in row else "-" for key, (_, form, scale) in columns.items()])
     widths = [max(map(len, column)) for column in zip(*lines)]
@@ -309,5 +314,5 @@ def table(results: Row) -> str:
 
 
 def scene_list() -> str:
-    """Names and sentences."""
+    """Names and descriptions of the scenes, one on each line."""
     return "\n".join(f"{name:<14} {scene.breaks}" for name, scene in SCENES.items())

@@ -1,4 +1,4 @@
-"""What a comparison looks like: a work-precision plot, and the sheets side by side."""
+"""Pictures of a comparison: a work-precision plot, and the sheets side by side."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from clothgym.lab.compare import Row, Setting
 
 INK, QUIET = "#2b2d42", "#8d99ae"
-COLOURS = {
+COLORS = {
     "explicit_euler": "#8a8f98",
     "semi_implicit_euler": "#d1495b",
     "verlet": "#2f6fb5",
@@ -29,14 +29,14 @@ COLOURS = {
 REFERENCE = "#c4bdb2"
 STYLES = (("-", "o"), ("--", "s"), (":", "^"))
 PANEL, ACROSS, DPI = 300, 5, 100  # pixels of a sheet's picture, sheets in a row, pixels of an inch
-FLOATING = 1e-4  # as far as an error axis goes down: what is below is the rounding of float32 [mm]
+FLOATING = 1e-4  # lower end of the error axis: below is the rounding of float32 [mm]
 
 
 def pyplot() -> Any:
-    """matplotlib's, without a window.
+    """matplotlib.pyplot without windows.
 
     Raises:
-        ImportError: it is missing; the message says how to get it.
+        ImportError: matplotlib is missing; the message says how to install it.
     """
     try:
         import matplotlib
@@ -49,8 +49,8 @@ def pyplot() -> Any:
 
 
 def draw_work_precision(results: Row, path: Path) -> None:
-    """Error over cost: a colour for each integrator, a line for each choice of its options."""
-    from clothgym.lab.compare import LANES, told
+    """Error over cost: a color for each integrator, a line for each choice of its options."""
+    from clothgym.lab.compare import LANES, described
 
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(9.6, 5.0), layout="constrained")
@@ -58,7 +58,7 @@ def draw_work_precision(results: Row, path: Path) -> None:
     lines: dict[tuple[str, str], list[Row]] = {}
     for row in results["rows"]:
         if not row["variant"]:
-            lines.setdefault((row["integrator"], told(row["options"])), []).append(row)
+            lines.setdefault((row["integrator"], described(row["options"])), []).append(row)
     seen: dict[str, int] = {}
     for (name, options), rows in lines.items():
         style, marker = STYLES[seen.setdefault(name, 0)]
@@ -70,20 +70,20 @@ def draw_work_precision(results: Row, path: Path) -> None:
         if failed:
             notes.append(f"unstable with {max(failed)}" + " or fewer" * (len(failed) > 1) if stable else "always unstable")
         x, y = ([row[key] for row in stable] for key in ("ms_batch", "error_mm"))
-        look = {"ls": style, "marker": marker, "ms": 4.5, "lw": 1.5, "mfc": COLOURS[name] if seen[name] == 1 else "white"}
-        axes.plot(x, np.maximum(y, FLOATING), color=COLOURS[name], label="\n   ".join([label, *notes]), **look)
+        look = {"ls": style, "marker": marker, "ms": 4.5, "lw": 1.5, "mfc": COLORS[name] if seen[name] == 1 else "white"}
+        axes.plot(x, np.maximum(y, FLOATING), color=COLORS[name], label="\n   ".join([label, *notes]), **look)
         if stable and seen[name] == 1:
             for row in (stable[0], stable[-1]):
                 place = row["ms_batch"], max(row["error_mm"], FLOATING)
                 beside = (4, -10) if name == "semi_implicit_euler" else (4, 4)  # verlet's line is the same
                 axes.annotate(
-                    row["substeps"], place, beside, textcoords="offset points", fontsize=7.5, color=COLOURS[name], clip_on=True
+                    row["substeps"], place, beside, textcoords="offset points", fontsize=7.5, color=COLORS[name], clip_on=True
                 )
     scene, about = results["scene"], results["reference"]
     bound = 5 * max(scene["size"][2:])
     axes.axhline(bound, color=QUIET, lw=0.9, ls=(0, (6, 4)), zorder=0)
     axes.annotate(
-        "5 mm a metre", (1, bound), (-2, 3), ("axes fraction", "data"), "offset points", ha="right", color=QUIET, fontsize=8
+        "5 mm per meter", (1, bound), (-2, 3), ("axes fraction", "data"), "offset points", ha="right", color=QUIET, fontsize=8
     )
     axes.set_xlabel(f"ms of one core per simulated second of one sheet, one of {LANES}", color=INK)
     axes.set_ylabel(f"rms error after {about['seconds']:g} s [mm]", color=INK)
@@ -99,7 +99,7 @@ def draw_work_precision(results: Row, path: Path) -> None:
 
 
 def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting, Row, NDArray | None]], path: Path) -> None:
-    """The reference, and each integrator's sheet in its colour; an unstable one's room is empty.
+    """The reference, and the sheet of each integrator in its color; the picture of an unstable one is empty.
 
     reference, sheets: positions [m], (particles, 3).
     """
@@ -109,7 +109,7 @@ def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting
         outcome = f"{row['error_mm']:.3g} mm off" if row["stable"] else "unstable"
         detail = setting.variant or f"{setting.substeps} substeps"
         labels.append(f"{setting.integrator}\n{detail}, {outcome}")
-        pictures.append(_picture(scene, sheet if sheet is not None else None, COLOURS[setting.integrator]))
+        pictures.append(_picture(scene, sheet if sheet is not None else None, COLORS[setting.integrator]))
     across = min(ACROSS, len(pictures))
     down = -(-len(pictures) // across)
     figure = plt.figure(figsize=(across * PANEL / DPI, down * (PANEL + 52) / DPI), facecolor="white")
@@ -121,18 +121,18 @@ def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting
         axes.imshow(picture, aspect="auto", interpolation="antialiased")
         axes.set_axis_off()
         first, second = label.split("\n")
-        colour = COLOURS.get(first, INK)
+        color = COLORS.get(first, INK)
         middle, under = left + 0.5 / across, top - high
         unit = 1 / (down * (PANEL + 52))
-        figure.text(middle, under - 6 * unit, first, ha="center", va="top", fontsize=12, weight="bold", color=colour)
+        figure.text(middle, under - 6 * unit, first, ha="center", va="top", fontsize=12, weight="bold", color=color)
         figure.text(middle, under - 27 * unit, second, ha="center", va="top", fontsize=10.5, color=INK)
     figure.savefig(path, dpi=DPI)
     plt.close(figure)
 
 
-def _picture(scene: Scene, sheet: NDArray | None, colour: str) -> NDArray[np.uint8]:
-    """A sheet in its room, or the room alone, (PANEL, PANEL, 3)."""
-    front = tuple(int(colour[place : place + 2], 16) for place in (1, 3, 5))
+def _picture(scene: Scene, sheet: NDArray | None, color: str) -> NDArray[np.uint8]:
+    """A sheet above the floor, or the floor alone, (PANEL, PANEL, 3)."""
+    front = tuple(int(color[place : place + 2], 16) for place in (1, 3, 5))
     back = tuple(round(0.6 * value) for value in front)
     renderer = Renderer(
         scene.mesh.triangles,

@@ -1,4 +1,4 @@
-"""Scenes on which integrators differ, each named for what it breaks."""
+"""Scenes that bring out differences between integrators, each named for what it strains."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Scene:
-    """A grid of cloth, how it begins, and when it is looked at.
+    """A grid of cloth, its start, and when it is evaluated.
 
     Attributes:
-        breaks: what it is and which methods it troubles, as a sentence.
+        breaks: what happens and which methods have trouble with it, as a sentence.
         size: rows, columns, width [m], height [m].
         material: the fabric; ``damping_time`` and ``air_drag`` are the scene's own.
         held: particles that stay where they are.
-        seconds: from the start to the look [s].
-        substeps: of a control step of 1/60 s, those that are tried.
-        shown: the number of them with which the picture is drawn; one of ``substeps``.
+        seconds: from the start to the evaluation [s].
+        substeps: numbers of substeps in a control step of 1/60 s to try.
+        shown: the one of ``substeps`` for which the picture is drawn.
         reference_substeps: of the converged run.
         eye, target: of the picture's camera [m].
-        altitude: height of the sheet's centre above the floor at first [m].
-        upright: begins in the plane y = 0 instead of flat.
+        altitude: height of the sheet's center above the floor at the start [m].
+        upright: starts in the plane y = 0 instead of flat.
         gravity: [m/s^2], downwards.
-        spin: angular velocity about the vertical through the centre at first [rad/s].
+        spin: angular velocity about the vertical through the center at the start [rad/s].
         bending: see ``Simulation``.
-        spring_constant: of all springs in place of the material's [N/m].
-        heavy, heavier: particles whose mass is so many times larger.
-        variants: other models of the same sheet, ``Simulation``'s arguments by label, held against the same reference.
-        settled: whether it has come to rest, so that its strain is a static one.
-        conserves: whether energy and angular momentum should stay as they were.
+        spring_constant: of all springs, instead of the material's [N/m].
+        heavy: particles whose mass is multiplied by ``heavier``.
+        variants: other models of the same sheet, as arguments of ``Simulation`` by label, compared with the same reference.
+        settled: whether it is at rest at the end, so that its strain is static.
+        conserves: whether energy and angular momentum should be conserved.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Scene:
 
     @property
     def start(self) -> tuple[NDArray, NDArray]:
-        """Positions [m] and velocities [m/s] at first, (particles, 3)."""
+        """Positions [m] and velocities [m/s] at the start, (particles, 3)."""
         x = self.mesh.rest_positions
         if self.upright:
             x = x[:, [0, 2, 1]]
@@ -96,7 +96,7 @@ class Scene:
         """The scene at its start, in vacuum and on one thread."""
         model: dict[str, Any] = {"bending": self.bending} | (dict(self.variants[variant]) if variant else {})
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # substeps beyond a method's bound are among what is compared
+            warnings.simplefilter("ignore", UserWarning)  # substeps beyond a method's stability bound are part of the comparison
             s = Simulation(
                 self.mesh,
                 self.material,
@@ -122,7 +122,7 @@ class Scene:
 
 
 def _particles(size: tuple[int, int, float, float], rows: slice, columns: slice) -> tuple[int, ...]:
-    """Those in some rows and columns of a grid."""
+    """Particles in the given rows and columns of a grid."""
     return tuple(np.arange(size[0] * size[1]).reshape(size[:2])[rows, columns].ravel().tolist())
 
 
@@ -150,7 +150,7 @@ SCENES: dict[str, Scene] = {
         ),
         Scene(
             name="soft_corner",
-            breaks="Provot's sheet of soft springs, 1 N/m, hung by two corners: threads stretch far beyond what cloth does, "
+            breaks="Provot's sheet of soft springs, 1 N/m, hung by two corners: yarns stretch far beyond what cloth does, "
             "converged or not, unless strain is limited",
             size=SHEET,
             material=Material(density=0.1, damping_time=0.0, air_drag=0.5),
@@ -169,7 +169,7 @@ SCENES: dict[str, Scene] = {
         ),
         Scene(
             name="heavy_corner",
-            breaks="a light sheet carries a patch fifty times heavier: methods that go from spring to spring leave it too soft",
+            breaks="a light sheet carries a patch fifty times heavier: methods that go spring by spring leave it too soft",
             size=SHEET,
             material=Material.preset("cotton", air_drag=0.75),
             held=TOP_CORNERS,

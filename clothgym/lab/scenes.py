@@ -1,6 +1,6 @@
-"""Floor 6: the two tests by which textile laboratories tell fabrics apart, as scenes: Cusick's drape test and the cantilever.
+"""Two tests by which textile laboratories characterize fabrics: Cusick's drape test and the cantilever.
 
-Both run until the sheet is at rest.  Linear drag calms it (``CALM``); what is left at rest does not depend on it.
+Both run until the sheet is at rest.  Linear drag damps the motion (``SETTLING_DRAG``); the shape at rest does not depend on it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY, Simulation
 from clothgym.triangles import disc
 
-SPECIMEN_RADIUS, SUPPORT_RADIUS = 0.15, 0.09  # of the drape test [m], BS 5058 and ISO 9073-9
-CALM = 20.0  # rate of the linear drag [1/s]: about critical for a skirt or a strip some centimetres long
+SPECIMEN_RADIUS, SUPPORT_RADIUS = 0.15, 0.09  # specimen and support of the drape test [m], BS 5058 and ISO 9073-9
+SETTLING_DRAG = 20.0  # rate of the linear drag [1/s]: about critical for a skirt or a strip of a few centimeters
 REST_SPEED = 1e-3  # a sheet is at rest when no particle is faster [m/s]
-LOADING = 1.0  # the weight comes on slowly, as the specimen is lowered on to the instrument's disc [s]
-ASYMMETRY, MOST_WAVES = 1e-4, 12  # a specimen starts with slight waves, so that it can fold: heights [m], and how many around it
+LOADING = 1.0  # time in which gravity grows from zero, as the specimen is lowered onto the instrument's disc [s]
+ASYMMETRY, MOST_WAVES = 1e-4, 12  # initial waves, without which a specimen would not fold: height [m], largest number around it
 LINES = 4000  # scan lines across a shadow
 COLUMNS, ROWS = 20, 3  # free particles along a strip, and particles across it
 
@@ -31,10 +31,10 @@ Option = str | Mapping[str, Any] | Integrator
 
 
 class Drape(NamedTuple):
-    """A drape test: one value an environment.
+    """Results of a drape test, one for each environment.
 
-    coefficient: of drape, from 0 (limp) to 1 (flat), (num_envs,).  speed: of the fastest particle at the end [m/s],
-    (num_envs,).  seconds: simulated until then.  positions: [m], (num_envs, particles, 3).  mesh: the specimen.
+    coefficient: drape coefficient, from 0 (limp) to 1 (flat), (num_envs,).  speed: of the fastest particle at the end [m/s],
+    (num_envs,).  seconds: simulated time [s].  positions: [m], (num_envs, particles, 3).  mesh: the specimen.
     """
 
     coefficient: NDArray[np.float64]
@@ -45,10 +45,10 @@ class Drape(NamedTuple):
 
 
 class Cantilever(NamedTuple):
-    """A cantilever test.
+    """Results of a cantilever test.
 
-    droop, elastica: angle of the chord from the clamp to the tip under the horizontal, measured and of the heavy elastica [deg].
-    weight: the strip's over its rigidity, ``G = rho g L^3/B``.  speed: of the fastest particle at the end [m/s].
+    droop: angle of the chord from clamp to tip below the horizontal [deg]; elastica: the same of the heavy elastica [deg].
+    weight: of the strip relative to its rigidity, ``G = rho g L^3/B``.  speed: of the fastest particle at the end [m/s].
     positions: [m], (particles, 3).
     """
 
@@ -76,16 +76,16 @@ def cusick_drape(
 ) -> Drape:
     """Let a round specimen of 15 cm radius hang over a disc of 9 cm, and measure its shadow.
 
-    The instrument clamps the specimen between two discs; here the particles over the disc are held where they are.  Each
-    environment starts from heights of its own, drawn with ``seed``, seed + 1, ..., and may come to rest in other folds.
+    The instrument clamps the specimen between two discs; here the particles above the disc are anchored.  Each environment
+    starts from its own heights, drawn with ``seed``, ``seed + 1``, ..., and may come to rest in other folds.
 
     Args:
         material: the fabric; its own ``air_drag`` is replaced.
-        rings: of the specimen's mesh, a multiple of 5, so that one lies on the disc's edge.
-        seconds: to give up after; ``Drape.speed`` tells whether the sheet was at rest by then.
+        rings: of the specimen's mesh, a multiple of 5, so that one lies on the edge of the support.
+        seconds: longest simulated time [s]; ``Drape.speed`` shows whether the sheet was at rest.
 
     Raises:
-        ValueError: another number of rings, or whatever ``Simulation`` does not take.
+        ValueError: rings that are not a multiple of 5, or what ``Simulation`` refuses.
     """
     if count("rings", rings) % 5:
         raise ValueError(f"rings={rings!r}: must be a multiple of 5, so that a ring lies on the support's edge")
@@ -94,7 +94,7 @@ def cusick_drape(
     held = 1 + 3 * edge * (edge + 1)  # particles of the rings up to the edge come first
     simulation = Simulation(
         mesh,
-        _calmed(material),
+        _with_drag(material),
         num_envs,
         integrator,
         air_density=0.0,
@@ -108,7 +108,7 @@ def cusick_drape(
         simulation.set_parameters(gravity=(0.0, 0.0, -GRAVITY * (step + 1) / loading))
         simulation.step()
     passed = LOADING + _settle(simulation, seconds)
-    # areas of the mesh itself, whose rings are polygons: a flat sheet has 1, a limp one 0
+    # all areas are of the mesh, whose rings are polygons, so that a flat sheet has exactly 1
     inside = np.all(mesh.triangles < held, axis=1)
     support = projected_area(mesh.rest_positions, mesh.triangles[inside])
     shadows = np.array([projected_area(one, mesh.triangles) for one in simulation.positions])
@@ -117,10 +117,10 @@ def cusick_drape(
 
 
 def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
-    """Area of the triangles' shadow on the ground [m^2], where several lie over each other counted once.
+    """Area of the triangles' shadow on the ground [m^2], with overlaps counted once.
 
-    Along each of ``LINES`` lines the shadow's length is that of the union of intervals, exactly; from line to line it is
-    nearly linear, and summed by the midpoint rule.  positions: [m], (particles, 3).
+    On each of ``LINES`` lines the length of the shadow is exactly that of the union of intervals; the lengths are summed by the
+    midpoint rule.  positions: [m], (particles, 3).
     """
     corners = finite("positions", positions)[np.asarray(triangles)][:, :, :2]
     low, high = corners[:, :, 1].min(), corners[:, :, 1].max()
@@ -139,7 +139,7 @@ def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
         share = np.divide(from_line, rise, out=np.zeros_like(rise), where=meets)
         x = corners[triangle, a, 0] + share * (corners[triangle, b, 0] - corners[triangle, a, 0])
         left, right = np.where(meets, np.minimum(left, x), left), np.where(meets, np.maximum(right, x), right)
-    # lines are laid end to end, so that one running maximum serves them all
+    # lines are laid end to end, so that one running maximum covers them all
     width = np.ptp(corners[:, :, 0]) + 1.0
     left, right = left + line * width, right + line * width
     order = np.argsort(left)
@@ -168,14 +168,14 @@ def cantilever(
         columns: of free particles.
 
     Raises:
-        ValueError: a length that is not positive, or whatever ``Simulation`` does not take.
+        ValueError: a length that is not positive, or what ``Simulation`` refuses.
     """
     cell = positive("overhang", overhang) / (count("columns", columns) + 0.5)
     mesh = grid(ROWS, columns + 2, (columns + 1) * cell, (ROWS - 1) * cell)
     column = np.arange(mesh.num_particles) % (columns + 2)
     simulation = Simulation(
         mesh,
-        _calmed(material),
+        _with_drag(material),
         integrator=integrator,
         air_density=0.0,
         anchors=[np.flatnonzero(column < 2).tolist()],
@@ -212,7 +212,7 @@ def elastica_droop(weight: float) -> float:
 
 
 def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
-    """A flat specimen with slight waves around its overhanging rim, the same on any mesh: (particles, 3)."""
+    """A flat specimen with slight waves in its overhanging rim, the same on any mesh [m], (particles, 3)."""
     random = np.random.default_rng(seed)
     waves = np.arange(2, MOST_WAVES + 1)
     height, phase = random.normal(scale=ASYMMETRY, size=len(waves)), random.uniform(0, 2 * np.pi, len(waves))
@@ -223,8 +223,9 @@ def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
     return raised
 
 
-def _calmed(material: Material) -> Material:
-    return replace(material, air_drag=CALM * material.density)
+def _with_drag(material: Material) -> Material:
+    """The material with the drag under which sheets settle."""
+    return replace(material, air_drag=SETTLING_DRAG * material.density)
 
 
 def _fastest(simulation: Simulation) -> NDArray[np.float64]:
@@ -233,9 +234,9 @@ def _fastest(simulation: Simulation) -> NDArray[np.float64]:
 
 
 def _settle(simulation: Simulation, seconds: float) -> float:
-    """Step until all sheets are at rest, ``seconds`` at most; the time that took [s]."""
+    """Step until all sheets are at rest, for ``seconds`` at most.  Returns the simulated time [s]."""
     tenth = max(1, round(0.1 / simulation.time_step))
-    # a sheet that starts flat is slow at first, too
+    # at least half a second: a sheet that starts flat is slow at first, too
     passed = 0.0
     while passed < positive("seconds", seconds) and (passed < 0.5 or _fastest(simulation).max() > REST_SPEED):
         simulation.step(tenth)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.lab.compare_pictures import COLOURS
+from clothgym.lab.compare_pictures import COLORS
 from clothgym.mesh import EDGE, STRUCTURAL_X
 from clothgym.playground.recording import Frame, Recording, strains, tensions, threads
 from clothgym.playground.stage import UNLIMITED, Hand
@@ -56,7 +56,7 @@ def spring_values(recording: Recording, frame: Frame, sheet: int, mode: str, spr
 
 def own_colour(label: str) -> tuple[int, int, int] | None:
     """A compared sheet's: its integrator's, pale if it has no strain limit; None for a label that is no integrator's."""
-    colour = COLOURS.get(label.removesuffix(UNLIMITED))
+    colour = COLORS.get(label.removesuffix(UNLIMITED))
     if colour is None:
         return None
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
