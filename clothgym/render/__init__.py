@@ -1,4 +1,4 @@
-"""Floor 6: what a sheet looks like: a small software rasteriser that draws the same picture on any machine.
+"""Floor 6: pictures of sheets, from a small software rasterizer that draws the same picture on any machine.
 
 It sees triangles, positions and named solids; it knows nothing of simulations or environments.
 """

@@ -1,4 +1,4 @@
-"""Where the eye stands and which ray belongs to which pixel."""
+"""A pinhole camera, and the ray of each pixel."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ Vector = tuple[float, float, float]
 
 
 class View(NamedTuple):
-    """A camera together with an image size, as the kernels read it.
+    """A camera with an image size, as kernels read it.
 
-    axes: right, up and forward, unit vectors.  rays: eye [m], then the ray of the image's corner (0, 0) and its change per
-    pixel to the right and downwards; rays have length 1 along the view axis, so that a ray times a depth [m]
-    is a point.  scale: pixels per unit of slope.  width, height [pixels].
+    axes: right, up and forward, unit vectors.  rays: eye [m], then the ray of the image's corner (0, 0) and its change per pixel to
+    the right and downwards; rays have length 1 along the view axis, so that eye plus depth [m] times ray is a point.
+    scale: pixels per unit of slope.  width, height: [pixels].
     """
 
     axes: tuple[Vector, Vector, Vector]
@@ -32,11 +32,11 @@ class Camera:
     """A pinhole camera.
 
     Attributes:
-        eye: where it stands [m].
+        eye: its position [m].
         target: the point in the middle of the image [m].
-        up: direction that is upwards in the image.
+        up: direction that points upwards in the image.
         vertical_fov: angle between the image's lower and upper edge [degrees].
-        near: depth before which nothing is drawn [m].
+        near: depth below which nothing is drawn [m].
 
     Raises:
         ValueError: numbers that are not finite, an eye on its target, an up along the view axis, an angle outside (0, 180),
@@ -54,13 +54,13 @@ class Camera:
             value = getattr(self, name)
             if np.shape(value) != (3,) or not np.all(np.isfinite(value)):
                 raise ValueError(f"camera {name}={value!r}: must be three finite numbers")
-            object.__setattr__(self, name, tuple(map(float, value)))  # an array is welcome, and the camera stays hashable
+            object.__setattr__(self, name, tuple(map(float, value)))  # arrays are accepted, and the camera stays hashable
         if not 0 < self.vertical_fov < 180:
             raise ValueError(f"camera vertical_fov={self.vertical_fov!r}: must lie between 0 and 180 degrees")
         if not (math.isfinite(self.near) and self.near > 0):
-            raise ValueError(f"camera near={self.near!r}: must be a positive, finite depth in metres")
+            raise ValueError(f"camera near={self.near!r}: must be a positive, finite depth in meters")
         if self.distance < 1e-6:
-            raise ValueError(f"camera eye={self.eye!r}: must stand apart from its target {self.target!r}")
+            raise ValueError(f"camera eye={self.eye!r}: must differ from its target {self.target!r}")
         forward = np.subtract(self.target, self.eye) / self.distance
         if np.linalg.norm(np.cross(forward, self.up)) < 1e-6 * max(float(np.linalg.norm(self.up)), 1e-300):
             raise ValueError(f"camera up={self.up!r}: must not point along the view axis {tuple(forward.tolist())!r}")
@@ -80,11 +80,11 @@ class Camera:
 
     @property
     def reach(self) -> float:
-        """Half the height that the image shows at the target [m]: the size of the scene as far as the camera knows."""
+        """Half the height that the image shows at the target [m], a measure of the size of the scene."""
         return self.distance * math.tan(math.radians(self.vertical_fov) / 2)
 
     def view(self, width: int, height: int) -> View:
-        """The camera for an image of that many pixels."""
+        """The camera with an image of width x height pixels."""
         right, up, forward = self.axes
         scale = height / 2 / math.tan(math.radians(self.vertical_fov) / 2)
         corner = forward + (up * height - right * width) / (2 * scale)
@@ -93,5 +93,5 @@ class Camera:
 
 
 def as_tuple(vector: NDArray[np.float64]) -> Vector:
-    """Three floats: within kernels they cost less than an array, which other arrays might overlap."""
+    """Three floats: kernels read them faster than an array, which might overlap with others."""
     return float(vector[0]), float(vector[1]), float(vector[2])

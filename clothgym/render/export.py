@@ -1,4 +1,4 @@
-"""Frames to a file, which stands there whole or not at all."""
+"""Pictures and films as files, each of which is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
     """Write an image, (height, width, 3) uint8, as a ``.png``.
 
     Raises:
-        ValueError: another ending, or no such image.
+        ValueError: another ending, or an array that is not an image.
         ImportError: pillow is missing.
     """
     path = Path(path)
@@ -37,7 +37,7 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
     """Write frames, (height, width, 3) uint8 each, as a looped ``.gif`` or an ``.mp4``.
 
-    Frames may be a generator, from which an ``.mp4`` is written as they come.  If it raises, the frames before are kept beside
+    Frames may come from a generator, and are written to an ``.mp4`` one by one.  If it raises, the frames so far are kept beside
     ``path``, as ``NAME.part.mp4``, and the error says so.
 
     Raises:
@@ -64,13 +64,14 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Write a file beside ``path`` and give it that name: half a file is never seen under it."""
+    """Write a file beside ``path``, then rename it: there is never half a file of that name."""
     scratch = path.with_name(f".{path.name}.part")
     scratch.write_bytes(content)
     os.replace(scratch, path)
 
 
 def _checked(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    """The frames as arrays; raises ValueError for one that is not an image of the size of the first."""
     shape = None
     for number, frame in enumerate(frames):
         image = np.asarray(frame)
@@ -83,6 +84,7 @@ def _checked(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]
 
 
 def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """All frames with one palette."""
     try:
         from PIL import Image
     except ImportError as error:
@@ -92,29 +94,30 @@ def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np
         for image in others:
             images.append(image)
     finally:
-        # one palette for all frames, learned from some of them: with one each, the floor would flicker
+        # one palette for all frames, from a sample of them: with one each, the floor would flicker
         sample = np.concatenate(images[:: max(1, len(images) // 8)], axis=0)
-        palette = Image.fromarray(_with_rare_colours(sample)).quantize(256, method=Image.Quantize.MEDIANCUT)
+        palette = Image.fromarray(_with_rare_colors(sample)).quantize(256, method=Image.Quantize.MEDIANCUT)
         pages = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
         # a gif counts in hundredths of a second; players slow down anything below two of them
         hundredths = max(2, round(100 / fps))
         pages[0].save(path, save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
 
 
-def _with_rare_colours(sample: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """An image, and below it, on as much room, every colour that it has, each on about as many pixels: small things keep theirs."""
+def _with_rare_colors(sample: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """An image, and below it all its colors on equal areas of the same size in total, so that small things keep their color."""
     _, first = np.unique((sample.reshape(-1, 3) >> 3).astype(np.uint32) @ [1024, 32, 1], return_index=True)
-    colours = sample.reshape(-1, 3)[first]
-    return np.concatenate([sample, np.resize(colours, sample.shape)], axis=0)
+    colors = sample.reshape(-1, 3)[first]
+    return np.concatenate([sample, np.resize(colors, sample.shape)], axis=0)
 
 
 def _write_mp4(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Frames as they come; the last row and column are repeated where their number is odd."""
     try:
         from imageio_ffmpeg import write_frames
     except ImportError as error:
         raise ImportError("an .mp4 needs imageio-ffmpeg: pip install 'clothgym[video]'") from error
     height, width = first.shape[:2]
-    # players want an even number of rows and columns
+    # players need an even number of rows and columns
     extra = ((0, height % 2), (0, width % 2), (0, 0))
     writer = write_frames(str(path), (width + width % 2, height + height % 2), fps=fps, quality=8, macro_block_size=1)
     writer.send(None)

@@ -1,7 +1,7 @@
-"""Meshes as binary glTF 2.0 (Khronos 2021): one moment, or a film that Blender and web viewers play at once.
+"""Meshes as binary glTF 2.0 (Khronos 2021): one moment, or an animation that Blender and web viewers play.
 
-Written by hand, because the file has to hold the very float32 that were simulated, and morph targets.  glTF is y up: the
-positions stay as they are, z up, and the node above them is turned.
+Written without a library, since the file must hold exactly the simulated float32 values, and morph targets.  glTF is y up: the
+positions stay z up, and their parent node is rotated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Part(NamedTuple):
 
 
 class _File:
-    """The binary chunk and the tables that say what lies where in it."""
+    """The binary chunk, and the tables of what lies where in it."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -46,7 +46,7 @@ class _File:
         self.accessors: list[dict[str, Any]] = []
 
     def add(self, array: NDArray, shape: str, target: int | None = None, bounds: bool = False) -> int:
-        """Append an array of float32 or uint32; the number of its accessor."""
+        """Append an array of float32 or uint32; returns the number of its accessor."""
         view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
         if target is not None:
             view["target"] = target
@@ -62,14 +62,14 @@ class _File:
         return len(self.accessors) - 1
 
     def primitive(self, part: Part) -> dict[str, Any]:
-        """Append a part's arrays; what its mesh says of them.  A part that never moves has no morph targets."""
+        """Append a part's arrays; returns its primitive.  A part that never moves has no morph targets."""
         x, normals = part.positions, part.normals
         attributes = {
             "POSITION": self.add(x[0], "VEC3", ARRAY_BUFFER, bounds=True),
             "NORMAL": self.add(normals[0], "VEC3", ARRAY_BUFFER),
         }
         if part.uv is not None:
-            # texture images begin at the top in glTF, and at the bottom everywhere else
+            # v counts from the top of a texture in glTF, and from the bottom elsewhere
             flipped = np.stack([part.uv[:, 0], 1 - part.uv[:, 1]], axis=1)
             attributes["TEXCOORD_0"] = self.add(flipped, "VEC2", ARRAY_BUFFER)
         indices = self.add(part.triangles.astype(np.uint32).ravel(), "SCALAR", ELEMENT_ARRAY_BUFFER)
@@ -86,9 +86,9 @@ class _File:
 
 
 def glb(parts: Sequence[Part], fps: float = 30.0) -> bytes:
-    """A ``.glb`` file.  Of several moments the first is the mesh, and the others are morph targets, each shown at its time.
+    """A ``.glb`` file.  The first moment is the mesh; the others are morph targets, each shown at its time.
 
-    A morph target is a displacement from the first moment: it gives a position back to the rounding of float32 alone.
+    A morph target is a displacement from the first moment, so positions come back up to the rounding of float32.
     """
     file = _File()
     primitives = [file.primitive(part) for part in parts]
@@ -128,5 +128,6 @@ def glb(parts: Sequence[Part], fps: float = 30.0) -> bytes:
 
 
 def _material(part: Part) -> dict[str, Any]:
+    """The material of a part: rough, and seen from both sides."""
     surface = {"baseColorFactor": [*linear_color(part.color).tolist(), 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.8}
     return {"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": True}

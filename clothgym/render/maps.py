@@ -1,6 +1,6 @@
-"""What stands between a point and the light: a shadow map, and how near the floor and the sky are covered.
+"""Maps of what lies between a point and the light: a shadow map, and how the floor and the sky are covered.
 
-All maps are square, lie around one centre and are rasterised anew for each frame with the kernels of the picture itself.
+All maps are square, share one center and are rasterized for each frame with the kernels of the picture itself.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.render.camera import Camera, Vector, as_tuple
-from clothgym.render.raster import project_orthographic, rasterise
+from clothgym.render.raster import project_orthographic, rasterize
 
-NOTHING = -1e6  # nearness where a ray of light meets no surface [m]
-CONTACT_HEIGHTS = (0.02, 0.14)  # a surface this high above the floor darkens it by half: touching, and hanging over it [m]
+NOTHING = -1e6  # nearness where a light ray meets no surface [m]
+CONTACT_HEIGHTS = (0.02, 0.14)  # height above the floor at which a surface darkens it by half: touching, hanging over it [m]
 CONTACT_BLUR = (0.012, 0.05)  # half widths of the two shadows' soft edges [m]
 SKY_BLUR = 0.03  # [m]
-CAST_BLUR = (0.008, 0.04)  # half widths of the lamp's shadow on the floor, of what stands on it and of what is far above [m]
+CAST_BLUR = (0.008, 0.04)  # half widths of the blur of shadows on the floor: of what stands on it, of what is far above [m]
 FAR_ABOVE = 0.6  # [m]
-FAINTEST = 1 / 512  # contact shadow that no byte shows
+FAINTEST = 1 / 512  # contact shadow too faint for a byte
 DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 UP = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
@@ -34,11 +34,11 @@ NOWHERE: Box = (0.0, -1.0, 0.0, -1.0)
 
 
 class Rig(NamedTuple):
-    """Where the maps lie; it does not move from frame to frame, so that shadows do not shimmer.
+    """Placement of the maps, the same in all frames, so that shadows do not shimmer.
 
     axes: right, up and to the light, unit vectors.  center [m].  shadow_size and height_size: texels along a side;
-    shadow_scale and height_scale: texels per metre.  Tuples, because an array passed within a kernel costs more than a look
-    at the map.
+    shadow_scale and height_scale: texels per meter.  Tuples, because passing an array within a kernel costs more than
+    reading the map.
     """
 
     axes: Axes
@@ -52,8 +52,8 @@ class Rig(NamedTuple):
 class Maps(NamedTuple):
     """shadow: nearness to the light [m], (size, size).  cast: the lamp's shadow on the floor along the same rays, 0 to 1, at half
     that size.  heights, (size, size, 3): the floor's two contact shadows, 0 to 1, and the blurred height of the topmost surface
-    [m].  The boxes: lowest and highest column and row where a look at the map can tell anything.  floor_box: lowest and highest
-    x and y [m] of what they tell about the floor; most of the floor lies outside and is spared the look."""
+    [m].  The boxes: lowest and highest column and row where a map is not empty.  floor_box: lowest and highest x and y [m] of
+    the floor where any is not; most of the floor lies outside, and needs no map."""
 
     shadow: NDArray[np.float32]
     shadow_box: Box
@@ -65,9 +65,9 @@ class Maps(NamedTuple):
 
 
 def studio_rig(camera: Camera, pixels: int) -> Rig:
-    """Maps over what the camera sees, with a key light high behind its left shoulder, for a picture that many samples high."""
+    """Maps over what the camera sees, with a key light high behind its left shoulder; pixels: samples along the image's side."""
     right, _, forward = camera.axes
-    # a camera may be rolled, its lamp is not
+    # a camera may be rolled, the lamp is not
     sideways = right * (1, 1, 0) if abs(right[2]) < 0.9 else np.array([1.0, 0, 0])
     sideways /= np.linalg.norm(sideways)
     backward = np.cross(sideways, (0, 0, 1))
@@ -85,7 +85,7 @@ def studio_rig(camera: Camera, pixels: int) -> Rig:
 
 @kernel
 def blur_turned(source, radius, out):
-    """Mean over 2 radius + 1 neighbours along a row, written to the transposed place: four calls blur both ways twice."""
+    """Mean of 2 radius + 1 neighbors along a row, written transposed: four calls blur both ways twice."""
     height, width = source.shape
     share = np.float32(1 / (2 * radius + 1))
     for row in range(height):
@@ -101,7 +101,7 @@ def blur_turned(source, radius, out):
 
 @kernel
 def contact_shadow(lowest, half_height, out):
-    """How much a surface darkens the floor below it: 1 where it touches, 1/2 at ``half_height`` [m], 0 where there is none."""
+    """How much a surface darkens the floor below it: 1 where it touches, 1/2 at ``half_height`` [m], 0 without a surface."""
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):
             h = max(-lowest[row, column], 0) / half_height
@@ -110,8 +110,8 @@ def contact_shadow(lowest, half_height, out):
 
 @kernel
 def split_shadow(shadow, axes, center, scale, left, top, near, far):
-    """The lamp's shadow on the floor at half the size of ``shadow``, from column ``left`` and row ``top`` on, as two parts that add
-    up to it, each 0 to 1: what casts it is near the floor, and ``FAR_ABOVE`` it along the ray or more."""
+    """The lamp's shadow on the floor at half the resolution of ``shadow``, from column ``left`` and row ``top`` on, in two parts, 0
+    to 1: of what is near the floor, and of what is ``FAR_ABOVE`` it or more along the ray."""
     size = shadow.shape[0] // 2
     for row in range(top, top + near.shape[0]):
         for column in range(left, left + near.shape[1]):
@@ -128,6 +128,7 @@ def split_shadow(shadow, axes, center, scale, left, top, near, far):
 
 
 def _blur(field: NDArray[np.float32], radius: int) -> None:
+    """Blur a field in place, twice along each axis."""
     other = np.empty(field.shape[::-1], np.float32)
     for _ in range(2):
         blur_turned(field, radius, other)
@@ -136,7 +137,7 @@ def _blur(field: NDArray[np.float32], radius: int) -> None:
 
 @kernel
 def filled(field, threshold, channels):
-    """First and last column, first and last row where one of the first ``channels`` is above the threshold; none: first > last."""
+    """First and last column, first and last row where one of the first ``channels`` exceeds the threshold; first > last if none."""
     rows, columns, _ = field.shape
     left, right, top, bottom = columns, -1, rows, -1
     for row in range(rows):
@@ -149,7 +150,7 @@ def filled(field, threshold, channels):
 
 
 def _box(ends: tuple[int, int, int, int], before: int, after: int, size: int) -> Box:
-    """Coordinates (columns, then rows) whose neighbours, ``before`` to ``after`` texels on, include a filled one."""
+    """Coordinates (columns, then rows) whose neighbors, ``before`` to ``after`` texels on, include a filled one."""
     if ends[0] > ends[1]:
         return NOWHERE
     low, high = (
@@ -161,7 +162,7 @@ def _box(ends: tuple[int, int, int, int], before: int, after: int, size: int) ->
 
 
 def _floor_shadow(rig: Rig, shadow: NDArray[np.float32], ends: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], Box]:
-    """The lamp's shadow on the floor, blurred the more the farther above it is what casts it, and its box."""
+    """The lamp's shadow on the floor, blurred more for what is farther above, and its box."""
     size = rig.shadow_size // 2
     cast = np.zeros((size, size, 1), np.float32)
     if ends[0] > ends[1]:
@@ -192,14 +193,14 @@ def _corners_on_floor(box: Box, axes: Axes, center: Vector, scale: float, size: 
 
 
 def draw_maps(rig: Rig, x: NDArray[np.float32], triangles: NDArray[np.int32], num_cloth: int, bias: float) -> Maps:
-    """The maps of one frame from vertices ``x`` [m], (vertices, 3), the first ``num_cloth`` of them cloth."""
+    """The maps of one frame; x: vertices [m], (vertices, 3), of which the first ``num_cloth`` are cloth."""
     screen = np.empty((len(x), 2), np.int32)
     nearness = np.empty(len(x), np.float32)
 
     def seen_from(axes: Axes, center: Vector, scale: float, size: int, empty: float) -> NDArray[np.float32]:
         project_orthographic(x, axes, center, scale, size, num_cloth, bias, screen, nearness)
         buffer = np.full((size, size), empty, np.float32)
-        rasterise(screen, nearness, triangles, len(triangles), buffer, np.empty((size, size), np.int32))
+        rasterize(screen, nearness, triangles, len(triangles), buffer, np.empty((size, size), np.int32))
         return buffer
 
     shadow = seen_from(rig.axes, rig.center, rig.shadow_scale, rig.shadow_size, NOTHING)

@@ -28,15 +28,15 @@ class _Cloth(NamedTuple):
 
 
 class MeshSequence:
-    """A folder of ``frame_00000.obj`` (or ``.glb``) and so on, written one by one: what is finished stays, whatever happens next.
+    """A folder of ``frame_00000.obj`` (or ``.glb``) and so on, written one by one; finished files stay if a later one fails.
 
-    Positions are z up.  A ``.glb`` says so, and holds the very float32 that it is given.  An ``.obj`` cannot say so (in
+    Positions are z up.  A ``.glb`` says so, and holds exactly the given float32 values.  An ``.obj`` cannot say so (in
     Blender's import choose Forward Y, Up Z); its nine digits give the same float32 back when they are read.
 
     Args:
-        folder: is made if missing.
+        folder: created if missing.
         triangles: of the cloth, counter-clockwise seen from its front, (triangles, 3).
-        uv: texture coordinates, (particles, 2); none if left out.
+        uv: texture coordinates, (particles, 2), or None.
         kind: "obj" or "glb".
         color: of the cloth, sRGB from 0 to 255; an ``.obj`` has none.
 
@@ -54,8 +54,8 @@ class MeshSequence:
         others = sorted(file.name for ending in KINDS for file in self.folder.glob(f"frame_*.{ending}"))
         if others:
             raise FileExistsError(
-                f"{str(self.folder)!r} holds {len(others)} frames already ({others[0]} to {others[-1]}), with which the new ones "
-                "would mix: name another folder, or remove them first"
+                f"{str(self.folder)!r} holds {len(others)} frames already ({others[0]} to {others[-1]}), which would be mixed with "
+                "the new ones: name another folder, or remove them first"
             )
         self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -122,7 +122,7 @@ def _parts(frames: NDArray[np.float32], solids: Sequence[Sequence[Solid]], cloth
         vertex_normals(x, cloth.triangles, out)
     parts = [Part("cloth", frames, normals, cloth.triangles, cloth.uv, cloth.color)]
     if len({tuple(solid.kind for solid in things) for things in solids}) > 1:
-        raise ValueError("the solids change in number or kind from frame to frame: one animation needs the same ones throughout")
+        raise ValueError("the solids change in number or kind from frame to frame: an animation needs the same ones throughout")
     for number, same in enumerate(zip(*solids)):
         meshes = [solid.mesh() for solid in same]
         x, n = (np.stack([getattr(mesh, name) for mesh in meshes]) for name in ("positions", "normals"))
@@ -132,7 +132,7 @@ def _parts(frames: NDArray[np.float32], solids: Sequence[Sequence[Solid]], cloth
 
 def _obj(parts: Sequence[Part]) -> bytes:
     """Wavefront's text: one object a part, of the first moment."""
-    lines, before, before_uv = ["# clothgym: metres, z up"], 1, 1
+    lines, before, before_uv = ["# clothgym: meters, z up"], 1, 1
     for part in parts:
         lines.append(f"o {part.name}")
         lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.positions[0].tolist()]

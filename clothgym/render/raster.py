@@ -1,8 +1,8 @@
 """From triangles to samples: projections and the z-buffer.
 
-Positions on the image are rounded to 1/256 pixel and edge functions are integers (Pineda 1988), so that neighbours with a
-common edge leave no gap.  Along a triangle "nearness" is linear on the image: the inverse of the depth for a perspective
-view, the height along the light for an orthographic one.  The greater nearness wins.
+Image positions are rounded to 1/256 pixel and edge functions are integers (Pineda 1988), so that neighbors with a common edge leave
+no gap.  Nearness is linear on the image along a triangle: the inverse depth in a perspective view, the height along the light in an
+orthographic one.  The larger nearness wins.
 """
 
 from __future__ import annotations
@@ -14,13 +14,14 @@ from clothgym._jit import kernel
 SUBPIXEL_BITS = 8
 SUBPIXEL = 1 << SUBPIXEL_BITS
 HALF_PIXEL = SUBPIXEL >> 1
-FARTHEST_PIXEL = 1e6  # beyond it, and where a coordinate is not a number, a vertex is not drawn
+FARTHEST_PIXEL = 1e6  # a vertex beyond it, or with a NaN coordinate, is not drawn
 NOT_DRAWN = -(1 << 31)
 
 
 @kernel
 def _snap(pixel_x, pixel_y, screen, v):
-    # not (... < ...) also holds for a coordinate that is not a number
+    # not (... < ...) also holds for NaN
+    """Round an image position to 1/256 pixel, or mark the vertex as not drawn."""
     if not (abs(pixel_x) < FARTHEST_PIXEL and abs(pixel_y) < FARTHEST_PIXEL):
         screen[v, 0] = NOT_DRAWN
         return
@@ -30,11 +31,11 @@ def _snap(pixel_x, pixel_y, screen, v):
 
 @kernel
 def project_perspective(x, axes, eye, scale, width, height, near, num_cloth, bias, screen, inverse_depth, nearness):
-    """Where vertices ``x`` [m], (vertices, 3), fall on an image of width x height pixels.
+    """Project vertices ``x`` [m], (vertices, 3), onto an image of width x height pixels.
 
     Writes screen: position [1/256 pixel], (vertices, 2) int32; inverse_depth [1/m] and nearness [1/m], (vertices,).  The
-    first ``num_cloth`` vertices are cloth: for the z-buffer alone they come nearer by ``bias`` [m], so that a solid does not
-    show through between the particles that rest on it.  A triangle with a vertex before the near plane is not drawn.
+    first ``num_cloth`` vertices are cloth: for the z-buffer alone they are moved closer by ``bias`` [m], so that a solid does
+    not show through between the particles that rest on it.  A triangle with a vertex in front of the near plane is not drawn.
     """
     for v in range(x.shape[0]):
         dx, dy, dz = x[v, 0] - eye[0], x[v, 1] - eye[1], x[v, 2] - eye[2]
@@ -51,10 +52,10 @@ def project_perspective(x, axes, eye, scale, width, height, near, num_cloth, bia
 
 @kernel
 def project_orthographic(x, axes, center, scale, size, num_cloth, bias, screen, nearness):
-    """Where vertices ``x`` [m], (vertices, 3), fall on a square map of size x size texels seen from ``axes[2]``.
+    """Project vertices ``x`` [m], (vertices, 3), onto a square map of size x size texels, seen from ``axes[2]``.
 
-    scale: texels per metre; ``center`` [m] falls on the middle.  nearness: height along ``axes[2]`` [m], (vertices,); that
-    of the cloth is greater by ``bias`` [m].
+    scale: texels per meter; ``center`` [m] is projected to the middle.  nearness: height along ``axes[2]`` [m], (vertices,);
+    that of the cloth is increased by ``bias`` [m].
     """
     for v in range(x.shape[0]):
         dx, dy, dz = x[v, 0] - center[0], x[v, 1] - center[1], x[v, 2] - center[2]
@@ -67,11 +68,11 @@ def project_orthographic(x, axes, center, scale, size, num_cloth, bias, screen, 
 
 
 @kernel
-def rasterise(screen, nearness, triangles, num_two_sided, buffer, owner):
+def rasterize(screen, nearness, triangles, num_two_sided, buffer, owner):
     """Draw triangles into ``buffer``: nearness of the nearest surface, and ``owner``: its triangle; both (height, width).
 
-    The first ``num_two_sided`` triangles are drawn from both sides, the others only where they turn their front
-    (counter-clockwise on the image as one sees it) to the eye.
+    The first ``num_two_sided`` triangles are drawn from both sides, the others only if their front (counter-clockwise on the
+    image) faces the eye.
     """
     height, width = buffer.shape
     for t in range(triangles.shape[0]):
@@ -84,7 +85,7 @@ def rasterise(screen, nearness, triangles, num_two_sided, buffer, owner):
         n0, n1, n2 = nearness[i], nearness[j], nearness[k]
         area = (x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)
         if area == 0 or (area > 0 and t >= num_two_sided):
-            continue  # rows count downwards: a positive area is clockwise to the eye
+            continue  # rows count downwards, so a positive area is clockwise
         if area < 0:
             x1, x2, y1, y2, n1, n2 = x2, x1, y2, y1, n2, n1
             area = -area
@@ -120,8 +121,8 @@ def rasterise(screen, nearness, triangles, num_two_sided, buffer, owner):
 
 @kernel
 def sample_weights(screen, triangles, inverse_depth, t, px, py):
-    """Shares of triangle t's three vertices at a sample, correct in perspective, the sample's inverse depth [1/m], and whether
-    the triangle turns its back to the eye.
+    """Perspective-correct weights of triangle t's vertices at a sample, the sample's inverse depth [1/m], and whether the triangle
+    is seen from its back.
 
     px, py: the sample [1/256 pixel].
     """

@@ -1,4 +1,4 @@
-"""The rasteriser as people use it: one cloth mesh, one camera, and as many frames as wanted."""
+"""The renderer: one cloth mesh, one camera, any number of frames."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from clothgym._jit import default_threads, run_spans
 from clothgym.render.camera import Camera, View
 from clothgym.render.heat import heat_palette
 from clothgym.render.maps import draw_maps, studio_rig
-from clothgym.render.raster import depth_image, floor_nearness, project_perspective, rasterise
+from clothgym.render.raster import depth_image, floor_nearness, project_perspective, rasterize
 from clothgym.render.shading import (
     CORAL,
     INDIGO,
@@ -31,10 +31,10 @@ from clothgym.render.surface import place_vertices, plain_surface, push_out, smo
 Marker = Solid | tuple[Sequence[float], Color]
 
 MARKER_RADIUS = 0.011  # [m]
-BIAS = 0.006  # the cloth is drawn this much nearer to the eye than it is [m]
-HIGHEST_LIFT, DEEPEST = 0.006, 0.03  # smooth cloth less than 3 cm deep in a solid is drawn on top of it, so far above [m]
-FINE_CELLS, COARSE_CELLS = 64, 32  # cells along the drawn cloth's longer side, for large and for small pictures
-LARGE_PICTURE = 400  # samples along its shorter side
+BIAS = 0.006  # distance by which the cloth is drawn closer to the eye [m]
+HIGHEST_LIFT, DEEPEST = 0.006, 0.03  # smooth cloth up to this deep in a solid is drawn above it, at most so high [m]
+FINE_CELLS, COARSE_CELLS = 64, 32  # cells along the longer side of the drawn cloth, in large and in small pictures
+LARGE_PICTURE = 400  # samples along the shorter side of a large picture
 HEAT = heat_palette()
 
 
@@ -65,14 +65,14 @@ class Renderer:
     Args:
         triangles: of the cloth mesh, counter-clockwise seen from its front, (triangles, 3) int32.
         uv: material coordinates for the pattern [m], (particles, 2).
-        camera: where the eye stands; above the floor.
+        camera: with its eye above the floor.
         width, height: of the image [pixels].
         antialias: samples per pixel and direction.
         threads: for batches; None takes the processors at hand.
         grid_shape: (rows, columns) if the particles are a grid, row by row: the cloth is then drawn as a smooth surface
             through them.
         front, back: colors of the fabric's sides, sRGB from 0 to 255.
-        check: width of a stripe of the pattern [m]; None makes twelve of the longer side.
+        check: width of a stripe of the pattern [m]; None for a twelfth of the longer side.
 
     Raises:
         ValueError: an argument that does not fit.
@@ -99,12 +99,12 @@ class Renderer:
         if threads is not None and (not isinstance(threads, (int, np.integer)) or threads < 1):
             raise ValueError(f"threads={threads!r}: must be a positive integer, or None for all processors")
         if camera.eye[2] <= 0:
-            raise ValueError(f"camera eye={camera.eye!r}: must stand above the floor z = 0, or the floor hides everything")
+            raise ValueError(f"camera eye={camera.eye!r}: must be above the floor z = 0")
         check_color("front", front)
         check_color("back", back)
         uv, triangles = _checked_mesh(uv, triangles, grid_shape)
         if check is not None and not (np.isfinite(check) and check > 0):
-            raise ValueError(f"check={check!r}: must be a positive, finite length in metres, or None")
+            raise ValueError(f"check={check!r}: must be a positive, finite length in meters, or None")
         self.camera, self.width, self.height, self.antialias = camera, int(width), int(height), int(antialias)
         self.threads = default_threads() if threads is None else int(threads)
         self._particles = len(uv)
@@ -134,8 +134,8 @@ class Renderer:
         """A picture, (height, width, 3) sRGB.
 
         positions: of the particles [m], (particles, 3).  markers: small spheres, each a (position [m], color), or solids.
-        values: a number of each particle, (particles,), that colours the fabric instead of its pattern, from ``heat.heat_colors``'s
-        cream at 0 and below to its violet at 1 and above.
+        values: a number of each particle, (particles,), that colors the fabric instead of its pattern, from the cream of
+        ``heat.heat_colors`` at 0 and below to its violet at 1 and above.
         """
         x = self._checked_positions(positions, 2)
         out = np.empty((self.height, self.width, 3), np.uint8)
@@ -145,7 +145,7 @@ class Renderer:
     def depth(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.float32]:
         """Depth along the view axis at the middle of each pixel [m], (height, width); +inf where nothing is seen.
 
-        The floor counts as seen, up to its horizon.  Arguments as for ``rgb``.
+        The floor is seen up to its horizon.  Arguments as for ``rgb``.
         """
         x = self._checked_positions(positions, 2)
         out = np.empty((self.height, self.width), np.float32)
@@ -159,7 +159,7 @@ class Renderer:
         markers: Sequence[Sequence[Marker]] | None = None,
         values: ArrayLike | None = None,
     ) -> NDArray[np.uint8]:
-        """Pictures of many environments, (environments, height, width, 3): the pixels that ``rgb`` gives for each.
+        """Pictures of many environments, (environments, height, width, 3), with the pixels of ``rgb``.
 
         positions [m], (environments, particles, 3).  solids, markers: a sequence for each environment, or None.  values:
         (environments, particles), or None.
@@ -175,7 +175,7 @@ class Renderer:
         solids: Sequence[Sequence[Solid]] | None = None,
         markers: Sequence[Sequence[Marker]] | None = None,
     ) -> NDArray[np.float32]:
-        """Depths of many environments [m], (environments, height, width): what ``depth`` gives for each."""
+        """Depths of many environments [m], (environments, height, width), with the values of ``depth``."""
         x, things = self._checked_batch(positions, solids, markers)
         out = np.empty((len(x), self.height, self.width), np.float32)
         self._spread(self._draw_depth, x, things, out)
@@ -191,13 +191,13 @@ class Renderer:
     def _draw_rgb(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.uint8]) -> None:
         scene = self._scene(x, things)
         cloth, rig, view = self._cloth, self._rig, self._sample_view
-        screen, inverse_depth, buffer, owner = self._rasterised(scene, view, self._sample_floor)
+        screen, inverse_depth, buffer, owner = self._rasterized(scene, view, self._sample_floor)
         maps = draw_maps(rig, scene.x, scene.triangles, len(cloth.uv), BIAS)
         curvature = np.empty(len(cloth.uv), np.float32)
         vertex_curvature(scene.x, scene.normals, cloth.triangles, curvature)
         palette = np.concatenate([self._palette, *(linear_color(solid.color)[None] for solid in [*things.solids, *things.markers])])
         mesh = (screen, inverse_depth, scene.triangles, scene.normals, cloth.uv, scene.surface, curvature, things.values)
-        # a texel of the shadow map is flat: a slanted surface must not shade itself
+        # a texel of the shadow map is flat: a slanted surface must not shadow itself
         slack = BIAS + 2.0 / rig.shadow_scale
         places = (rig.axes, rig.center, rig.shadow_scale, rig.height_scale, slack)
         look = (palette, self._check, HEAT)
@@ -210,7 +210,7 @@ class Renderer:
 
     def _draw_depth(self, x: NDArray[np.float32], things: _Things, out: NDArray[np.float32]) -> None:
         scene = self._scene(x, things)
-        screen, inverse_depth, buffer, owner = self._rasterised(scene, self._pixel_view, self._pixel_floor)
+        screen, inverse_depth, buffer, owner = self._rasterized(scene, self._pixel_view, self._pixel_floor)
         depth_image(screen, inverse_depth, scene.triangles, buffer, owner, out)
 
     def _scene(self, x: NDArray[np.float32], things: _Things) -> _Scene:
@@ -231,7 +231,7 @@ class Renderer:
         counts = [len(cloth.triangles), *(len(mesh.triangles) for mesh in meshes)]
         return _Scene(vertices, normals, triangles, np.repeat(np.arange(len(counts), dtype=np.int32), counts))
 
-    def _rasterised(self, scene: _Scene, view: View, floor: NDArray[np.float32]) -> tuple[NDArray[Any], ...]:
+    def _rasterized(self, scene: _Scene, view: View, floor: NDArray[np.float32]) -> tuple[NDArray[Any], ...]:
         """screen and inverse depth of the vertices; nearness and triangle of the samples.  floor: nearness to start with."""
         cloth, count = self._cloth, len(scene.x)
         screen, inverse_depth, nearness = np.empty((count, 2), np.int32), np.empty(count, np.float32), np.empty(count, np.float32)
@@ -240,7 +240,7 @@ class Renderer:
             screen, inverse_depth, nearness,
         )  # fmt: skip
         buffer, owner = floor.copy(), np.full(floor.shape, -1, np.int32)
-        rasterise(screen, nearness, scene.triangles, len(cloth.triangles), buffer, owner)
+        rasterize(screen, nearness, scene.triangles, len(cloth.triangles), buffer, owner)
         return screen, inverse_depth, buffer, owner
 
     def _checked_positions(self, positions: ArrayLike, dimensions: int) -> NDArray[np.float32]:
@@ -254,7 +254,7 @@ class Renderer:
         if not np.all(np.isfinite(x)):
             place = tuple(np.argwhere(~np.isfinite(x))[0, :-1].tolist())
             raise ValueError(
-                f"positions[{', '.join(map(str, place))}]={x[place].tolist()}: a cloth that is not finite cannot be drawn; "
+                f"positions[{', '.join(map(str, place))}]={x[place].tolist()}: cloth that is not finite cannot be drawn; "
                 "draw the last finite state instead"
             )
         return x
@@ -314,7 +314,7 @@ def _checked_mesh(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     uv = np.ascontiguousarray(uv, np.float32)
     if uv.ndim != 2 or uv.shape[1] != 2 or not np.all(np.isfinite(uv)):
-        raise ValueError(f"uv has shape {uv.shape}: must be (particles, 2), finite, in metres")
+        raise ValueError(f"uv has shape {uv.shape}: must be (particles, 2), finite, in meters")
     corners = np.asarray(triangles)
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0 or not np.issubdtype(corners.dtype, np.integer):
         raise ValueError(f"triangles have shape {corners.shape} and dtype {corners.dtype}: must be (triangles, 3) integers")

@@ -1,7 +1,7 @@
-"""From samples to colours: fabric, solids, floor and light.
+"""From samples to colors: fabric, solids, floor and light.
 
-Arrays are float32, the arithmetic between them is numba's own choice (float64 for literals): one colour costs a few dozen
-nanoseconds either way.  Colours are linear light until the last line, where a table turns them to sRGB.
+Arrays are float32; the arithmetic between them is numba's choice (float64 with literals), which makes little difference to the few
+dozen nanoseconds of a color.  Colors are linear light until the end, where a table converts them to sRGB.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ CORAL, CREAM = (206, 64, 50), (247, 228, 206)
 INDIGO = (54, 68, 132)
 STUDIO = ((226, 222, 214), (205, 200, 191), (240, 238, 234), (222, 227, 232))  # floor, its lines, horizon, zenith
 
-KEY = (0.90, 0.86, 0.79)  # light from the lamp, before the cosine
+KEY = (0.90, 0.86, 0.79)  # light of the lamp, before the cosine
 SKY = (0.43, 0.43, 0.45)  # from straight above
 BOUNCE = (0.40, 0.36, 0.32)  # from the floor
 TILES = 10.0  # on a metre of the floor
 LINE_WIDTH = 0.0016  # [m]
-ROOF_HEIGHT = 0.10  # a surface this far above takes the most of the sky's light [m]
+ROOF_HEIGHT = 0.10  # height above at which a surface blocks most of the sky's light [m]
 TEXELS_ASIDE = 1.5
-TRANSLUCENCE = 0.30  # of the fabric
+TRANSLUCENCE = 0.30  # share of the lamp's light that passes through the fabric
 SHEEN, GLOSS = 0.35, 0.10  # light scattered along a silhouette; highlight of a solid
 CLOTH = 0  # surface number of the cloth; solids are 1, 2, ...
-SHADE = (0.50, 0.48, 0.43)  # what the lamp's shadow takes from the floor
-TOUCHED, HUNG_OVER = 0.55, 0.45  # what a surface takes that touches the floor, and one that hangs over it
-ROOFED = 0.55  # share of the sky that a surface above takes from one below
+SHADE = (0.50, 0.48, 0.43)  # share of the floor's light that the lamp's shadow takes
+TOUCHED, HUNG_OVER = 0.55, 0.45  # share that a surface takes that touches the floor, and one that hangs over it
+ROOFED = 0.55  # share of the sky that a surface above takes
 HOLLOW, MOST_HOLLOW, MOST_RIDGE = 0.012, 0.5, 0.25  # share of the sky that a hollow loses, by its curvature [m], and bounds
-THREADS, RELIEF = 20.0, 0.12  # threads of a stripe; how much brighter those of the warp are than those of the weft
-COVER = 0.85  # share of a crossing that the upper thread hides; the lower one shows at its sides
-FINEST = 2.0  # threads in a footprint from which on they are not told apart
-STEEPEST = 2.0  # slope to the eye up to which one look at a surface does for all samples of a pixel
+YARNS, RELIEF = 20.0, 0.12  # yarns in a stripe; how much brighter warp is than weft
+COVER = 0.85  # share of a crossing that the upper yarn covers; the lower one shows at its sides
+FINEST = 2.0  # yarns in a footprint from which on they are not drawn one by one
+STEEPEST = 2.0  # slope to the eye up to which one sample of a surface stands for all of a pixel
 TONES = 8192
-SHOULDER, BRIGHTEST = 0.70, 2.0  # light above the shoulder is compressed, as film does it, so that bright folds keep their form
+SHOULDER, BRIGHTEST = 0.70, 2.0  # light above the shoulder is compressed, as film does, so that bright folds keep their shape
 
 _curve = np.linspace(0, BRIGHTEST, TONES)
 _curve = np.where(_curve < SHOULDER, _curve, 1 - (1 - SHOULDER) * np.exp(-np.maximum(_curve - SHOULDER, 0) / (1 - SHOULDER)))
@@ -47,7 +47,7 @@ SRGB: NDArray[np.uint8] = np.round(255 * _srgb).astype(np.uint8)
 
 
 def cloth_and_floor_palette(front: tuple[int, int, int], back: tuple[int, int, int]) -> NDArray[np.float32]:
-    """Linear colours of fabric and studio, (SOLIDS, 3); the solids' own follow them."""
+    """Linear colors of fabric and studio, (SOLIDS, 3); those of solids follow."""
     cream = linear_color(CREAM)
     rows = []
     for color in map(linear_color, (front, back)):
@@ -96,6 +96,7 @@ def _lit(shadow, box, axes, center, scale, slack, x, y, z):
 
 @kernel
 def _bilinear(field, row, column, channel, fu, fv):
+    """Bilinear value of a channel between four texels."""
     upper = field[row, column, channel] * (1 - fu) + field[row, column + 1, channel] * fu
     lower = field[row + 1, column, channel] * (1 - fu) + field[row + 1, column + 1, channel] * fu
     return upper * (1 - fv) + lower * fv
@@ -118,7 +119,7 @@ def _heights_at(heights, box, center, scale, x, y):
 
 @kernel
 def _background(up, palette):
-    """Linear colour above the horizon; up: the ray's slope."""
+    """Linear color above the horizon; up: slope of the ray."""
     t = min(1.5 * up, 1)
     low, high = palette[HORIZON], palette[ZENITH]
     return low[0] + t * (high[0] - low[0]), low[1] + t * (high[1] - low[1]), low[2] + t * (high[2] - low[2])
@@ -126,7 +127,7 @@ def _background(up, palette):
 
 @kernel
 def _tile_ink(x, y, depth, dx, dy, dz, rays, antialias):
-    """Share of a pixel's footprint on the floor at (x, y) [m] that is covered by the lines between tiles."""
+    """Share of a pixel's footprint on the floor at (x, y) [m] that the lines between tiles cover."""
     # how far the point moves from one pixel to the next, right and down
     sx, sy, tiles = rays[2][2] / dz, rays[3][2] / dz, depth * TILES * antialias
     wide_x = tiles * (abs(rays[2][0] - dx * sx) + abs(rays[3][0] - dx * sy))
@@ -137,7 +138,7 @@ def _tile_ink(x, y, depth, dx, dy, dz, rays, antialias):
 
 @kernel
 def draw_studio(rays, reach, center, palette, antialias, studio):
-    """Floor and background without anything on them, linear, (height, width, 3): the same in every frame of a camera."""
+    """Empty floor and background, linear, (height, width, 3): the same in all frames of a camera."""
     floor, line, horizon = palette[FLOOR], palette[LINE], palette[HORIZON]
     for row in range(studio.shape[0]):
         for column in range(studio.shape[1]):
@@ -176,22 +177,22 @@ def _cast_on_floor(cast, box, axes, center, scale, x, y):
 
 @kernel
 def _tone(u, v, check, footprint):
-    """0 where the fabric has its own colour, 1 where it is light, and how bright its threads are: gingham as it is woven.
+    """0 where the fabric has its color, 1 where it is light, and the brightness of its yarns: woven gingham.
 
-    Stripes of warp cross stripes of weft; a thread of one lies over and under those of the other in turn.  Where threads are
-    too fine to be seen half of each is.  u, v, check, footprint [m].
+    Stripes of warp cross stripes of weft; a yarn of one lies over and under those of the other in turn.  Where yarns are too fine
+    to be seen, half of each shows.  u, v, check, footprint [m].
     """
     width = max(footprint / check, 1e-6)
     warp, weft = _stripes(u / check, width), _stripes(v / check, width)
-    over, fine = 0.5, THREADS * width
+    over, fine = 0.5, YARNS * width
     if fine < FINEST:
-        over += (4 * COVER - 2) * (_stripes(u / check * THREADS, fine) - 0.5) * (_stripes(v / check * THREADS, fine) - 0.5)
+        over += (4 * COVER - 2) * (_stripes(u / check * YARNS, fine) - 0.5) * (_stripes(v / check * YARNS, fine) - 0.5)
     return weft + over * (warp - weft), 1 + RELIEF * (over - 0.5)
 
 
 @kernel
 def _fabric(uv, values, triangles, t, w0, w1, w2, footprint, check, palette, heat, front):
-    """Linear colour of the cloth at a point of triangle t."""
+    """Linear color of the cloth at a point of triangle t."""
     i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
     if len(values) > 0:
         value = w0 * values[i] + w1 * values[j] + w2 * values[k]
@@ -238,9 +239,9 @@ def survey(screen, owner, buffer, surface, antialias, smoothness, seen):
 
 @kernel
 def shade_floor(rays, view, maps, rig, studio, antialias, seen, light):
-    """The studio, darkened by shadows, into ``light``, (height, width, 3); what surfaces cover of a pixel is left to them.
+    """Write the studio, darkened by shadows, to ``light``, (height, width, 3), less the share of each pixel that surfaces cover.
 
-    A shadow on the floor is smooth: one look in the middle of a pixel does for all its samples.
+    Shadows on the floor are smooth: one sample in the middle of a pixel is enough.
     """
     _, _, cast, cast_box, heights, heights_box, floor_box = maps
     axes, center, shadow_scale, height_scale, _ = rig
@@ -281,7 +282,7 @@ def _pixels_of_floor(box, eye, view, width, height):
     for corner in range(4):
         dx, dy = box[corner & 1] - eye[0], box[2 + (corner >> 1)] - eye[1]
         depth = axes[2][0] * dx + axes[2][1] * dy - axes[2][2] * eye[2]
-        if depth < near:  # it reaches behind the eye
+        if depth < near:  # the rectangle reaches behind the eye
             return 0, width - 1, 0, height - 1
         along, up = axes[0][0] * dx + axes[0][1] * dy - axes[0][2] * eye[2], axes[1][0] * dx + axes[1][1] * dy - axes[1][2] * eye[2]
         column = int(min(max(0.5 * width + scale * along / depth, -1), width))
@@ -295,7 +296,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
     """Add cloth and solids, linear, to ``light``, (height, width, 3): the mean over each pixel's antialias^2 samples.
 
     owner: triangle seen by a sample or -1, (height antialias, width antialias).  seen: see ``survey``.  rays: of the samples'
-    image.  Light and pattern are smooth: where all samples show one piece of surface, one look in their middle does for them.
+    image.  Light and pattern are smooth: where all samples show one even piece of surface, one in the middle is enough.
     """
     screen, inverse_depth, triangles, normals, uv, surface, curvature, values = mesh
     palette, check, heat = look
@@ -307,7 +308,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
         row, column = place // width, place % width
         if seen[row, column] == 0:
             continue
-        across = antialias if seen[row, column] < 0 else 1  # samples that one look is for
+        across = antialias if seen[row, column] < 0 else 1  # samples that are shaded at once
         looks = 1 if seen[row, column] < 0 else antialias * antialias
         for n in range(looks):
             s, q = row * antialias + n // antialias, column * antialias + n % antialias
@@ -332,7 +333,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
             facing = min(max(-(nx * dx + ny * dy + nz * dz) * toward, 0), 1)
 
             lamp = nx * axes[2][0] + ny * axes[2][1] + nz * axes[2][2]
-            # looked up beside the surface, on its lit side: within a texel a slanted surface would shade itself
+            # read beside the surface, on its lit side: within a texel a slanted surface would shadow itself
             aside = TEXELS_ASIDE / shadow_scale if lamp > 0 else -TEXELS_ASIDE / shadow_scale
             lit = _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x + aside * nx, y + aside * ny, z + aside * nz)
             _, hanging, roof = _heights_at(heights, heights_box, center, height_scale, x, y)
@@ -342,7 +343,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
             if surface[t] == CLOTH:
                 footprint = depth * across * slope / max(facing, 0.15)
                 r, g, b = _fabric(uv, values, triangles, t, w0, w1, w2, footprint, check, palette, heat, not clockwise)
-                # some of the lamp's light comes through the fabric
+                # some of the lamp's light passes through the fabric
                 direct += TRANSLUCENCE * max(-lamp, 0) * lit
                 # less of the sky is seen from a hollow, more from a ridge
                 bent = w0 * curvature[i] + w1 * curvature[j] + w2 * curvature[k]
@@ -366,7 +367,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
 
 @kernel
 def encode(light, out):
-    """Linear light to sRGB bytes, (height, width, 3); what is not a number is black."""
+    """Linear light to sRGB bytes, (height, width, 3); NaN is black."""
     for row in range(light.shape[0]):
         for column in range(light.shape[1]):
             for c in range(3):

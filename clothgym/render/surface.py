@@ -12,11 +12,11 @@ from clothgym._jit import kernel
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """What does not change from frame to frame.
+    """The parts of a drawn surface that do not change from frame to frame.
 
     Attributes:
-        index: particles that a drawn vertex is made of, (vertices, k) int32.
-        weight: their shares; they sum to 1, (vertices, k) float32.
+        index: particles of which a drawn vertex is a mean, (vertices, k) int32.
+        weight: their weights, which sum to 1, (vertices, k) float32.
         triangles: (triangles, 3) int32.
         uv: material coordinates of the vertices [m], (vertices, 2) float32.
         cell: side of a drawn cell where the surface is refined [m]; 0 where triangles are drawn as they are.
@@ -30,7 +30,7 @@ class Surface:
 
 
 def plain_surface(triangles: NDArray[np.int32], uv: NDArray[np.float32]) -> Surface:
-    """The triangles as they are."""
+    """The triangles of the mesh, unrefined."""
     particles = len(uv)
     return Surface(np.arange(particles, dtype=np.int32)[:, None], np.ones((particles, 1), np.float32), triangles, uv)
 
@@ -47,7 +47,7 @@ def smooth_surface(triangles: NDArray[np.int32], uv: NDArray[np.float32], grid_s
     fine = np.arange(len(index)).reshape(len(row_index), len(col_index))
     a, b, c, d = (q.ravel() for q in (fine[:-1, :-1], fine[:-1, 1:], fine[1:, :-1], fine[1:, 1:]))
     quads = np.stack([np.stack([a, b, d], 1), np.stack([a, d, c], 1)], axis=1).reshape(-1, 3).astype(np.int32)
-    # the caller's triangles say which side is the front: these are counter-clockwise with columns along x and rows along y
+    # the given triangles define the front: these are counter-clockwise with columns along x and rows along y
     (r0, c0), (r1, c1), (r2, c2) = (divmod(int(corner), cols) for corner in triangles[0])
     if (c1 - c0) * (r2 - r0) < (c2 - c0) * (r1 - r0):
         quads = np.ascontiguousarray(quads[:, ::-1])
@@ -58,7 +58,7 @@ def smooth_surface(triangles: NDArray[np.int32], uv: NDArray[np.float32], grid_s
 def _catmull_rom(count: int, factor: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Four points and their weights for each point of a line refined ``factor`` times, two (points, 4).
 
-    Catmull and Rom 1974; beyond its ends the line is continued straight on, so that flat stays flat.
+    Catmull and Rom 1974; the line continues straight beyond its ends, so that flat stays flat.
     """
     place = np.arange((count - 1) * factor + 1)
     cell = np.minimum(place // factor, count - 2)
@@ -98,8 +98,8 @@ def place_vertices(x, index, weight, out):
 def push_out(x, num_cloth, center, cos_yaw, sin_yaw, half, radius, lift, deepest):
     """Lift the first ``num_cloth`` vertices ``x`` [m], (vertices, 3), that lie in a solid to ``lift`` [m] above its surface.
 
-    Particles rest on a solid, but straight cloth between them cuts its edges off, and so does a drawn cell.  A vertex
-    deeper than ``deepest`` [m] stays: there the cloth is truly inside.  The solid is a box of half sides ``half`` [m] swept
+    Particles rest on a solid, but straight cloth between them, and a drawn cell, cut off its edges.  A vertex deeper than
+    ``deepest`` [m] stays: there the cloth is really inside.  The solid is a box of half sides ``half`` [m] swept
     by a ball of ``radius`` [m].
     """
     for v in range(num_cloth):
@@ -131,7 +131,7 @@ def push_out(x, num_cloth, center, cos_yaw, sin_yaw, half, radius, lift, deepest
 
 @kernel
 def vertex_normals(x, triangles, out):
-    """Unit normals, (vertices, 3): the sum of the triangles' own, each weighted by its area."""
+    """Unit normals, (vertices, 3): the mean over triangles, weighted by area."""
     out[:] = 0
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
@@ -148,14 +148,14 @@ def vertex_normals(x, triangles, out):
             for c in range(3):
                 out[v, c] /= length
         else:
-            out[v, 2] = 1  # a collapsed patch has no direction of its own
+            out[v, 2] = 1  # a collapsed patch has no normal
 
 
 @kernel
 def vertex_curvature(x, normals, triangles, out):
-    """Mean curvature [1/m], (vertices,), positive where the neighbours lie above the tangent plane: in a hollow of the front.
+    """Mean curvature [1/m], (vertices,), positive where the neighbors lie above the tangent plane: in a hollow of the front.
 
-    A neighbour at e lies H |e|^2 / 2 above the plane: each edge is asked, and the longer ones count for more.
+    A neighbor at e lies H |e|^2 / 2 above the plane; H is the mean over edges, weighted by |e|^2.
     """
     squares = np.zeros(len(out), np.float32)
     out[:] = 0
