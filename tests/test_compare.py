@@ -9,7 +9,7 @@ import pytest
 
 from clothgym import INTEGRATORS, Material
 from clothgym.cli import main
-from clothgym.lab import compare, compare_pictures
+from clothgym.lab import compare, compare_pictures, compare_plan
 from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 
 THREE = ("explicit_euler", "verlet", "xpbd")
@@ -49,7 +49,7 @@ def test_all_results_are_written(tiny):
     folder, results = tiny
     written = json.loads((folder / "results.json").read_text())
     assert written["machine"]["versions"]["clothgym"]
-    assert len(written["rows"]) == 2 + 2 + 2 * len(compare.CHOICES["xpbd"])
+    assert len(written["rows"]) == 2 + 2 + 2 * len(compare_plan.CHOICES["xpbd"])
     assert written["rows"] == json.loads(json.dumps(results["rows"]))
     text = (folder / "table.txt").read_text()
     assert text == compare.table(results) + "\n"
@@ -175,7 +175,7 @@ def test_a_missing_matplotlib_is_told_before_anything_is_measured(tmp_path, monk
 
 
 def test_the_first_choice_of_options_is_the_default():
-    for name, choices in compare.CHOICES.items():
+    for name, choices in compare_plan.CHOICES.items():
         assert choices[0].items() <= INTEGRATORS[name].options.items()
     assert set(compare_pictures.COLORS) == set(INTEGRATORS)
 

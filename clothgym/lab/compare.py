@@ -12,77 +12,21 @@ import json
 import statistics
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import integrators
+from clothgym.lab import compare_pictures
 from clothgym.lab.bench import machine
-from clothgym.lab.compare_scenes import FRAME, SCENES, Scene, scene_named
+from clothgym.lab.compare_plan import LANES, Plan, Row, Setting, described, sheet_name
+from clothgym.lab.compare_plan import plan as plan
+from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 from clothgym.simulation import Simulation
 
-Row = dict[str, Any]
-
 BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
-LANES = 64  # sheets in the batch that is timed
 VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; fewer, but so many, once they have taken so long [s]
-# options of an integrator to try, its default first
-CHOICES: dict[str, tuple[dict[str, int], ...]] = {
-    "implicit_euler": ({"newton_iterations": 1}, {"newton_iterations": 3}),
-    "projective_dynamics": ({"iterations": 10}, {"iterations": 3}),
-    "pbd": ({"iterations": 10},),
-    "xpbd": ({"iterations": 1}, {"iterations": 4}),
-}
-
-
-class Setting(NamedTuple):
-    """One configuration to measure: integrator, options, substeps of a control step, and a variant of the scene or ""."""
-
-    integrator: str
-    options: Mapping[str, int]
-    substeps: int
-    variant: str
-
-    def matches(self, row: Row) -> bool:
-        return self == Setting(*(row[name] for name in self._fields))
-
-    def simulation(self, scene: Scene, num_envs: int = 1) -> Simulation:
-        return scene.simulation({"name": self.integrator, **self.options}, self.substeps, self.variant, num_envs)
-
-
-class Plan(NamedTuple):
-    """A scene and the integrators to try on it; ``quick`` tries fewer settings."""
-
-    scene: Scene
-    names: tuple[str, ...]
-    quick: bool = False
-
-    def settings(self) -> list[Setting]:
-        """All settings, by integrator, option and substeps; then the scene's variants, with the substeps of the picture."""
-        scene = self.scene
-        tried = [n for place, n in enumerate(scene.substeps) if n == scene.shown or place % 2 or not self.quick]
-        of = {name: CHOICES.get(name, ({},))[: 1 if self.quick else None] for name in self.names}
-        return [Setting(name, options, n, "") for name in self.names for options in of[name] for n in tried] + [
-            Setting(name, of[name][0], scene.shown, variant) for variant in scene.variants for name in self.names
-        ]
-
-    def shown(self) -> list[Setting]:
-        """The settings in the picture."""
-        settings = [s for s in self.settings() if s.substeps == self.scene.shown]
-        return [s for s in settings if s.options == CHOICES.get(s.integrator, ({},))[0]]
-
-
-def plan(scene: str, names: Sequence[str] | None = None, quick: bool = False) -> Plan:
-    """What is to be measured; all integrators if no names are given.
-
-    Raises:
-        ValueError: no such scene or integrator; the message lists those that there are.
-    """
-    names = tuple(dict.fromkeys(names or integrators.INTEGRATORS))
-    return Plan(scene_named(scene), tuple(integrators.get(name).name for name in names), quick)
 
 
 # --- one setting --------------------------------------------------------------------------------------------------------
@@ -209,18 +153,12 @@ class Record:
         part.replace(self.path)
 
 
-def sheet_name(setting: Setting) -> str:
-    return setting.integrator + (f", {setting.variant}" if setting.variant else "")
-
-
 def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
     """Measure what the folder lacks, draw the pictures, and return the results.
 
     Raises:
         ImportError: matplotlib is missing; nothing has been measured.
     """
-    from clothgym.lab import compare_pictures
-
     compare_pictures.pyplot()
     scene, settings, shown = plan.scene, plan.settings(), plan.shown()
     record = Record(folder, scene, fresh)
@@ -274,11 +212,6 @@ COLUMNS = {
     "ms_alone": ("ms/s alone", "{:.3g}", 1),
     "ns_per_element": ("ns/element", "{:.2f}", 1),
 }
-
-
-def described(options: Mapping[str, int], variant: str = "") -> str:
-    """Options and variant as shown in a table."""
-    return ", ".join([f"{name.replace('_', ' ')} {value}" for name, value in options.items()] + [variant] * bool(variant))
 
 
 def table(results: Row) -> str:

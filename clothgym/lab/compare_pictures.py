@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.lab.compare_plan import LANES, Row, Setting, described
 from clothgym.lab.compare_scenes import Scene
 from clothgym.render import Camera, Renderer
-
-if TYPE_CHECKING:
-    from clothgym.lab.compare import Row, Setting
 
 INK, QUIET = "#2b2d42", "#8d99ae"
 COLORS = {
@@ -50,8 +48,6 @@ def pyplot() -> Any:
 
 def draw_work_precision(results: Row, path: Path) -> None:
     """Error over cost: a color for each integrator, a line for each choice of its options."""
-    from clothgym.lab.compare import LANES, described
-
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(9.6, 5.0), layout="constrained")
     axes.set(xscale="log", yscale="log")
