@@ -55,6 +55,7 @@ def _take(own, rules, sheet, move, free):
 @inlined
 def _potential(own, rules, sheet):
     """How far the taking hold is along, and how near the sheet is to the target."""
+    # 1 for a place that is held, at most a half for one that its gripper is near
     taken = 0.0
     for k in range(rules.places.shape[0]):
         place = rules.places[k]

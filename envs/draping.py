@@ -39,9 +39,9 @@ THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its 
 EVALUATED_POINTS = 256
 GUIDE_POINTS = 32
 COVERED_WITHIN = 0.02  # in sides
-CENTRING_SCALE = 0.2  # in sides: performance is halved at this distance
+CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
 SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
-ENOUGH_COVERAGE, ENOUGH_CENTRING, ENOUGH_REST = 0.9, 0.1, 0.05
+ENOUGH_COVERAGE, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.1, 0.05
 
 BOX = SHAPES.index("box")
 TARGET_SLOT = 1  # the target's place among ``colliders``
@@ -126,7 +126,7 @@ def constants(guide_reach: float) -> dict[str, Any]:
 
 @inlined
 def _surface_of(own, units):
-    """Points of the target's upper surface, as ``place_points`` takes them; units: those of a round one and of a box."""
+    """Points of the target's upper surface, as ``placed`` takes them; units: those of a round one and of a box."""
     return units[1 if own.solid == BOX else 0], own.top, own.radius, own.turn
 
 
@@ -152,29 +152,31 @@ def _off_center(own, rules, sheet):
 
 
 @inlined
-def _centring(off_center):
-    """1 in the center, 1/2 at CENTRING_SCALE sides: smooth, and with a gradient from afar."""
-    return 1 / (1 + (off_center / CENTRING_SCALE) ** 2)
+def _centering(off_center):
+    """1 in the center, 1/2 at CENTERING_SCALE sides: smooth, and with a gradient from afar."""
+    return 1 / (1 + (off_center / CENTERING_SCALE) ** 2)
 
 
 @inlined
 def covering(own, rules, sheet):
     """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
     near = _nearness(sheet.x, _surface_of(own, rules.guides), rules.guide_reach)
-    return (near + _centring(_off_center(own, rules, sheet))) / 2
+    return (near + _centering(_off_center(own, rules, sheet))) / 2
 
 
 @inlined
 def evaluate_cover(own, rules, sheet, info):
     """Write what covers the target, how central and how much at rest it is; returns the normalized performance."""
+    # what the evaluation measures
     surface = _surface_of(own, rules.evaluated)
     info.coverage = _coverage(sheet.x, sheet.mesh.triangles, surface, COVERED_WITHIN * rules.side)
     info.off_center = _off_center(own, rules, sheet)
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    # success by thresholds; the performance is a smooth product of the same three
     share = info.coverage / own.reference
-    central, at_rest = info.off_center <= ENOUGH_CENTRING, info.rms_speed < ENOUGH_REST
+    central, at_rest = info.off_center <= ENOUGH_CENTERING, info.rms_speed < ENOUGH_REST
     info.is_success = share >= ENOUGH_COVERAGE and central and at_rest
-    return min(share, 1.0) * _centring(info.off_center) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+    return min(share, 1.0) * _centering(info.off_center) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
 
 
 @inlined
@@ -187,14 +189,17 @@ def account_reference(own, rules, sheet, info, terms, running, failure):
 @inlined
 def observe_target(own, rules, sheet, seen):
     """The sheet's center, what holds it, the target, and the time."""
+    # the sheet, and what holds it
     for c in range(3):
         seen.center[c] = (sheet.summary[CENTROID + c] - own.top[c]) / rules.side
     for k in range(sheet.holds.shape[0]):
         seen.holds[k] = sheet.holds[k] > 0
+    # the target: its shape among all, size and yaw
     for k in range(len(SHAPES)):
         seen.target_shape[k] = own.solid == k
     seen.target_radius, seen.target_height = own.radius / rules.side, own.top[2] / rules.side
     seen.target_yaw = own.yaw * (4 / np.pi)
+    # where the episode is
     seen.settling = own.settling_since >= 0
     seen.episode_left = 1 - own.step / (rules.acting_steps + rules.settling_steps)
     seen.acting_left = max(rules.acting_steps - own.step, 0) / rules.acting_steps

@@ -24,6 +24,7 @@ GROUP = 4  # triangles that share a box in ``covered_share``
 
 @inlined
 def _distance2(p, q):
+    """Squared distance of two points."""
     return (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
 
 
@@ -49,6 +50,7 @@ def _bits(value):
 
 @inlined
 def _from_bits(bits):
+    """The float32 of these bits."""
     return np.int32(bits).view(np.float32)
 
 
@@ -56,17 +58,19 @@ def _from_bits(bits):
 def summarize(x, v, share, ends, inverse2, out):
     """Summary of a sheet: (SUMMARY,).
 
-    Centre of area [m] (3), mean squared speed [m^2/s^2], largest squared stretch of the structural springs (length over
+    Center of area [m] (3), mean squared speed [m^2/s^2], largest squared stretch of the structural springs (length over
     rest length), and 1 where every position and velocity is finite and sane, else 0.
     share: each particle's share of the sheet's area, summing to 1, (particles,).  ends: of the structural springs, (2, springs);
     inverse2: one over the squares of their rest lengths [1/m^2], (springs,).
     """
+    # center of area and mean squared speed, weighted by area
     cx = cy = cz = speed2 = np.float32(0)
     for p in range(x.shape[1]):
         cx += share[p] * x[0, p]
         cy += share[p] * x[1, p]
         cz += share[p] * x[2, p]
         speed2 += share[p] * (v[0, p] * v[0, p] + v[1, p] * v[1, p] + v[2, p] * v[2, p])
+    # the largest squared stretch, found by its bits
     largest = np.int32(0)
     for s in range(inverse2.shape[0]):
         i, j = ends[0, s], ends[1, s]
@@ -91,12 +95,14 @@ def stretch_quantile(x, ends, inverse2, share):
     By bisection, from 1 to twice that, to 2^-20: the least stretch (at least 1) that no more than ``1 - share`` of the springs
     exceed.
     """
+    # each spring's stretch
     count = inverse2.shape[0]
     stretch = np.empty(count, np.float32)
     for s in range(count):
         i, j = ends[0, s], ends[1, s]
         dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
         stretch[s] = np.sqrt((dx * dx + dy * dy + dz * dz) * inverse2[s])
+    # halve the range that holds the quantile, twenty times
     allowed = int((1 - share) * count)
     low, step = np.float32(1), np.float32(0.5)
     for _ in range(20):
@@ -114,6 +120,7 @@ def soft_coverage(x, points, reach):
 
     d: distance [m] from the point to the nearest particle.
     """
+    # each point's squared distance to the nearest particle, found by its bits, and its weight in the mean
     one, total = np.float32(1), np.float32(0)
     weight = one / (np.float32(reach) * np.float32(reach))
     for k in range(points.shape[0]):
@@ -149,6 +156,7 @@ def key_particles(mesh: ClothMesh) -> NDArray:
 @kernel
 def _distance2_to_triangle(p, a, b, c):
     """Squared distance [m^2] from point p to triangle abc (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
+    # edges from a, the point from each corner, and its projections on these edges
     abx, aby, abz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     acx, acy, acz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     apx, apy, apz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
@@ -161,6 +169,7 @@ def _distance2_to_triangle(p, a, b, c):
     d5 = abx * cpx + aby * cpy + abz * cpz
     d6 = acx * cpx + acy * cpy + acz * cpz
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    # the nearest point is a + s ab + t ac, with s and t by the region in which p lies
     if d1 <= 0 and d2 <= 0:  # the region of vertex a
         s, t = 0.0, 0.0
     elif d3 >= 0 and d4 <= d3:  # b
@@ -198,6 +207,7 @@ def covered_share(x, triangles, points, tolerance):
                     corners[t, m, c] = x[c, triangles[t, m]]
                     least, most = min(least, corners[t, m, c]), max(most, corners[t, m, c])
             low[g, c], high[g, c] = least - tolerance, most + tolerance
+    # count the points that have a triangle near enough
     covered = 0
     for k in range(points.shape[0]):
         covered += _near_any(points[k], corners, low, high, tolerance * tolerance)
@@ -207,6 +217,7 @@ def covered_share(x, triangles, points, tolerance):
 @kernel
 def _near_any(p, corners, low, high, tolerance2):
     """Whether a triangle is within the root of ``tolerance2`` [m^2] of point p; low, high: boxes of GROUP triangles each."""
+    # triangles of a box that holds the point, until one is near enough
     x, y, z = p[0], p[1], p[2]
     for g in range((corners.shape[0] + GROUP - 1) // GROUP):
         if x < low[g, 0] or x > high[g, 0] or y < low[g, 1] or y > high[g, 1] or z < low[g, 2] or z > high[g, 2]:

@@ -78,6 +78,7 @@ def _pass_waypoint(own, rules, sheet, move, free):
 @inlined
 def _measure(own, rules, sheet):
     """The strain's 95th percentile, how the sheet pulls at each clip, and the origin of what is observed."""
+    # strain and pulls; a sheet that has diverged pulls at nothing
     own.strain_p95 = stretch_quantile(sheet.x, sheet.mesh.ends, sheet.mesh.inverse2, 0.95) - 1
     for k in range(2):
         pull = length_of(sheet.pulls[k])
@@ -112,12 +113,14 @@ def _evaluate(own, rules, sheet, info):
 @inlined
 def _account(own, rules, sheet, info, terms, running, failure):
     """The step's cost and what it comes from; returns the price of that cost."""
+    # the cost of this step
     strain = largest_strain(sheet.summary)
     info.cost = 1.0 if running and strain > rules.threshold else 0.0
     # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
     cost = info.cost + (rules.acting_steps - own.step if failure != FINE else 0)
     own.episode_cost += cost
     info.episode_cost = own.episode_cost
+    # what it comes from
     info.strain_excess = max(strain - rules.threshold, 0.0)
     info.strain_p95 = own.strain_p95 if sheet.summary[FINITE] > 0 else MOST_STRAIN
     info.tension_left, info.tension_right = own.tension[0], own.tension[1]
@@ -128,15 +131,18 @@ def _account(own, rules, sheet, info, terms, running, failure):
 @inlined
 def _observe(own, rules, sheet, seen):
     """The ways to the next two way-points, the post, the wind, strain and pulls, the threshold and the time."""
+    # ways and pulls of both clips
     following = min(own.next + 1, WAYPOINTS - 1)
     for k in range(2):
         for c in range(3):
             seen.to_next[k, c] = (own.places[own.next, k, c] - sheet.hands[k, c]) * (5 / rules.side)
             seen.to_following[k, c] = (own.places[following, k, c] - sheet.hands[k, c]) / rules.side
         seen.pulls[k] = own.tension[k] / rules.weight
+    # where on the way the pair is
     seen.at_goal = own.next == WAYPOINTS - 1
     for c in range(2):
         seen.post[c] = (own.post[c] - (sheet.hands[0, c] + sheet.hands[1, c]) / 2) / rules.side
+    # the air, the strain over the threshold, and the time
     for c in range(3):
         seen.wind[c] = sheet.air[min(own.step, sheet.air.shape[0] - 1), c]
     seen.strain_max = largest_strain(sheet.summary) / rules.threshold

@@ -1,4 +1,4 @@
-"""The drape: its reward, limits, observation and judgement, against figures worked out here."""
+"""The drape: its reward, limits, observation and evaluation, against figures worked out here."""
 
 import gymnasium as gym
 import numpy as np
@@ -50,7 +50,7 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
     assert total == pytest.approx(info["normalized_performance"] - before - effort + 0.25, abs=1e-5)
 
 
-def test_the_sparse_reward_is_the_judgement_alone():
+def test_the_sparse_reward_is_the_evaluation_alone():
     env, _ = start(reward_mode="sparse")
     rewards, terminated = [], False
     while not terminated:
@@ -79,7 +79,7 @@ def test_an_anchor_lets_go_above_four_fifths(grip, held):
     assert env.task.simulation.attached[0].tolist() == [held, True]
 
 
-def test_time_is_up_after_60_steps_and_the_judgement_is_40_later():
+def test_time_is_up_after_60_steps_and_the_evaluation_is_40_later():
     env, _ = start()
     for step in range(1, 101):
         *_, terminated, _, info = env.step(np.zeros(8))
@@ -163,7 +163,7 @@ def test_a_refused_reset_leaves_nothing_behind():
     assert env.task.simulation.parameters[0] == pytest.approx([0.1503, 261.1, 105.0, 2.34e-6, 1e-4, 1.2, 0.02, 0.72])
 
 
-# --- the judgement of the drape -------------------------------------------------------------------------------------------
+# --- the evaluation of the drape -------------------------------------------------------------------------------------------
 
 
 def test_distance_to_a_triangle_against_a_fine_sampling():
@@ -212,7 +212,7 @@ def test_reference_coverage_interpolates_the_table():
 
 
 def laid(env, offset):
-    """Put the sheet flat on the target's top, ``offset`` sides beside it, held by nothing; let it settle and be judged."""
+    """Put the sheet flat on the target's top, ``offset`` sides beside it, held by nothing; let it settle and be evaluated."""
     env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.unwrapped.task
     task.simulation.reset(positions=SHEET.rest_positions + (offset * SIDE, 0, 0.244))

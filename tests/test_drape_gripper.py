@@ -1,4 +1,4 @@
-"""The drape with grippers: its fingers, potential, observation, starts and judgement, against figures worked out here."""
+"""The drape with grippers: its fingers, potential, observation, starts and evaluation, against figures worked out here."""
 
 from importlib import resources
 
@@ -65,7 +65,7 @@ def potential(env, places=CORNERS):
     return 0.7 * drape + 0.3 * np.mean(np.where(held, 1, 0.5 / (1 + (away / (0.15 * SIDE)) ** 2)))
 
 
-def judgement(env, index=0):
+def evaluation(env, index=0):
     """What the drape's page says of the sheet as it lies: performance, success, coverage, distance and speed."""
     task = env.unwrapped.task
     target, x = task.targets[index], positions(env)[index]
@@ -148,7 +148,7 @@ def test_a_new_episode_begins_with_open_fingers_that_were_told_nothing():
     assert np.all(grippers.openings[0] == 1) and np.array_equal(grippers.openings[1], before)
 
 
-def test_fingers_open_after_100_steps_and_the_judgement_is_at_140():
+def test_fingers_open_after_100_steps_and_the_evaluation_is_at_140():
     env, _ = start()
     for step in range(1, STEPS + 1):
         moves = np.array([0, 0, 0.2, CLOSED, 0, 0, 0.2, CLOSED])
@@ -183,7 +183,7 @@ def test_a_gripper_takes_what_lies_within_3_cm_of_its_tip_and_moves_no_faster_th
         assert positions(env)[0, CORNERS] - before[1] == pytest.approx(np.tile(wanted, (2, 1)), abs=1e-5)
 
 
-# --- reward and judgement -------------------------------------------------------------------------------------------------
+# --- reward and evaluation -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("policy", ["expert", "chance"])
@@ -200,7 +200,7 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
         held.append(int(np.sum(env.get_state().simulation.holder[0, CORNERS] >= 0)))
         if steps % 7 == 0 and not terminated:
             assert total == pytest.approx(potential(env) - before - effort, abs=2e-5)
-    performance, success, *_ = judgement(env)
+    performance, success, *_ = evaluation(env)
     assert info["is_success"] == success == (policy == "expert")
     assert (max(held) == 2 and performance > 0.8) if success else performance < 0.1
     assert total == pytest.approx(performance - before - effort + 0.25 * success, abs=2e-5)
@@ -219,22 +219,22 @@ def test_the_potential_of_one_gripper_counts_the_middle_of_the_edge():
     assert held[-1] and not held[0]
 
 
-def test_the_sparse_reward_is_the_judgement_alone():
+def test_the_sparse_reward_is_the_evaluation_alone():
     env, _ = start(reward_mode="sparse")
     rewards, terminated = [], False
     while not terminated:
         _, reward, terminated, _, info = env.step(env.expert_action())
         rewards.append(reward)
-    assert rewards[-1] == pytest.approx(judgement(env)[0], rel=1e-5) and rewards[-1] > 0.5 and not any(rewards[:-1])
+    assert rewards[-1] == pytest.approx(evaluation(env)[0], rel=1e-5) and rewards[-1] > 0.5 and not any(rewards[:-1])
     assert info["failure"] == ""
 
 
-def test_the_judgement_is_the_drape_s_on_the_sheet_as_it_lies():
+def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():
     """On the expert's sheets, and on such as were let go too early."""
     env = batch(12, seed=20)
     last = play(env, lambda env, step: env.unwrapped.expert_actions() if step < 62 else np.tile([0, 0, 0, OPEN] * 2, (12, 1)))
     for i in range(12):
-        performance, success, coverage, off, speed = judgement(env, i)
+        performance, success, coverage, off, speed = evaluation(env, i)
         assert last["coverage"][i] == coverage
         assert last["coverage_reference"][i] == reference_coverage(env.unwrapped.task.targets[i], SIDE)
         assert last["off_center"][i] == pytest.approx(off, abs=1e-5)
@@ -248,7 +248,7 @@ def test_the_judgement_is_the_drape_s_on_the_sheet_as_it_lies():
     ("offset", "speed", "success"), [(0.0, 0.0, True), (0.0, 0.3, False), (0.13, 0.0, False), (0.09, 0.0, True)]
 )
 def test_success_asks_for_a_centred_sheet_at_rest(offset, speed, success):
-    """A flat sheet on a box, which is judged at once, without weight: at rest or not, centred or not."""
+    """A flat sheet on a box, which is evaluated at once, without weight: at rest or not, centred or not."""
     env, _ = start(options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.task
     env.step(np.zeros(8))
@@ -256,7 +256,7 @@ def test_success_asks_for_a_centred_sheet_at_rest(offset, speed, success):
     task.simulation.reset(positions=SHEET.rest_positions + (offset * SIDE, 0, 0.243), velocities=(speed, 0, 0))
     task.episode["settling_since"][0], task.episode["step"][0] = ACTING, STEPS - 1
     *_, terminated, _, info = env.step(np.zeros(8))
-    performance, *_, off, rms = judgement(env)
+    performance, *_, off, rms = evaluation(env)
     assert terminated and off == pytest.approx(offset + speed / 60 / SIDE, abs=0.015) and (rms > 0.05) == (speed > 0)
     assert info["coverage"] > 0.9 and info["is_success"] == success
     assert info["normalized_performance"] == pytest.approx(performance, abs=1e-5)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_drape_gripper import ACTING, CORNERS, SIDE, STEPS, batch, fetched, judgement, play, positions, start, stretch
+from test_drape_gripper import ACTING, CORNERS, SIDE, STEPS, batch, evaluation, fetched, play, positions, start, stretch
 
 # --- who succeeds, and who cheats -----------------------------------------------------------------------------------------
 
@@ -35,8 +35,8 @@ def test_fingers_that_cannot_hold_the_weight_never_lift_the_sheet():
     assert play(firm, lambda env, step: env.unwrapped.expert_actions())["is_success"].any()
 
 
-def test_who_holds_the_sheet_over_the_target_to_the_end_is_judged_by_how_it_falls():
-    """The fingers open by themselves; nothing that is held is ever judged, and the sheet is where it fell."""
+def test_who_holds_the_sheet_over_the_target_to_the_end_is_evaluated_by_how_it_falls():
+    """The fingers open by themselves; nothing that is held is ever evaluated, and the sheet is where it fell."""
     env = batch(6, seed=3)
     heights, hold, policy = [], [], fetched((0.0, 0.25, 0.75))
 
@@ -51,7 +51,7 @@ def test_who_holds_the_sheet_over_the_target_to_the_end_is_judged_by_how_it_fall
     assert not np.any(hold[ACTING + 1 :]) and np.all(positions(env)[:, CORNERS, 2].max(axis=1) < tops + 0.1 * SIDE)
     assert last["steps"] == STEPS
     for i in range(6):
-        performance, success, *_ = judgement(env, i)
+        performance, success, *_ = evaluation(env, i)
         assert last["normalized_performance"][i] == pytest.approx(performance, abs=1e-5) and last["is_success"][i] == success
 
 

@@ -1,4 +1,4 @@
-"""The reach: its reward, limits, observation and judgement, against figures worked out here."""
+"""The reach: its reward, limits, observation and evaluation, against figures worked out here."""
 
 import gymnasium as gym
 import numpy as np
@@ -33,8 +33,8 @@ def potential(env, d0):
     return (max(0, 1 - d / d0) + 1 / (1 + (d / 0.15) ** 2) / (1 + (v / 0.2) ** 2)) / 2
 
 
-def judged(env, distance, velocity=(0.0, 0.0, 0.0)):
-    """The judgement of an episode at whose end the free corner is this far from the goal, in sides, and moves like that [m/s].
+def evaluated(env, distance, velocity=(0.0, 0.0, 0.0)):
+    """The evaluation of an episode at whose end the free corner is this far from the goal, in sides, and moves like that [m/s].
 
     The sheet hangs at rest in a frame that moves with its hand; without drag nothing tells it so.
     """
@@ -72,7 +72,7 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
     assert total == pytest.approx(info["normalized_performance"] - before - effort + 0.25 * info["is_success"], abs=1e-5)
 
 
-def test_the_sparse_reward_is_the_judgement_alone():
+def test_the_sparse_reward_is_the_evaluation_alone():
     env, _ = start(reward_mode="sparse")
     rewards = []
     for _ in range(STEPS):
@@ -94,7 +94,7 @@ def test_a_failure_costs_the_potential_and_a_half():
     assert reward == pytest.approx(-before - 0.5, abs=1e-5) and before > 0.2
 
 
-# --- judgement ------------------------------------------------------------------------------------------------------------
+# --- evaluation ------------------------------------------------------------------------------------------------------------
 
 
 def test_performance_is_the_share_of_the_way_and_of_calm():
@@ -112,7 +112,7 @@ def test_performance_is_the_share_of_the_way_and_of_calm():
 @pytest.mark.parametrize(("distance", "success"), [(0.0, True), (0.049, True), (0.051, False), (0.3, False)])
 def test_a_corner_at_rest_succeeds_within_a_twentieth_of_a_side(distance, success):
     env, _ = start()
-    info = judged(env, distance)
+    info = evaluated(env, distance)
     assert info["goal_distance"] == pytest.approx(distance, abs=5e-4) and info["corner_speed"] < 0.02
     assert info["is_success"] == success
 
@@ -120,9 +120,9 @@ def test_a_corner_at_rest_succeeds_within_a_twentieth_of_a_side(distance, succes
 @pytest.mark.parametrize(("speed", "success"), [(0.09, True), (0.11, False), (0.5, False), (1.5, False)])
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, -0.6, 0.8)])
 def test_a_corner_that_passes_through_the_goal_is_no_success(direction, speed, success):
-    """In the goal at the moment of the judgement, but on its way through; speeds in sides a second."""
+    """In the goal at the moment of the evaluation, but on its way through; speeds in sides a second."""
     env, _ = start()
-    info = judged(env, 0.0, np.array(direction) * speed * SIDE)
+    info = evaluated(env, 0.0, np.array(direction) * speed * SIDE)
     assert info["goal_distance"] < 5e-3 and info["corner_speed"] == pytest.approx(speed, abs=5e-3)
     assert info["is_success"] == success
     assert info["normalized_performance"] == pytest.approx(1 / (1 + (speed / 0.2) ** 2), rel=0.05)
@@ -233,7 +233,7 @@ def test_bad_goals_are_named(goal, name):
 
 
 def play(policy, num_envs=20, seed=100):
-    """Judgements of a policy, as arrays: the last info of each environment."""
+    """Evaluations of a policy, as arrays: the last info of each environment."""
     env = gym.make_vec(REACH, num_envs=num_envs, autoreset_mode="Disabled")
     env.reset(seed=seed)
     for _ in range(STEPS):
