@@ -19,7 +19,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="driving a browse
 if CHROMIUM is None:
     pytest.skip("no Chromium on this machine: apt-get install chromium", allow_module_level=True)
 
-from clothgym.playground.recording import threads  # noqa: E402
+from clothgym.playground.recording import yarns  # noqa: E402
 from clothgym.playground.server import LOOPBACK, serve  # noqa: E402
 
 DEADLINE = 90.0  # seconds for what is waited for: kernels may have to be compiled, beside other tests
@@ -174,7 +174,7 @@ def test_the_most_strained_thread_that_the_page_names_is_the_cores(visitor):
     visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{100 * strain.max():.2f} %", exact=True).count() == 1)
     # what was sent to the browser is red where the core is most strained
     node = visitor.page.show._threads[0]
-    springs = threads(mesh)
+    springs = yarns(mesh)
     loud = np.argsort(strain)[-6:]
     assert np.array_equal(node.points[loud], s.positions[0][mesh.springs.particles[springs[loud]]])
     assert np.all(node.colors[loud, :, 0] > 150) and np.all(node.colors[loud, :, 1] < 40)
@@ -186,7 +186,7 @@ def test_menus_switch_the_integrator_and_the_colours(visitor):
     visitor.until(lambda: visitor.stage.sheets[0].simulation.integrator.name == "verlet")
     visitor.tab.get_by_text("verlet", exact=True).first.wait_for(timeout=1e3 * DEADLINE)
     dark = visitor.picture()
-    visitor.choose("colour by", "fabric")
+    visitor.choose("color by", "fabric")
 
     def reddish():
         red = visitor.picture() - dark

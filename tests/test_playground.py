@@ -12,7 +12,7 @@ from stages import advanced, page
 from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.playground import server
 from clothgym.playground.episode import EpisodeStage, Replay
-from clothgym.playground.recording import Recording, strains, tensions, threads
+from clothgym.playground.recording import Recording, strains, tensions, yarns
 from clothgym.playground.scenes import SCENES, scene_named, turned_on_a_lathe
 from clothgym.playground.show import RAMP, linear, ramp
 from clothgym.playground.stage import SceneStage, Stability, why_it_burst
@@ -73,7 +73,7 @@ def test_readings_are_those_of_the_positions():
 def test_colours_by_strain_are_loudest_where_the_test_finds_the_most_strained_springs():
     stage = advanced(SceneStage("patch", Settings(fabric="knit", air_drag=0.75)), 60)
     mesh, x = stage.scene.mesh, stage.frame.positions[0]
-    springs = threads(mesh)
+    springs = yarns(mesh)
     mine = (lengths(mesh, x.astype(float)) / mesh.springs.rest_length - 1)[springs]
     assert np.allclose(strains(mesh, x, springs), mine, atol=1e-9)
     forces = tensions(mesh, x, springs, stage.frame.stiffness[0])
@@ -84,7 +84,7 @@ def test_colours_by_strain_are_loudest_where_the_test_finds_the_most_strained_sp
     visitor.stage, visitor.moment, visitor.playing = stage, 60, False
     visitor._see()
     visitor.tick()
-    shown = client.scene.handles["/sheet0/threads"]
+    shown = client.scene.handles["/sheet0/yarns"]
     most = np.argsort(mine)[-4:]
     assert np.array_equal(shown.points[most], x[mesh.springs.particles[springs[most]]])
     assert np.array_equal(shown.colors[most], np.broadcast_to(linear(ramp(np.ones((4, 2)))), (4, 2, 3)))

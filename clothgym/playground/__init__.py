@@ -1,4 +1,5 @@
-"""Floor 8: the playground, cloth that a visitor can touch in the browser.
+"""Floor 8: the playground, cloth to play with in the browser.
 
-``scenes`` is what is shown, ``stage`` one visitor's cloth, and ``page`` and ``server`` are all that knows of viser.
+``scenes`` and ``world`` describe what is shown, ``stage`` and ``episode`` run it for one visitor, ``page`` and ``server`` alone use
+viser, and ``exporting`` and ``files`` write what was shown.
 """

@@ -1,4 +1,4 @@
-"""Stages that are no scene of the gallery: an environment with somebody who acts in it, and a recording that is shown again."""
+"""Stages that are not scenes: an environment with a policy, and a recording that is shown again."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observation) -> action
-BOXED = ("integrator", "bending", "strain_limit", "self_collision", "wind", "gust")  # what an environment is made with
+BOXED = ("integrator", "bending", "strain_limit", "self_collision", "wind", "gust")  # settings that need a new environment
 
 
-KEPT_NOTES = ("judgement", "run", "air")  # which a change of settings leaves true
+KEPT_NOTES = ("judgement", "run", "air")  # notes that a change of settings does not affect
 
 
 def expert(env: Any, observation: NDArray) -> NDArray:
@@ -72,7 +72,7 @@ class EpisodeStage(Stage):
             self._begin({})
 
     def _begin(self, given: Mapping[str, Any]) -> None:
-        """Open the environment with these options of its own, anew."""
+        """Open the environment with these options."""
         self._options = dict(given)
         self.env = self._made()
         self._given = dict(given)
@@ -95,7 +95,7 @@ class EpisodeStage(Stage):
         return self._over
 
     def choose(self, policy: str) -> None:
-        """Let somebody else act, from now on; who was trained with other options finds them in an environment that is made anew.
+        """Use another policy from now on; if it was trained with other options, in a new environment with these.
 
         Raises:
             ValueError: nobody has that name.
@@ -113,7 +113,7 @@ class EpisodeStage(Stage):
         self.seed = self.seed if seed is None else int(seed)
         self._observation, _ = self.env.reset(seed=self.seed)
         self.env.action_space.seed(self.seed)
-        # an episode begins with the task's own figures
+        # an episode starts with the task's own parameters
         set_in_place(self.simulation, self._own, self.settings)
         self._dragged: dict[int, NDArray] = {}
         self._closed = np.full(len(self.hands()), self.env.task.hand_actions > 3 and not len(self.simulation.grippers))
@@ -175,7 +175,7 @@ class EpisodeStage(Stage):
         self.recording.labels = (self.simulation.integrator.name,)
 
     def _rebuild(self, after: Settings) -> None:
-        """Make the environment anew, and go on with the episode if its state fits; else begin it again."""
+        """Make a new environment, and continue the episode if its state fits; else restart it."""
         old, options, state = self.env, self._options, self.env.get_state()
         self._options = (self._given or {}) | {
             "integrator": after.integrator,
@@ -197,7 +197,7 @@ class EpisodeStage(Stage):
             self.notes["anew"] = "This cannot change within an episode: it has begun again."
 
     def _goes_on(self, state: Any) -> bool:
-        """Take an episode over, if it fits."""
+        """Continue from a state; returns whether it fits."""
         try:
             self.env.set_state(state)
         except ValueError:
@@ -231,7 +231,7 @@ class EpisodeStage(Stage):
         self._dragged.setdefault(hand, self.simulation.hand_positions[0, hand])
 
     def _steered(self, action: NDArray) -> NDArray:
-        """The action in which dragged hands go where the visitor has them, as fast as the task lets them."""
+        """The action with dragged hands moving to the visitor's positions, as fast as the task allows."""
         task = self.env.task
         moves = action.reshape(task.num_hands, task.hand_actions).copy()
         for hand, place in self._dragged.items():
@@ -243,7 +243,7 @@ class EpisodeStage(Stage):
 
 
 class Replay(Stage):
-    """A recording, shown again: all its frames are there at once, and nothing in it can be changed."""
+    """A recording that is shown again: all frames are there, and nothing can be changed."""
 
     def __init__(self, recording: Recording, name: str = "replay") -> None:
         super().__init__()
@@ -260,14 +260,14 @@ class Replay(Stage):
         return self.frame
 
     def reset(self, seed: int | None = None) -> None:
-        """It begins where it begins."""
+        """Nothing to do: a recording does not change."""
 
     def change(self, **changes: Any) -> None:
         raise ValueError("a recording cannot be changed: choose a scene or an environment")
 
 
 def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
-    """The settings that a task's simulation has; of a wind that each episode draws, the largest speed."""
+    """The settings of a task's simulation; for a wind that each episode draws, the largest speed."""
     material, state = simulation.material, simulation.get_state()
     return Settings(
         gravity=round(-float(state.gravity[0, 2]), 6),

@@ -1,4 +1,4 @@
-"""``python -m clothgym export``: a scene or an episode as a picture, a film or meshes."""
+"""``python -m clothgym export``: a scene or an episode as a picture, a video or meshes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from clothgym.render import MeshSequence, write_picture, write_video
 from clothgym.render.meshes import KINDS
 from clothgym.simulation import GRAVITY
 
-SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a film's side and of a picture's
+SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
 Say = Callable[[int, int], None]
 
 

@@ -1,4 +1,4 @@
-"""What a visitor takes home: a picture, a film, meshes, or the recording itself."""
+"""Files that a visitor can save: a picture, a video, meshes, or the recording itself."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def made(kind: str, stage: Stage, moment: int, camera: Any, color: str = "fabric
 
 
 def _seen(camera: Any) -> Camera:
-    """A viewer's camera, lifted above the floor."""
+    """The viewer's camera, above the floor."""
     x, y, z = np.asarray(camera.position, float).tolist()
     fov = float(np.degrees(camera.fov))
     target = tuple(np.asarray(camera.look_at, float).tolist())

@@ -1,4 +1,4 @@
-"""A viewer that shows nothing: what the page makes is there to be read, and its controls can be turned as a visitor would."""
+"""A viewer that shows nothing: tests read what the page creates, and move its controls as a visitor would."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class Handle:
-    """A control or a node: its properties are attributes, as they were given or last assigned."""
+    """A control or a node with its properties as attributes."""
 
     def __init__(self, kind: str, **properties: Any) -> None:
         self.kind, self.removed = kind, False
@@ -25,7 +25,7 @@ class Handle:
         return callback
 
     def turn(self, value: Any = None, phase: str = "update") -> None:
-        """Do what a visitor does: turn a control to a value, press a button, or drag a node."""
+        """Act as a visitor: set a control to a value, press a button, or drag a node."""
         self.value = value
         for callback in self.callbacks:
             outcome = callback(SimpleNamespace(target=self, phase=phase, client_id=0))
@@ -36,7 +36,7 @@ class Handle:
         self.removed = True
 
     def place(self, *_: Any) -> Handle:
-        """A panel's place is no matter."""
+        """Ignore the placement of a panel."""
         return self
 
     dock_left = dock_right = set_width = add_tab = place
@@ -49,7 +49,7 @@ class Handle:
 
 
 class Part:
-    """A viewer's scene or controls: ``add_...`` makes a handle, by its name or its label; whatever else it is told is no matter."""
+    """A viewer's scene or controls: ``add_...`` creates a handle by its name or label; all other calls are ignored."""
 
     def __init__(self) -> None:
         self.handles: dict[str, Handle] = {}

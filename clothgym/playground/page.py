@@ -17,33 +17,33 @@ from clothgym.integrators import INTEGRATORS
 from clothgym.material import PRESETS
 from clothgym.playground import files
 from clothgym.playground.plots import Plots
-from clothgym.playground.readings import legend, told
+from clothgym.playground.readings import legend, readings_table
 from clothgym.playground.show import MODES, Show
 from clothgym.playground.stage import REBUILDS, SceneStage, Stage
 from clothgym.simulation import GRAVITY
 
 NONE = "none"
-SIDE_BY_SIDE = 0.55  # by which share of that it goes back for each sheet more
-NARROWER = 0.35  # and for each sheet more whose readings take from the view's width
-ROOM = 1.25  # the page's eye is so many times as far away as a picture's: panels take from its width
-HANDS = 4  # that a visitor can make take hold or let go
+SIDE_BY_SIDE = 0.55  # share of its distance by which the eye moves back for each further sheet
+NARROWER = 0.35  # and for each further sheet whose readings make the view narrower
+ROOM = 1.25  # distance of the page's eye relative to that of a picture, since panels make the view narrower
+HANDS = 4  # anchors and grippers that a visitor can close and open
 MOST_SUBSTEPS = 400
-LEFT, COLUMN = 290, 75  # width of the left panel, and what it takes more for a third and a fourth sheet's readings [pixels]
-READ_EVERY = 0.2  # seconds between two looks at numbers and plots: nobody reads faster
-# sliders: setting, label, largest value, step, what a unit of the slider is in the setting's own, and a hint
+LEFT, COLUMN = 290, 75  # width of the left panel, and added to it for the readings of a third and a fourth sheet [pixels]
+READ_EVERY = 0.2  # between two updates of numbers and plots [s]
+# sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
 WORLD = (
-    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from nothing to the Earth's"),
-    ("wind", "wind m/s", 12.0, 0.1, 1.0, "its steady part, to the right"),
+    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from zero to that of the Earth"),
+    ("wind", "wind m/s", 12.0, 0.1, 1.0, "steady part, to the right"),
     ("gust", "gusts m/s", 4.0, 0.1, 1.0, "root mean square of each component"),
     ("friction", "friction", 1.0, 0.01, 1.0, "Coulomb's coefficient of the solids"),
 )
 CLOTH = (
-    ("stretch_stiffness", "threads N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
+    ("stretch_stiffness", "yarns N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
     ("shear_stiffness", "diagonals N/m", 1000.0, 1.0, 1.0, "shear stiffness: shear modulus times thickness"),
     ("bend_rigidity", "bending µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
     ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
-    ("air_drag", "calm N s/m³", 3.0, 0.01, 1.0, "linear drag, in which swings come to rest"),
-    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, kept by force; zero for none"),
+    ("air_drag", "drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
+    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
 )
 
 
@@ -53,19 +53,19 @@ class Page:
     Args:
         client: viser's, or a ``NullClient``.
         open_stage: makes the stage of a name.
-        choices: what there is to choose, names by title.
-        start: the name of the first.
+        choices: names of scenes and environments, by title.
+        start: the name shown first.
 
-    ``tick`` is called by one thread alone; what a visitor does comes in a queue.
+    ``tick`` is called by one thread only; a visitor's actions come in a queue.
     """
 
     def __init__(self, client: Any, open_stage: Callable[[str], Stage], choices: Mapping[str, str], start: str) -> None:
         self.client, self._open_stage, self.choices = client, open_stage, dict(choices)
         self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self.playing, self.moment = True, 0
-        self._stale = True  # whether something is to be drawn
-        self._waiting: Any = None  # what tells that the next frame takes a while
-        self._fresh = False  # whether the stage has something that has not gone on yet, and may be compiled when it does
+        self._stale = True  # whether the view must be drawn again
+        self._waiting: Any = None  # notification that the next frame takes a while
+        self._fresh = False  # whether the stage has not advanced since it was built, and may have to compile first
         self.controls: dict[str, Any] = {}
         self.stage: Stage
         self.open(start)
@@ -73,11 +73,11 @@ class Page:
     # --- what a visitor does --------------------------------------------------------------------------------------------
 
     def order(self, what: str, value: Any = None) -> None:
-        """Something that a visitor wants, to be done in the next tick."""
+        """Queue what a visitor wants, for the next tick."""
         self._orders.put((what, value))
 
     def tick(self) -> None:
-        """Do what was ordered, go on if it plays, and show what has changed."""
+        """Carry out the orders, advance if playing, and show what has changed."""
         changes: dict[str, Any] = {}
         drags: dict[int, NDArray | None] = {}
         while True:
@@ -86,7 +86,7 @@ class Page:
             except Empty:
                 break
             if what == "drag":
-                # of several places on the way the last counts, but the end of it must not be lost
+                # of several positions only the last counts, but the end of a drag must not be lost
                 drags[value[0]] = value[1]
                 self._do(self.stage.drag, *value)
             elif what == "change":
@@ -105,38 +105,38 @@ class Page:
 
     @property
     def _at_the_end(self) -> bool:
-        """Whether nothing more is to come."""
+        """Whether the last frame is shown and the stage is over."""
         return self.stage.over and self.moment == len(self.stage.recording.frames) - 1
 
     def _advance(self) -> None:
-        """Go on to the next frame: of what is over, to one that there is."""
+        """Advance to the next frame; when the stage is over, to the next one recorded."""
         if self.stage.over:
             self.moment = min(self.moment + 1, len(self.stage.recording.frames) - 1)
             return
         if self._fresh:
-            self._wait("Made anew.")
+            self._wait("Rebuilding.")
         self._fresh = False
         self.stage.advance()
         self.moment = len(self.stage.recording.frames) - 1
 
     def _wait(self, why: str) -> None:
-        """Tell the visitor to, until the next frame is there: what is new may have to be compiled before it goes on."""
+        """Show a notification until the next frame is there: what was rebuilt may have to be compiled first."""
         self._fresh = True
         if self._waiting is None:
             words = f"{why} The first time on a machine it is compiled, which takes up to a minute."
             self._waiting = self.client.add_notification("One moment", words, loading=True)
 
     def _do(self, deed: Callable[..., Any], *values: Any) -> bool:
-        """Do something, and whether it could be done; what cannot be is told in a sentence."""
+        """Do something; returns whether it worked.  If not, a notification says why."""
         self._stale = True
         try:
             deed(*values)
         except (ValueError, OSError, ImportError) as error:
-            self.client.add_notification("That cannot be", str(error), color="orange", auto_close_seconds=12.0)
-        except Exception as error:  # policies and recordings are anybody's
+            self.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=12.0)
+        except Exception as error:  # policies and recordings come from users
             traceback.print_exc(file=sys.stderr)
             self.playing = False
-            words = f"It stands still: {type(error).__name__}, {error}. Reset it, or choose who acts or another scene."
+            words = f"Stopped: {type(error).__name__}, {error}. Reset, or choose another policy or another scene."
             self.client.add_notification("Something failed", words, color="red", auto_close_seconds=20.0)
         else:
             return True
@@ -147,7 +147,7 @@ class Page:
         if not changes:
             return
         if any(name in REBUILDS for name in changes):
-            self._wait("Made anew.")
+            self._wait("Rebuilding.")
         self._do(lambda: self.stage.change(**changes))
         if "strain_limit" in changes and isinstance(self.stage, SceneStage):
             self._do(self._compare)
@@ -178,7 +178,7 @@ class Page:
             self.playing = not self.playing
 
     def _scrub(self, moment: float) -> None:
-        """Show a frame of the past."""
+        """Show an earlier frame."""
         self.playing, self.moment = False, min(int(moment), len(self.stage.recording.frames) - 1)
 
     def _compare(self, _: Any = None) -> None:
@@ -188,10 +188,10 @@ class Page:
         limit = self.stage.settings.strain_limit
         unlimited = bool(self.controls["unlimited"].value) and limit is not None and not chosen
         if (tuple(chosen), unlimited) != (self.stage.compared, self.stage.unlimited):
-            self._wait("Comparing." if chosen or unlimited else "Made anew.")
+            self._wait("Comparing." if chosen or unlimited else "Rebuilding.")
             self.stage.compare(chosen, unlimited)
             self.moment = 0
-            self.controls["show"].value = "fabric"  # in which each method has a colour
+            self.controls["show"].value = "fabric"  # in which each method has its color
             more = len(self.stage.sheets) - 1
             self._stand_back(1 + SIDE_BY_SIDE * more + NARROWER * max(0, more - 1))
             self.panel.set_width(LEFT + COLUMN * max(0, more - 1))
@@ -200,7 +200,7 @@ class Page:
     def _choose(self, policy: str) -> None:
         before = self.stage.recording
         self.stage.choose(policy)  # type: ignore[attr-defined]
-        if self.stage.recording is not before:  # it was trained in an environment with other options
+        if self.stage.recording is not before:  # the policy was trained in an environment with other options
             self.moment = 0
             self._see()
 
@@ -210,7 +210,7 @@ class Page:
             self.stage.hold(hand, holds)
 
     def _look(self, _: Any = None) -> None:
-        """Only what is shown has changed."""
+        """Draw again: only the view has changed."""
 
     def _save(self, kind: str) -> None:
         waiting = self.client.add_notification("One moment", f"Making {files.KINDS[kind]}.", loading=True)
@@ -224,7 +224,7 @@ class Page:
     # --- controls -------------------------------------------------------------------------------------------------------
 
     def _build(self) -> None:
-        """All controls, once; ``_suit`` shows those that the open stage has."""
+        """Create all controls, once; ``_suit`` shows those of the open stage."""
         gui, add = self.client.gui, self._add
         add("about", gui.add_markdown(""))
         add("scene", gui.add_dropdown("scene", tuple(self.choices)))
@@ -237,7 +237,7 @@ class Page:
         with add("Cloth", gui.add_folder("Cloth")):
             self._menu(gui, "fabric", "fabric", PRESETS)
             self._add_sliders(gui, CLOTH)
-            hint = "begins anew with a second, pale sheet: the same without the limit"
+            hint = "restarts with a second, pale sheet: the same without the limit"
             self._ordered(self._add("unlimited", gui.add_checkbox("without the limit, too", False, hint=hint)), "compare")
         with add("Method", gui.add_folder("Method")):
             self._add_method(gui)
@@ -245,7 +245,7 @@ class Page:
             self._add_comparison(gui)
         with gui.add_folder("Save"):
             kinds = add("kind", gui.add_dropdown("as", tuple(files.KINDS.values()), initial_value=files.KINDS["png"]))
-            names = {told: kind for kind, told in files.KINDS.items()}
+            names = {label: kind for kind, label in files.KINDS.items()}
             self._ordered(add("save", gui.add_button("Save")), "save", lambda _: names[kinds.value])
         gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
@@ -258,7 +258,7 @@ class Page:
             self.plots = Plots(gui)
 
     def _suit(self) -> None:
-        """Show the controls that the open stage has, at its settings, and look at it from where it is seen well."""
+        """Show the controls of the open stage, at its settings, and place the camera."""
         stage, controls = self.stage, self.controls
         simulated = bool(stage.stabilities())
         controls["about"].content = stage.about
@@ -290,11 +290,11 @@ class Page:
         self._stand_back(1.0)
 
     def _stand_back(self, share: float) -> None:
-        """Look at the stage from where it is seen well, so many times as far away."""
+        """Place the camera where the stage is seen well, at ``share`` times that distance."""
         camera = self.stage.recording.camera
         back = np.subtract(camera.eye, camera.target) * ROOM * share
         self.client.camera.position, self.client.camera.look_at = tuple(camera.target + back), camera.target
-        self.client.camera.near = 0.1  # a sheet is near its solid: depth must tell them apart
+        self.client.camera.near = 0.1  # a sheet is close to its solid, so depth must be resolved
         self.client.camera.fov = float(np.radians(camera.vertical_fov))
 
     def _add(self, name: str, control: Any) -> Any:
@@ -302,7 +302,7 @@ class Page:
         return control
 
     def _ordered(self, control: Any, what: str, meant: Callable[[Any], Any] = lambda value: value) -> None:
-        """Let a control order something when a visitor turns it, and not when we put it somewhere."""
+        """Let a control queue an order when a visitor moves it, not when the page sets it."""
 
         def turned(event: Any) -> None:
             if event.client_id is not None:
@@ -315,9 +315,7 @@ class Page:
         self._ordered(self._add("time", buttons), "press")
         self._add("state", gui.add_markdown(""))
         self._add("seed", gui.add_number("seed", 0, min=0, step=1, hint="of the next reset"))
-        scrub = self._add(
-            "moment", gui.add_slider("moment", 0, 1, 1, 0, hint="frames that were shown; drag it back to see them again")
-        )
+        scrub = self._add("moment", gui.add_slider("moment", 0, 1, 1, 0, hint="frames so far; drag back to see them again"))
         self._ordered(scrub, "scrub")
         menu = self._add("policy", gui.add_dropdown("who acts", ("expert",)))
         self._ordered(menu, "choose")
@@ -356,9 +354,9 @@ class Page:
             self._ordered(menu, "compare")
 
     def _add_view(self, gui: Any) -> None:
-        self._add("show", gui.add_dropdown("colour by", MODES))
+        self._add("show", gui.add_dropdown("color by", MODES))
         self._add("legend", gui.add_html(""))
-        self._add("diagonals", gui.add_checkbox("diagonals, too", False))
+        self._add("diagonals", gui.add_checkbox("show diagonals", False))
         self._add("handles", gui.add_checkbox("handles to drag", False))
         for name in ("show", "diagonals", "handles"):
             self._ordered(self.controls[name], "look")
@@ -369,14 +367,14 @@ class Page:
     # --- what is shown --------------------------------------------------------------------------------------------------
 
     def _see(self) -> None:
-        """The nodes of the stage's recording."""
+        """Create the nodes of the stage's recording."""
         self.show = Show(self.client.scene, self.stage.recording, lambda hand, place: self.order("drag", (hand, place)))
         self.plots.begin(self.stage.recording)
         self._stale, self._read_at = True, -READ_EVERY
         self._fill()
 
     def _fill(self) -> None:
-        """Put the controls to the settings; those that are there already are no new orders."""
+        """Set the controls to the settings, which queues no orders."""
         settings, controls = self.stage.settings, self.controls
         for name, _, largest, _, unit, _ in (*WORLD, *CLOTH):
             value = round((getattr(settings, name) or 0.0) / unit, 9)
@@ -403,7 +401,7 @@ class Page:
             self.show.draw(frames[self.moment], mode, bool(self.controls["diagonals"].value))
             if self.moment == len(frames) - 1:
                 self.show.draw_hands(self.stage.hands(), bool(self.controls["handles"].value))
-        state = "■ over: reset to begin again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
+        state = "■ over: reset to start again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
         if self.controls["state"].content != state:
             self.controls["state"].content = state
         now = time.monotonic()
@@ -418,7 +416,7 @@ class Page:
         controls["moment"].max = max(1, len(frames) - 1)
         controls["moment"].value = self.moment
         controls["notes"].content = "\n\n".join(f"> {note}" for note in self.stage.notes.values())
-        controls["readings"].content = told(self.stage.recording, frame, self.stage.stabilities())
+        controls["readings"].content = readings_table(self.stage.recording, frame, self.stage.stabilities())
         controls["legend"].content = legend(self.stage.recording, frame, mode)
         for number, hand in enumerate(self.stage.hands()[:HANDS]):
             controls[f"hand {number}"].value = hand.holds

@@ -1,4 +1,4 @@
-"""A recording's frames as pictures and as meshes, for the page and for the command."""
+"""Frames of a recording as pictures and as meshes, for the page and for the command line."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ COLORS = ("fabric", "strain")
 def painter(
     recording: Recording, size: int, antialias: int = 2, color: str = "fabric", camera: Camera | None = None
 ) -> Callable[[Frame], NDArray[np.uint8]]:
-    """What draws a recording's frames, (size, size, 3) each, in the colours of the sheets' fabric or in those of their strain.
+    """What draws a recording's frames, (size, size, 3) each, in the colors of the fabric or of the strain.
 
     camera: in place of the recording's own.
     """
@@ -44,7 +44,7 @@ def painter(
                 depths.append(renderer.depth(x, frame.solids))
         if len(pictures) == 1:
             return pictures[0]
-        # the nearest sheet of each pixel; where none is, the darkest, which has the shadows of all
+        # in each pixel the nearest sheet; where there is none, the darkest picture, which has the shadows of all
         nearest, stack = np.argmin(depths, axis=0)[None, :, :, None], np.stack(pictures)
         away = np.max(depths, axis=0)[:, :, None] == np.min(depths, axis=0)[:, :, None]
         return np.where(away, stack.min(axis=0), np.take_along_axis(stack, nearest, axis=0)[0])
@@ -53,7 +53,7 @@ def painter(
 
 
 def strain_shares(recording: Recording, x: NDArray) -> NDArray[np.float32]:
-    """The largest strain of the threads at each particle, as a share of that at which the recording's colours end, (particles,)."""
+    """The largest strain of the yarns at each particle, as a share of that at which the color scale ends, (particles,)."""
     return largest_at_particles(recording.mesh, structural_strain(recording.mesh, x[None]))[0] / np.float32(recording.strained)
 
 
@@ -61,7 +61,7 @@ def strain_shares(recording: Recording, x: NDArray) -> NDArray[np.float32]:
 
 
 def joined(recording: Recording) -> tuple[NDArray, NDArray]:
-    """The sheets of a recording as one mesh: triangles, and texture coordinates with which a picture fills each sheet."""
+    """The sheets of a recording as one mesh: triangles, and texture coordinates with which an image fills each sheet."""
     mesh, sheets = recording.mesh, len(recording.labels)
     triangles = np.concatenate([mesh.triangles + k * mesh.num_particles for k in range(sheets)])
     return triangles, np.tile(mesh.rest_positions[:, :2] / max(mesh.size) + 0.5, (sheets, 1))

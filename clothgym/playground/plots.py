@@ -9,23 +9,23 @@ import numpy as np
 
 from clothgym.lab.compare_pictures import INK
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.show import own_colour
+from clothgym.playground.show import own_color
 from clothgym.render.shading import CORAL
 
 POINTS = 300  # frames in a plot
 HEIGHT = 130  # of a plot [pixels]
-SPAN = 2.0  # a plot begins and ends at a multiple of that [s]: anew at each frame would be dear
+SPAN = 2.0  # plots start and end at multiples of this [s]: a new range for each frame would be costly
 READINGS = {"largest strain [%]": ("strain", 100.0), "energy [mJ]": ("energy", 1e3)}
 REWARD = "reward terms"
 TERMS = ("#d1495b", "#2f6fb5", "#3a8f4e", "#edae49", "#7b4fa3", "#8c6239", "#12a5a5", "#8a8f98")
-Lines = tuple[tuple[str, str], ...]  # labels and colours
+Lines = tuple[tuple[str, str], ...]  # labels and colors
 
 
 class Plots:
-    """The plots of one recording at a time.  Those that it has no use for are hidden: what is removed may still be on its way.
+    """The plots of one recording at a time.  Unused ones are hidden, not removed: updates may still be on their way.
 
     Args:
-        gui: viser's, or a null viewer's, in whose present container they are put.
+        gui: viser's, or a null viewer's; plots are added to its current container.
     """
 
     def __init__(self, gui: Any) -> None:
@@ -38,7 +38,7 @@ class Plots:
         """Show the plots of these sheets."""
         compared = len(recording.labels) > 1
         hexed = "#{:02x}{:02x}{:02x}".format
-        self.lines = tuple((label, hexed(*(own_colour(label) or CORAL))) for label in recording.labels)
+        self.lines = tuple((label, hexed(*(own_color(label) or CORAL))) for label in recording.labels)
         if not compared:
             self.lines = (("sheet", INK),)
         for plot in self.shown.values():
@@ -46,7 +46,7 @@ class Plots:
         self.shown = {}
 
     def draw(self, frames: Sequence[Frame]) -> None:
-        """The last of these frames."""
+        """Plot the last ``POINTS`` of these frames."""
         shown = frames[-POINTS:]
         times = np.array([frame.time for frame in shown])
         for title, (name, unit) in READINGS.items():
@@ -73,10 +73,10 @@ class Plots:
         self._scale(plot, times, values)
 
     def _scale(self, plot: Any, times: np.ndarray, values: np.ndarray) -> None:
-        """From zero, so that a still cloth has a still line, and anew only if the values have left the scale or shrunk in it."""
+        """Scale from zero, so that cloth at rest has a flat line, and rescale only if values leave the scale or shrink in it."""
         finite = values[np.isfinite(values)]
         low, high = min(0.0, float(finite.min(initial=0.0))), max(1e-2, float(finite.max(initial=0.0)))
-        # the plot's own choice of times would be a long one after a single frame, and stay
+        # the plot's own choice of a time range after a single frame would be long, and stay
         begin, end = SPAN * np.floor(times[0] / SPAN), SPAN * max(1.0, np.ceil(times[-1] / SPAN))
         now = self.ends.get(id(plot), (0.0, 0.0, 0.0, 0.0))
         if low < now[0] or high > now[1] or (high - low) < 0.3 * (now[1] - now[0]):

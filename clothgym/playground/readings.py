@@ -1,4 +1,4 @@
-"""Numbers of a frame as a table, and what its colours mean."""
+"""Readings of a frame as a table, and the legend of its colors."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.playground.recording import Frame, Recording, strains, threads
+from clothgym.playground.recording import Frame, Recording, strains, yarns
 from clothgym.playground.show import RAMP, STOPS, spring_values
 from clothgym.playground.stage import Stability
 
 
-def told(recording: Recording, frame: Frame, stabilities: Sequence[Stability]) -> str:
-    """The readings as a table, a column for each sheet; stabilities: none where nothing is simulated."""
-    springs = threads(recording.mesh)
+def readings_table(recording: Recording, frame: Frame, stabilities: Sequence[Stability]) -> str:
+    """The readings as a table, a column for each sheet; stabilities: empty if nothing is simulated."""
+    springs = yarns(recording.mesh)
     most = int(np.argmax(strains(recording.mesh, frame.positions[0], springs)))
     i, j = recording.mesh.springs.particles[springs[most]].tolist()
     readings = frame.readings
     rows = [("time", [f"{frame.time:.2f} s"]), ("largest strain", percent(readings["strain"]))]
     if "strain before limiting" in readings:
         rows.append(("before the limit", percent(readings["strain before limiting"])))
-    rows.append(("most strained thread", [f"{i} to {j}"]))
+    rows.append(("most strained yarn", [f"{i} to {j}"]))
     rows.append(("energy", [f"{1e3 * value:.4g} mJ" for value in readings["energy"]]))
     rows.append(("deepest in a solid", [f"{1e3 * value:.2f} mm" for value in readings["penetration"]]))
     rows.append(("a step costs", [f"{1e3 * value:.2f} ms" for value in readings["cost"]]))
     if stabilities:
         rows.append(("substep", [f"{1e3 * s.substep:.3g} ms" for s in stabilities]))
         rows.append(("its bound", [f"{1e3 * s.bound:.3g} ms" if s.bound > 0 else "none" for s in stabilities]))
-        rows.append(("so it is", [f"**{s.verdict}**" if s.verdict == "unstable" else s.verdict for s in stabilities]))
+        rows.append(("stability", [f"**{s.verdict}**" if s.verdict == "unstable" else s.verdict for s in stabilities]))
     rows += [(f"reward: {name}", [f"{value:+.4f}"]) for name, value in frame.terms.items()]
     count = len(recording.labels)
     head = "| |" + "|".join(label.replace("_", " ") for label in recording.labels) + "|\n|---|" + "---:|" * count
@@ -41,7 +41,7 @@ def percent(values: NDArray) -> list[str]:
 
 
 def legend(recording: Recording, frame: Frame, mode: str) -> str:
-    """What the colours mean."""
+    """The legend of the colors, as HTML."""
     if mode == "fabric":
         return ""
     if mode == "contact":

@@ -1,4 +1,4 @@
-"""What a visitor has seen: frames, which can be shown again, saved as a file, and read back."""
+"""Recordings: frames that can be shown again, saved to a file and loaded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from clothgym.parameters import FIGURES
 from clothgym.render import Camera, Solid
 from clothgym.simulation import Simulation
 
-TOUCHING = 1e-3  # a particle touches a solid when it is this near to where it would rest [m]
+TOUCHING = 1e-3  # distance from where it would rest within which a particle touches a solid [m]
 MESH = ("rest_positions", "triangles", "area")
 
 
@@ -47,9 +47,9 @@ class Frame:
 
 
 def read(simulation: Simulation, cost: float, penetration: float) -> dict[str, float]:
-    """The readings of one sheet: largest strain of its threads, energy [J], deepest penetration [m], and a control step's cost [s].
+    """The readings of one sheet: largest strain of its yarns, energy [J], deepest penetration [m], and a control step's cost [s].
 
-    With a strain limit also the largest strain that it met in the last control step.  cost, penetration: measured elsewhere.
+    With a strain limit also the largest strain before limiting in the last control step.  cost, penetration: measured elsewhere.
     """
     energy, limiting = simulation.energy(), simulation.limiting
     readings = {
@@ -71,7 +71,7 @@ def touching(simulation: Simulation) -> NDArray[np.bool_]:
 
 
 def stiffness(simulation: Simulation) -> NDArray[np.float64]:
-    """Of its first sheet's springs by kind [N/m], (kinds,); of those that bend only if no hinges do."""
+    """Of its first sheet's springs by kind [N/m], (kinds,); bending springs only if hinges do not bend the sheet."""
     figures = dict(zip(FIGURES, simulation.parameters[0]))
     bend = 0.0 if simulation.bending.hinged else figures["bend_rigidity"]
     moduli = (figures["stretch_stiffness"], figures["shear_stiffness"], bend)
@@ -81,8 +81,8 @@ def stiffness(simulation: Simulation) -> NDArray[np.float64]:
 # --- springs ------------------------------------------------------------------------------------------------------------
 
 
-def threads(mesh: ClothMesh, diagonals: bool = False) -> NDArray[np.int64]:
-    """The springs that are drawn: threads, or edges, and the diagonals if wanted."""
+def yarns(mesh: ClothMesh, diagonals: bool = False) -> NDArray[np.int64]:
+    """The springs that are drawn: yarns, or edges of a triangle mesh, and optionally diagonals."""
     return np.flatnonzero(mesh.springs.kind <= SHEAR if diagonals else mesh.springs.kind < SHEAR)
 
 
@@ -106,10 +106,10 @@ class Recording:
     """Frames of one mesh.
 
     Attributes:
-        title: what it is of.
+        title: of the scene or environment.
         mesh: the sheet; time_step: between frames [s]; camera: where it is seen from.
         labels: a name for each sheet.
-        strained: the strain at which the colours end.
+        strained: strain at which the color scale ends.
         frames: in order.
     """
 
@@ -162,11 +162,11 @@ class Recording:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is no recording, or a broken one.
+            ValueError: the file is not a recording, or a broken one.
         """
         try:
-            if not zipfile.is_zipfile(path) and Path(path).stat():  # who is not there says so
-                raise ValueError("it is no npz")
+            if not zipfile.is_zipfile(path) and Path(path).stat():  # a missing file raises here
+                raise ValueError("not an npz file")
             with np.load(path, allow_pickle=False) as file:
                 return _from_arrays(dict(file))
         except (KeyError, AttributeError, TypeError, IndexError, ValueError, EOFError, zipfile.BadZipFile) as error:

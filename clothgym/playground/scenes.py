@@ -12,13 +12,13 @@ from clothgym.mesh import ClothMesh, grid
 from clothgym.playground.world import Scene, Settings, Targets, hint
 from clothgym.render import Camera, Solid
 
-STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colours of solids
-CALM = 0.75  # linear drag in which slow swings come to rest [N s/m^3]
+STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colors of solids
+SWING_DRAG = 0.75  # linear drag that damps slow swinging [N s/m^3]
 
 
 def turned_on_a_lathe(profile: NDArray, segments: int = 40) -> tuple[NDArray, NDArray]:
-    """The solid that a profile of radii and heights [m], (points, 2), from the axis below to the axis above, makes as it turns:
-    vertices (vertices, 3) and triangles (triangles, 3), counter-clockwise from outside."""
+    """The solid of revolution of a profile of radii and heights [m], (points, 2), from the axis below to the axis above: vertices
+    [m], (vertices, 3), and triangles, (triangles, 3), counter-clockwise seen from outside."""
     angles = np.arange(segments) * 2 * np.pi / segments
     ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     inner = profile[1:-1]
@@ -37,7 +37,7 @@ def turned_on_a_lathe(profile: NDArray, segments: int = 40) -> tuple[NDArray, ND
 
 
 def pawn(height: float = 0.5) -> tuple[NDArray, NDArray]:
-    """A pawn of a game of chess, its foot at z = 0: vertices [m] and triangles."""
+    """A chess pawn that stands on z = 0: vertices [m] and triangles."""
     angles = np.linspace(-0.3, 0.5, 11)[:-1] * np.pi
     ball = np.stack([0.16 * np.cos(angles), 0.84 + 0.16 * np.sin(angles)], axis=1)
     rise = np.linspace(0, 1, 8)
@@ -51,7 +51,7 @@ def pawn(height: float = 0.5) -> tuple[NDArray, NDArray]:
 
 
 def walk(time: float) -> tuple[NDArray, float]:
-    """Where somebody is who walks a figure of eight [m], (3,), and which way they face [rad]; they set out slowly."""
+    """Position [m], (3,), and heading [rad] of a person who walks a figure of eight, and starts slowly."""
     phase = 0.9 * (time - 1.2 * (1 - np.exp(-time / 1.2)))
     place = np.array([0.5 * np.sin(phase), 0.22 * np.sin(2 * phase), 0.012 * np.sin(8 * phase)])
     facing = np.arctan2(0.44 * np.cos(2 * phase), 0.5 * np.cos(phase))
@@ -64,7 +64,7 @@ TORSO, HEAD = np.array([0.0, 0.0, 0.63]), np.array([0.0, 0.0, 1.26])
 
 
 def wear_the_cape(time: float) -> tuple[NDArray, Targets]:
-    """The collar's anchors about the neck of somebody who walks, and the torso and the head in it."""
+    """The collar's anchors around the neck of a walking person, and torso and head."""
     place, facing = walk(time)
     way = facing + np.pi + COLLAR
     collar = np.stack([SHOULDERS * np.cos(way), SHOULDERS * np.sin(way), np.full(len(way), NECK)], axis=1)
@@ -72,7 +72,7 @@ def wear_the_cape(time: float) -> tuple[NDArray, Targets]:
 
 
 def lay_down(time: float) -> tuple[NDArray, Targets]:
-    """Two corners that are lowered to the floor while they sway, so that the sheet comes to lie on itself."""
+    """Two corners that sway while they are lowered to the floor, so that the sheet lies down on itself."""
     height = max(0.64 - 0.16 * time, 0.02)
     sway = 0.13 * np.sin(2 * np.pi * time / 2.0) * min(time, 1.0)
     return np.array([(-0.3, sway, height), (0.3, sway, height)]), {}
@@ -93,7 +93,7 @@ TITLES = {
 
 
 def hung(mesh: ClothMesh, top: float) -> NDArray:
-    """A grid that hangs straight down from its last row, in the plane y = 0 [m], (particles, 3)."""
+    """Positions of a grid that hangs straight down from its last row, in the plane y = 0 [m], (particles, 3)."""
     x = mesh.rest_positions[:, [0, 2, 1]].copy()
     return x + (0, 0, top - x[:, 2].max())
 
@@ -103,10 +103,10 @@ def pinned_patch() -> Scene:
     return Scene(
         name="patch",
         title=TITLES["patch"],
-        about="A little patch, pinned at two corners. Pull the gravity slider, and watch the threads take up the load.",
+        about="A little patch, pinned at two corners. Pull the gravity slider, and watch the yarns take up the load.",
         mesh=mesh,
         start=mesh.rest_positions + (0, 0, 0.8),
-        settings=Settings(gravity=0.0, fabric="knit", air_drag=CALM),
+        settings=Settings(gravity=0.0, fabric="knit", air_drag=SWING_DRAG),
         anchors=mesh.corners[2:],
         names=("left pin", "right pin"),
         held=(0, 1),
@@ -125,7 +125,7 @@ def flag() -> Scene:
     return Scene(
         name="flag",
         title=TITLES["flag"],
-        about="A flag of silk. The wind has a steady part and gusts; turn either down and it falls to the pole.",
+        about="A flag of silk. The wind has a steady part and gusts; turn either down and the flag sinks to the pole.",
         mesh=mesh,
         start=start,
         settings=Settings(wind=6.0, gust=1.0, fabric="silk"),
@@ -139,7 +139,7 @@ def flag() -> Scene:
 
 
 def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, colour: tuple[int, int, int], top: float) -> Scene:
-    """A sheet that falls onto a solid; its corners can be taken."""
+    """A sheet that falls onto a solid; its corners can be dragged."""
     mesh = grid(25, 25, 0.9, 0.9)
     return Scene(
         name=name,
@@ -159,7 +159,7 @@ def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, colour
 
 
 def sphere() -> Scene:
-    about = "A sheet falls over a ball. Take a corner and pull it off."
+    about = "A sheet falls over a ball. Drag a corner to pull it off."
     return sheet_over("sphere", about, Sphere(center=(0, 0, 0.24), radius=0.22), SAGE, 0.46)
 
 
@@ -171,7 +171,7 @@ def box() -> Scene:
 def sheet_over_pawn() -> Scene:
     vertices, triangles = pawn()
     solid = MeshCollider(vertices=vertices, triangles=triangles)
-    about = "A sheet falls over a chessman, which it knows as a mesh of triangles."
+    about = "A sheet falls over a chess pawn, a mesh of triangles."
     return sheet_over("pawn", about, solid, CLAY, 0.5)
 
 
@@ -182,13 +182,13 @@ def cape() -> Scene:
     row, column = np.divmod(np.arange(mesh.num_particles), columns)
     across, down = 2 * column / (columns - 1) - 1, 1 - row / (rows - 1)
     place, facing = walk(0.0)
-    # a part of a cone about the torso, wider at the hem
+    # part of a cone around the torso, wider at the hem
     way, out = facing + np.pi + COLLAR[-1] * across, SHOULDERS + (HEM - SHOULDERS) * down
     start = place + np.stack([out * np.cos(way), out * np.sin(way), NECK - 0.79 * down], axis=1)
     return Scene(
         name="cape",
         title=TITLES["cape"],
-        about="A cape on the shoulders of somebody who walks a figure of eight.",
+        about="A cape on the shoulders of a person who walks a figure of eight.",
         mesh=mesh,
         start=start,
         settings=Settings(fabric="wool", air_drag=0.2, friction=0.2),

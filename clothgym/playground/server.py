@@ -1,4 +1,4 @@
-"""The server: a page for each visitor, who has a cloth of their own."""
+"""The server: a page for each visitor, with cloth of their own."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from clothgym.registration import ENVIRONMENTS, checked_id
 LOOPBACK = "127.0.0.1"
 PORT = 8080
 REPLAY = "recording"
-EASE = 0.002  # shortest rest between two frames, in which the server's other threads have their turn [s]
+EASE = 0.002  # shortest pause between two frames, for the server's other threads [s]
 
 
 class Gallery:
     """What can be shown, by name: scenes, environments, and a recording if there is one.
 
     Args:
-        recording: to be shown again.
-        policies: who may act in an environment besides its expert: by the environment's id, and then by name.
+        recording: to show again.
+        policies: policies for each environment besides its expert, by id and then by name.
     """
 
     def __init__(self, recording: Recording | None = None, policies: Mapping[str, Mapping[str, Policy]] | None = None) -> None:
@@ -48,7 +48,7 @@ class Gallery:
             self.titles = {f"recording of {recording.title}": REPLAY} | self.titles
 
     def checked(self, name: str) -> str:
-        """The name as it is kept.
+        """The name without its namespace.
 
         Raises:
             ValueError: there is nothing of that name.
@@ -65,7 +65,7 @@ class Gallery:
         return bare
 
     def open(self, name: str) -> Stage:
-        """The stage of that name, new."""
+        """A new stage of that name."""
         name = self.checked(name)
         if name == REPLAY:
             assert self.recording is not None
@@ -94,14 +94,14 @@ class Visit:
             while not self.closed.is_set():
                 self.page.tick()
                 self.frames += 1
-                # a frame that is late is not made up for: the cloth is slow then, and no heap of frames waits
+                # late frames are not caught up: the cloth is slow then, and no frames pile up
                 due = max(due + self.page.stage.recording.time_step, time.monotonic() + EASE)
                 self.closed.wait(due - time.monotonic())
         except Exception:
-            # a visitor who has just left is no error; another one is told, and ends this visit alone
+            # after a visitor has left, errors are expected; any other is shown, and ends this visit only
             if not self.closed.wait(1.0):
                 traceback.print_exc(file=sys.stderr)
-                sorry = "Something went wrong, which the server's terminal shows. Load the page anew to begin again."
+                sorry = "Something went wrong, which the server's terminal shows. Reload the page to start again."
                 with contextlib.suppress(Exception):
                     self._client.add_notification("This page has stopped", sorry, color="red")
 
@@ -119,11 +119,11 @@ class Playground:
         free = free_port(host, port)
         self.gallery, self.start = gallery, gallery.checked(start)
         self.visits: dict[int, Visit] = {}
-        # a page that has just been closed may still be written to
+        # viser may still write to a page that has just been closed
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-        with contextlib.redirect_stdout(io.StringIO()):  # its banner: our own line says where the page is
+        with contextlib.redirect_stdout(io.StringIO()):  # no banner: our own line gives the address
             self.server = viser.ViserServer(host=host, port=free, label="clothgym", verbose=False)
-        # viser can open a tunnel to a server of its makers, for anyone who asks: not this one
+        # viser can open a public tunnel for any visitor who asks: not here
         self.server.request_share_url = lambda verbose=True: None
         furnish(self.server.scene)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(206, 64, 50), control_width="large")
@@ -141,7 +141,7 @@ class Playground:
             visit.closed.set()
 
     def stop(self) -> None:
-        """Send everybody home, and close."""
+        """End all visits, and close the server."""
         for visit in list(self.visits.values()):
             visit.closed.set()
             visit.thread.join(10)
@@ -172,7 +172,7 @@ def policies_of(runs: Sequence[str], start: str) -> tuple[str, dict[str, dict[st
         act = learnt(Path(run), env_id)
         own = policies.setdefault(env_id, {})
         name = Path(run).resolve().name
-        # runs of the same name are told apart by their whole paths
+        # runs of the same name are distinguished by their full paths
         own[name if name not in own else str(Path(run).resolve())] = Learnt(act, config["env_kwargs"])
         start = start or env_id
     return start, policies
@@ -193,7 +193,7 @@ def imported_viser() -> Any:
     """viser.
 
     Raises:
-        ImportError: it is missing; the message says how to get it.
+        ImportError: viser is missing; the message says how to install it.
     """
     try:
         import viser
@@ -226,7 +226,7 @@ def free_port(host: str, port: int, tries: int = 20) -> int:
 
 
 def say(line: str) -> None:
-    """Print at once, into a pipe too."""
+    """Print at once, also into a pipe."""
     print(line, flush=True)
 
 

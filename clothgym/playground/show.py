@@ -1,4 +1,4 @@
-"""A frame as nodes of a viewer's scene: sheets, their threads, solids, what touches, and hands that can be dragged."""
+"""A frame as nodes of a viewer's scene: sheets, yarns, solids, particles in contact, and handles to drag."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from numpy.typing import NDArray
 
 from clothgym.lab.compare_pictures import COLORS
 from clothgym.mesh import EDGE, STRUCTURAL_X
-from clothgym.playground.recording import Frame, Recording, strains, tensions, threads
+from clothgym.playground.recording import Frame, Recording, strains, tensions, yarns
 from clothgym.playground.stage import UNLIMITED, Hand
 from clothgym.render import Solid
 from clothgym.render.shading import CORAL, INDIGO
 from clothgym.render.solids import linear_color
 
 MODES = ("fabric", "strain", "tension", "contact")
-DARK, DARK_BACK = (70, 76, 98), (58, 60, 78)  # the sheet where something else has the colours
-WEAVE = (232, 156, 138)  # threads of the fabric as such
-TOUCH, HOLD = (240, 140, 30), (250, 200, 60)  # what touches, and what is held
-# colours of pushed, idle and loaded springs: at minus one, zero, a third, two thirds and the whole of the scale
+DARK, DARK_BACK = (70, 76, 98), (58, 60, 78)  # the sheet where something else is colored
+WEAVE = (232, 156, 138)  # yarns in the mode "fabric"
+TOUCH, HOLD = (240, 140, 30), (250, 200, 60)  # particles that touch a solid, and anchored ones
+# colors of compressed, idle and loaded springs: at minus one, zero, a third, two thirds and the whole of the scale
 STOPS = np.array([-1.0, 0.0, 0.33, 0.66, 1.0])
 RAMP = np.array([(84, 150, 255), (112, 118, 138), (255, 206, 92), (255, 122, 40), (232, 20, 56)], float)
 IDLE = (112, 118, 138)
-PALE = 225  # what a sheet without the strain limit has two thirds of
+PALE = 225  # gray mixed into the color of a sheet without the strain limit
 GROUND, SKY, HORIZON = (236, 232, 225), (222, 228, 236), (247, 245, 241)
 LINEAR = (255 * linear_color(range(256)) + 0.5).astype(np.uint8)
-INSET = 0.003  # solids are drawn so much smaller: the sheet's triangles are chords of what is round [m]
-LIGHT = 0.8  # intensity of what comes from all sides
-QUIET, LOUD = 0.0016, 0.0042  # thickness of the threads [m]
+INSET = 0.003  # solids are drawn smaller by this: the sheet's triangles are chords of round solids [m]
+LIGHT = 0.8  # intensity of the ambient light
+THIN, BOLD = 0.0016, 0.0042  # thickness of yarns [m]
 
 
 def ramp(values: NDArray) -> NDArray[np.uint8]:
-    """Colours of shares of the scale, (...) to (..., 3), sRGB."""
+    """sRGB colors of shares of the scale, (...) to (..., 3)."""
     return np.stack([np.interp(values, STOPS, RAMP[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
 
 
 def linear(colours: NDArray) -> NDArray[np.uint8]:
-    """sRGB as linear light: a browser takes colours of lines for that."""
+    """sRGB as linear light, in which a browser expects the colors of lines."""
     return LINEAR[colours]
 
 
@@ -49,13 +49,13 @@ def spring_values(recording: Recording, frame: Frame, sheet: int, mode: str, spr
     x, mesh = frame.positions[sheet], recording.mesh
     if mode == "tension":
         kind = EDGE if mesh.shape is None else STRUCTURAL_X
-        full = recording.strained * frame.stiffness[sheet, kind] * float(np.median(mesh.springs.rest_length[threads(mesh)]))
+        full = recording.strained * frame.stiffness[sheet, kind] * float(np.median(mesh.springs.rest_length[yarns(mesh)]))
         return tensions(mesh, x, springs, frame.stiffness[sheet]), full
     return strains(mesh, x, springs), recording.strained
 
 
-def own_colour(label: str) -> tuple[int, int, int] | None:
-    """A compared sheet's: its integrator's, pale if it has no strain limit; None for a label that is no integrator's."""
+def own_color(label: str) -> tuple[int, int, int] | None:
+    """Color of a compared sheet: that of its integrator, paler without a strain limit; None if the label is not an integrator."""
     colour = COLORS.get(label.removesuffix(UNLIMITED))
     if colour is None:
         return None
@@ -66,8 +66,8 @@ def own_colour(label: str) -> tuple[int, int, int] | None:
 
 
 def sides(label: str, compared: bool) -> tuple[tuple[int, int, int], tuple[int, int, int]]:
-    """Colours of a sheet's front and back: the fabric's, or its own where several are compared."""
-    front = own_colour(label) if compared else None
+    """Colors of a sheet's front and back: those of the fabric, or its own if several are compared."""
+    front = own_color(label) if compared else None
     return (CORAL, INDIGO) if front is None else (front, tuple(round(0.6 * c) for c in front))  # type: ignore[return-value]
 
 
@@ -76,14 +76,14 @@ class Show:
 
     Args:
         scene: viser's, or a null viewer's.
-        dragged: called with a hand and a place [m], (3,), as it is dragged, and with None when it is left.
+        dragged: called with a hand and its position [m], (3,), while it is dragged, and with None at the end.
     """
 
     def __init__(self, scene: Any, recording: Recording, dragged: Callable[[int, NDArray | None], None]) -> None:
         self.scene, self.recording, self._dragged = scene, recording, dragged
-        self._held: set[int] = set()  # hands that the visitor has in theirs
+        self._held: set[int] = set()  # hands that the visitor drags now
         scene.reset()
-        scene.set_background_image(sky(), format="png")  # a visitor's own: their reset takes away what all share
+        scene.set_background_image(sky(), format="png")  # for each visitor: a reset removes the shared one
         scene.add_grid(
             "/ground", 8.0, 8.0, cell_size=0.1, section_size=0.5, cell_color=(226, 221, 213), section_color=(208, 202, 193),
             cell_thickness=0.6, section_thickness=1.0, plane_color=GROUND, plane_opacity=1.0, shadow_opacity=0.22,
@@ -99,10 +99,10 @@ class Show:
                 for side, colour in zip(("front", "back"), colours)
             ]
             self._sheets.append((pair, colours))
-        springs = threads(mesh)
+        springs = yarns(mesh)
         points = frame.positions[0][mesh.springs.particles[springs]]
-        self._threads = [
-            scene.add_line_segments(f"/sheet{number}/threads", points, np.zeros_like(points, np.uint8), thickness=QUIET)
+        self._yarns = [
+            scene.add_line_segments(f"/sheet{number}/yarns", points, np.zeros_like(points, np.uint8), thickness=THIN)
             for number in range(len(self._sheets))
         ]
         self._dots = {
@@ -115,18 +115,18 @@ class Show:
         self._handles: dict[int, Any] = {}
 
     def draw(self, frame: Frame, mode: str, diagonals: bool = False) -> None:
-        """Show a frame, coloured by one of ``MODES``."""
+        """Show a frame, colored by one of ``MODES``."""
         mesh = self.recording.mesh
-        springs = threads(mesh, diagonals)
-        loud = mode in ("strain", "tension")
-        for number, ((pair, colours), lines) in enumerate(zip(self._sheets, self._threads)):
+        springs = yarns(mesh, diagonals)
+        bold = mode in ("strain", "tension")
+        for number, ((pair, colours), lines) in enumerate(zip(self._sheets, self._yarns)):
             x = frame.positions[number]
             for node, colour, dark in zip(pair, colours, (DARK, DARK_BACK)):
                 node.vertices = x
                 node.color = colour if mode == "fabric" else dark
             lines.points = x[mesh.springs.particles[springs]]
-            lines.thickness = LOUD if loud else QUIET
-            if loud:
+            lines.thickness = BOLD if bold else THIN
+            if bold:
                 values, full = spring_values(self.recording, frame, number, mode, springs)
                 lines.colors = np.repeat(linear(ramp(values / full))[:, None], 2, axis=1)
             else:
@@ -164,7 +164,7 @@ class Show:
                 node.visible = False
 
     def draw_hands(self, hands: Sequence[Hand], draggable: bool) -> None:
-        """Mark what is held, and put a handle at each hand that can be dragged, if they are wanted."""
+        """Mark what is held, and show a handle at each hand that can be dragged, if wanted."""
         self._dot("held", np.array([hand.position for hand in hands if hand.holds]).reshape(-1, 3))
         for number, hand in enumerate(hands):
             wanted = draggable and hand.draggable
@@ -182,7 +182,7 @@ class Show:
         )  # fmt: skip
 
         @handle.on_update
-        async def _(event: Any) -> None:  # no thread of a pool: those do not keep the order
+        async def _(event: Any) -> None:  # async, since threads of a pool would not keep the order
             if event.phase == "end":
                 self._held.discard(number)
                 self._dragged(number, None)
@@ -194,8 +194,8 @@ class Show:
 
 
 def furnish(scene: Any) -> None:
-    """A soft light, which all visitors share."""
-    # an environment map would be softer still, but dear where no graphics card draws it
+    """Set up the ambient light, which all visitors share."""
+    # an environment map would be softer, but is slow without a graphics card
     scene.add_light_hemisphere("/sky", sky_color=HORIZON, ground_color=GROUND, intensity=LIGHT)
     scene.world_axes.visible = False
 

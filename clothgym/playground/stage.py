@@ -24,20 +24,20 @@ from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
-GUSTS = 3600  # control steps after which the gusts come again
+GUSTS = 3600  # control steps after which the gusts repeat
 LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
-KEPT = 1800  # frames that can be scrubbed back to
+KEPT = 1800  # most recent frames that are kept
 MOST_COMPARED = 4
 REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
 UNLIMITED = ", no limit"  # ends the label of a sheet without the others' strain limit
-SHREDS = 0.12  # a sheet that has blown up is drawn torn so far from where it was [m]: where it is, nobody could see
+SHREDS = 0.12  # largest displacement at which a sheet that has blown up is drawn [m]: its real position is out of sight
 EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
-# what the main loop is compiled with, or a method's plan depends on: changing it makes a new simulation of the same sheet
+# settings that change the compiled loop or a method's plan: they need a new simulation of the same sheet
 REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
 
 
 class Hand(NamedTuple):
-    """What holds the cloth, as a visitor sees it: a name, where it is [m], whether it holds anything, and if it can be dragged."""
+    """An anchor or gripper as a visitor sees it: name, position [m], whether it holds anything, and whether it can be dragged."""
 
     name: str
     position: NDArray
@@ -84,12 +84,12 @@ def why_it_burst(name: str, at: Stability) -> str:
 
 
 class Stage:
-    """What the page shows: something that goes on from frame to frame, and remembers what it showed.
+    """What the page shows: something that advances from frame to frame, and records its frames.
 
     Attributes:
         name: as it was asked for; about: a sentence.
-        recording: the frames that it showed, the last of them where it stands.
-        notes: sentences for the visitor, by what they are about.
+        recording: its frames, the last of which is the current one.
+        notes: sentences for the visitor, by subject.
     """
 
     name: str
@@ -103,44 +103,44 @@ class Stage:
 
     @property
     def frame(self) -> Frame:
-        """Where it stands."""
+        """The current frame."""
         return self.recording.frames[-1]
 
     @property
     def over(self) -> bool:
-        """Whether nothing happens any more until a reset."""
+        """Whether nothing more happens until a reset."""
         return False
 
     def advance(self) -> Frame:
-        """Go on to the next frame."""
+        """Advance to the next frame."""
         raise NotImplementedError
 
     def reset(self, seed: int | None = None) -> None:
-        """Begin anew, with that seed or the same."""
+        """Start again, with that seed or the same."""
         raise NotImplementedError
 
     def change(self, **changes: Any) -> None:
         """Change settings.
 
         Raises:
-            ValueError: an unknown name or a value that makes no sense; nothing is changed then.
+            ValueError: an unknown name or an invalid value; nothing is changed.
         """
         raise NotImplementedError
 
     def hands(self) -> list[Hand]:
-        """What holds the cloth."""
+        """The anchors and grippers."""
         return []
 
     def drag(self, hand: int, place: ArrayLike | None) -> None:
-        """Take a hand to a place [m], (3,), or leave it to itself again, with None."""
+        """Move a hand to a position [m], (3,), or stop moving it with None."""
         raise NotImplementedError
 
     def hold(self, hand: int, holds: bool) -> None:
-        """Make a hand take hold, or let go."""
+        """Close or open a hand."""
         raise NotImplementedError
 
     def stabilities(self) -> list[Stability]:
-        """Of each sheet; none where nothing is simulated."""
+        """The stability of each sheet; empty if nothing is simulated."""
         return []
 
     def _keep(self, frame: Frame) -> Frame:
@@ -158,10 +158,10 @@ class Sheet:
         limited: whether it has the settings' strain limit.
         simulation: a batch of one.
         cost: of its last control step [s].
-        burst: why it has blown up; it stands still then.
-        penetration: how deep it was in a solid when that was last looked at [m].
-        shredded: whether it is shown as it is after that.
-        positions, touching, readings: as it was when last looked at, see ``Frame``.
+        burst: why it has blown up, or ""; it is not advanced any more then.
+        penetration: how deep it was in a solid when last measured [m].
+        shredded: whether its last positions were set after it blew up.
+        positions, touching, readings: when last measured, see ``Frame``.
     """
 
     name: str
@@ -190,7 +190,7 @@ class Sheet:
             self.burst = why_it_burst(self.name, stability(self.simulation))
 
     def look(self, penetration: bool) -> None:
-        """See how it is now.  Of a sheet that has blown up the last readings stay, and shreds of it near to where it was."""
+        """Update positions and readings.  A sheet that has blown up keeps its readings, and is drawn in shreds."""
         s = self.simulation
         if self.burst:
             if not self.shredded:
@@ -208,7 +208,7 @@ class SceneStage(Stage):
 
     Args:
         scene: its name, or a ``Scene``.
-        settings: in place of the scene's own.
+        settings: instead of the scene's own.
         compared: two to four integrators, a sheet each; none for one sheet with the settings' integrator.
 
     Raises:
@@ -261,11 +261,11 @@ class SceneStage(Stage):
         self.recording.frames[:] = [self._look()]
 
     def compare(self, names: Sequence[str], unlimited: bool = False) -> None:
-        """Begin anew with a sheet for each of these integrators, two to four; with none, one sheet with the settings' own, and with
-        ``unlimited`` the same without the strain limit beside it.
+        """Start again with a sheet for each of these integrators, two to four.  Without names, with one sheet for the integrator of
+        the settings, and with ``unlimited`` beside it the same without the strain limit.
 
         Raises:
-            ValueError: another number of integrators, or both are asked for.
+            ValueError: another number of integrators, or names with ``unlimited``.
         """
         names = list(dict.fromkeys(names))
         if len(names) == 1 or len(names) > MOST_COMPARED:
@@ -300,7 +300,7 @@ class SceneStage(Stage):
                 for sheet, offset in zip(self.sheets, self.offsets)
                 for solid in self.scene.solids(sheet.simulation)
             ),
-            # without a limit a sheet has no strain before limiting
+            # a sheet without a limit has no strain before limiting
             readings={name: np.array([one.get(name, np.nan) for one in readings]) for name in readings[0]},
         )
 
@@ -309,9 +309,9 @@ class SceneStage(Stage):
     def change(self, **changes: Any) -> None:
         after = self.settings.changed(**changes)
         before, self.notes = self.settings, {k: v for k, v in self.notes.items() if k == "burst"}
-        anew = {name for name in REBUILDS if getattr(after, name) != getattr(before, name)}
+        rebuilt = {name for name in REBUILDS if getattr(after, name) != getattr(before, name)}
         if after.self_collision != "off" and after.friction != before.friction:
-            anew.add("friction")
+            rebuilt.add("friction")
         made = []
         for sheet in self.sheets:
             name = sheet.name if self.compared else after.integrator
@@ -319,14 +319,14 @@ class SceneStage(Stage):
             ignored = figures & integrators.get(name).ignored
             if ignored:
                 self.notes["ignored"] = refusal(integrators.get(name), sorted(ignored)[0]).capitalize() + "."
-            if anew or ignored:
+            if rebuilt or ignored:
                 made.append((name, carried_over(sheet.simulation, self.scene, own(after, name, sheet.limited))))
             else:
                 unbounded = set_in_place(sheet.simulation, before, after)
                 if unbounded:
                     self.notes["substeps"] = unbounded
                 made.append((name, sheet.simulation))
-        # what was seen of a sheet stays: one that has blown up is not looked at again before a reset
+        # recorded positions and readings stay: a sheet that has blown up is not measured again before a reset
         for sheet, (name, simulation) in zip(self.sheets, made):
             sheet.name, sheet.simulation = name, simulation
         self.settings, self._bounds = after, None
@@ -342,7 +342,7 @@ class SceneStage(Stage):
     def hands(self) -> list[Hand]:
         s = self.sheets[0].simulation
         held, places = s.attached[0], s.hand_positions[0]
-        # one that holds nothing is shown where its particle is
+        # an open anchor is shown at its particle
         for hand in np.flatnonzero(~held):
             places[hand] = s.positions[0, s.anchors[hand]]
         return [
@@ -376,7 +376,7 @@ class SceneStage(Stage):
 
 
 def own(settings: Settings, integrator: str, limited: bool) -> Settings:
-    """The settings of a sheet among others."""
+    """The settings of one of several sheets."""
     return settings.changed(integrator=integrator, **({} if limited else {"strain_limit": None}))
 
 
@@ -384,13 +384,13 @@ def own(settings: Settings, integrator: str, limited: bool) -> Settings:
 
 
 def changed_figures(before: Settings, after: Settings) -> set[str]:
-    """Figures of the fabric in which two settings differ."""
+    """Properties of the fabric in which two settings differ."""
     pairs = zip(FIGURES, of_material(before.material), of_material(after.material))
     return {name for name, old, new in pairs if old != new}
 
 
 def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> str:
-    """Change what a running simulation can be told; a sentence if its substeps cannot follow a bound, and so stay."""
+    """Change a running simulation in place.  Returns a sentence if its substeps stay since there is no bound, else ""."""
     figures: dict[str, Any] = {name: getattr(after.material, name) for name in changed_figures(before, after)}
     if after.gravity != before.gravity:
         figures["gravity"] = (0, 0, -after.gravity)
@@ -411,7 +411,7 @@ def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> s
 
 
 def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Simulation:
-    """A new simulation of a scene's sheet with other settings, as the old one is now: where it is, how fast, and who holds it."""
+    """A new simulation of a scene's sheet with other settings, with the positions, velocities and attachments of the old one."""
     old = simulation.get_state()
     new = scene.simulation(settings)
     finite = np.isfinite(old.positions).all() and np.isfinite(old.velocities).all()
@@ -428,7 +428,7 @@ def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Si
 
 
 def visible(x: NDArray) -> NDArray[np.float32]:
-    """Positions that can be drawn: what is not finite, or far away, is put at the edge of what can be seen [m]."""
+    """Positions that can be drawn [m]: values that are not finite or far away are clipped to the edge of the view."""
     return np.clip(np.nan_to_num(x, nan=0.0, posinf=9.0, neginf=-9.0), -9.0, 9.0).astype(np.float32)
 
 

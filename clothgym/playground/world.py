@@ -1,4 +1,4 @@
-"""What a visitor finds: a sheet, what holds and moves it, and the settings that can be turned."""
+"""Scenes and settings: a sheet, what holds and moves it, and what a visitor can change."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ CLAY = (196, 189, 178)  # colour of solids
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """All that a visitor can turn while it runs.
+    """All that a visitor can change while it runs.
 
     Attributes:
         gravity: downwards [m/s^2].
         wind: speed of its steady part [m/s], and gust, the root mean square of each of the gusts' components [m/s].
-        fabric: a name of ``material.PRESETS``, from which the figures come that are not given.
+        fabric: a name of ``material.PRESETS``, for the properties that are not given.
         stretch_stiffness, shear_stiffness, bend_rigidity, damping_time, air_drag: see ``Material``.
         friction: of the solids, and of the sheet on itself.
         integrator, bending, strain_limit, self_collision, substeps: see ``Simulation``; self_collision is "off",
             "fast" or "strict".
 
     Raises:
-        ValueError: a value that makes no sense; the message names it and what would do.
+        ValueError: an invalid value; the message names it and what is valid.
     """
 
     gravity: float = GRAVITY
@@ -73,17 +73,17 @@ class Settings:
         for name in FIGURES:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(fabric, name))
-        self.material  # noqa: B018 - a fabric that is none is refused here
+        self.material  # noqa: B018 - an invalid fabric is refused here
 
     @property
     def material(self) -> Material:
         return Material.preset(self.fabric, **{name: getattr(self, name) for name in FIGURES})
 
     def changed(self, **changes: Any) -> Settings:
-        """The same with some changed; another fabric brings all its figures but the air's drag.
+        """A copy with some settings changed; another fabric brings all its properties except the drag of the air.
 
         Raises:
-            ValueError: an unknown name, or a value that makes no sense.
+            ValueError: an unknown name, or an invalid value.
         """
         known = [item.name for item in fields(self)]
         for name in changes:
@@ -102,18 +102,18 @@ class Scene:
     """A sheet and its world.
 
     Attributes:
-        name, title: as it is asked for, and as it is shown.
+        name: by which it is chosen; title: by which it is shown.
         about: what there is to see and to try, as a sentence.
-        mesh: the sheet at rest; ``start``: where it begins [m], (particles, 3).
-        settings: those that a visitor finds.
+        mesh: the sheet at rest; ``start``: initial positions [m], (particles, 3).
+        settings: at the start.
         anchors: particles, or patches of them, that can be held; ``names`` of them; those ``held`` at first.
         handles: anchors that can be dragged.
         colliders: solids that the sheet feels; ``scenery``: solids that are drawn besides.
         colours: of the colliders that are drawn, by number.
         motion: where anchors are to be at a time [s], (anchors, 3) [m], and colliders, by number; None where nothing moves.
-        rests: when what the motion holds is let go [s].
-        camera: where it is seen from.
-        strained: the strain at which the colours end.
+        rests: time at which moving anchors are released [s].
+        camera: its view.
+        strained: strain at which the color scale ends.
     """
 
     name: str
@@ -151,7 +151,7 @@ class Scene:
             "on_divergence": "ignore",
         }
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # substeps beyond a bound are among what is shown
+            warnings.simplefilter("ignore", UserWarning)  # substeps beyond a bound are part of the show
             s = Simulation(self.mesh, given.material, **(chosen | options))
         begin(s, self)
         return s
@@ -168,7 +168,7 @@ class Scene:
 
 
 def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None:
-    """Put a scene's simulation at its start; a seed shifts the free particles by about a thousandth of a spacing."""
+    """Reset a scene's simulation to its start; a seed displaces the free particles by about a thousandth of a spacing."""
     x = scene.start.copy()
     if seed is not None:
         held = [particle for anchor in scene.held for particle in np.atleast_1d(scene.anchors[anchor])]
@@ -182,7 +182,7 @@ def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None
 
 
 def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | None = None) -> None:
-    """Tell a scene's anchors and solids where to be at a time [s]; others: anchors that someone else moves, by number [m]."""
+    """Move a scene's anchors and solids to their targets for a time [s]; others: targets of dragged anchors, by number [m]."""
     targets = simulation.hand_positions
     if scene.motion is not None and time <= scene.rests:
         targets[0], solids = scene.motion(time)
