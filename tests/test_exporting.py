@@ -122,7 +122,7 @@ def test_a_burst_says_why_and_keeps_what_came_before(tmp_path, ending):
         (["patch", "--seconds", "-1"], "seconds=-1.0: must be positive"),
         (["patch", "--size", "0"], "size=0: must be an integer"),
         (["patch", "--color", "heat"], "color='heat': must be 'fabric' or 'strain'"),
-        (["patch", "--out", "a.glb", "--color", "strain"], "meshes have the fabric's colour alone"),
+        (["patch", "--out", "a.glb", "--color", "strain"], "meshes only have the fabric's color"),
         (["patch", "--kind", "stl"], "kind='stl': must be 'obj' or 'glb'"),
         (["patch", "--set", "gravity"], "'gravity': must be NAME=VALUE"),
         (["patch", "--set", "gravty=1"], "no setting 'gravty'; did you mean 'gravity'?"),

@@ -1,4 +1,4 @@
-"""The rows of the table that take seconds: episodes of the tasks, maneuvers, MuJoCo, and whole processes."""
+"""Rows of the table that take seconds each: episodes of the tasks, maneuvers, MuJoCo, and whole processes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FRAME, THICKNESS = 1 / 60, 0.008
 
 
 def make(env_id: str, num_envs: int | None = None, **options: Any) -> Any:
-    """An environment, or a batch, whose options its task may not take yet: ``contact`` is slipped in, ``physics`` left out."""
+    """An environment or a batch.  Options that an older task lacks are patched in (``contact``) or left out (``physics``)."""
     if num_envs is not None:
         options |= {"num_envs": num_envs, "threads": 1}
         options.setdefault("autoreset_mode", "SameStep")
@@ -73,7 +73,7 @@ class Stopwatch:
 
 
 def play(variants: dict[str, Row], expert: bool, num_envs: int = MANY, steps: int = STEPS, rounds: int = 2) -> dict[str, float]:
-    """Microseconds of an environment step by variant, in turns step by step; of each step the fastest round counts."""
+    """Time of an environment step by variant [us]; variants take turns, and the fastest round of each step counts."""
     best: dict[str, NDArray] = {name: np.full(steps, np.inf) for name in variants}
     envs = {name: make(DRAPE, num_envs, **options).unwrapped for name, options in variants.items()}
     for turn in range(rounds):
@@ -120,7 +120,7 @@ def strict() -> list[Row]:
 
 
 def env() -> list[Row]:
-    """Steps a second of ``gym.make``, resets included."""
+    """Steps per second of ``gym.make``, with resets."""
     rows = []
     cases = [(env_id, actor) for env_id in ENVIRONMENTS for actor in ("chance", "expert")]
     made = {case: make(case[0], physics="fast") for case in cases}
@@ -147,7 +147,7 @@ def env() -> list[Row]:
 
 
 def overhead() -> list[Row]:
-    """What everything that is not physics costs: the time of steps, less that of the simulation's steps in them."""
+    """Cost of everything but physics: the time of environment steps less that of the simulation in them."""
     rows = []
     for env_id in ENVIRONMENTS:
         ways: list[tuple[str, int, float, Callable[[], Any]]] = [
@@ -165,7 +165,7 @@ def overhead() -> list[Row]:
 
 
 def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> float:
-    """Microseconds of an environment step without its physics, resets included, the median of rounds; chance acts."""
+    """Time of an environment step without its physics, with resets and random actions [us]: median of rounds."""
     random, adapted = np.random.default_rng(0), not isinstance(one, gym.Env | gym.vector.VectorEnv)
     simulation = (one.env if adapted else one).unwrapped.task.simulation
     one.reset() if adapted else one.reset(seed=0)
@@ -182,7 +182,7 @@ def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> floa
         beat("beside the physics")
         return total
 
-    act(110 if num_envs > 1 else 1)  # by then the episodes' ends are spread over time
+    act(110 if num_envs > 1 else 1)  # until the ends of episodes are spread over time
     watch, taken = Stopwatch(simulation), []
     for _ in range(rounds):
         before = watch.seconds
@@ -194,7 +194,7 @@ def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> floa
 
 
 def frames(maneuvers: Mapping[str, Maneuver], count: int) -> dict[str, float]:
-    """Mean milliseconds of a frame of each, the physics alone, in turns frame by frame."""
+    """Mean time of a frame of each, physics alone [ms]; they take turns frame by frame."""
     watches = {name: Stopwatch(maneuver.simulation) for name, maneuver in maneuvers.items()}
     for frame in range(count):
         for maneuver in maneuvers.values():
@@ -210,7 +210,7 @@ def _options(mode: str) -> Row:
 def fold(num_envs: int = 64) -> list[Row]:
     mesh, modes = grid(25, 25, 1.0, 1.0), ("none", "strict")
     made = {mode: Fold(mesh, seeds=range(num_envs), thickness=THICKNESS, **_options(mode)) for mode in modes}
-    for mode in modes:  # loads what is compiled
+    for mode in modes:  # loads compiled code
         Fold(mesh, seeds=[0], thickness=THICKNESS, **_options(mode)).step()
     ms = {mode: time / num_envs for mode, time in frames(made, round(made["none"].seconds / FRAME)).items()}
     return [
@@ -220,7 +220,7 @@ def fold(num_envs: int = 64) -> list[Row]:
 
 
 def growth(sides: tuple[int, int] = (25, 100), count: int = 60) -> list[Row]:
-    """A folded sheet's first second of falling, by size."""
+    """The first second of a falling folded sheet, by size."""
     made = {}
     for side in sides:
         mesh = grid(side, side, (side - 1) * SPACING, (side - 1) * SPACING)
@@ -229,12 +229,12 @@ def growth(sides: tuple[int, int] = (25, 100), count: int = 60) -> list[Row]:
         made.pop(f"warm {side}").simulation.step()
     ms = frames(made, count)
     small, large = (ms[f"falling {side}"] for side in sides)
-    told = [
+    rows = [
         row_of("growth", f"a folded sheet that falls, {side} x {side}, strict", ms[f"falling {side}"], "ms a frame")
         for side in sides
     ]
     times = f"the same, {sides[0]} x {sides[0]} to {sides[1]} x {sides[1]}"
-    return [*told, row_of("growth", times, large / small, "times", 20)]
+    return [*rows, row_of("growth", times, large / small, "times", 20)]
 
 
 def mujoco() -> list[Row]:
@@ -283,7 +283,7 @@ def start(runs: int = 7) -> list[Row]:
 
 
 def process_seconds(code: str, cache: str) -> float:
-    """Processor seconds of a whole process, or those on the clock where the system does not tell."""
+    """Processor time of a whole process [s], or wall time where the system does not report it."""
     begun, before = time.perf_counter(), os.times()
     environment = os.environ | {"CLOTHGYM_CACHE_DIR": cache}
     # bytecode is written as it is for most people: else each process compiles every module of Python again

@@ -1,12 +1,11 @@
-"""The table of speeds: what each thing costs here, beside what is wanted of it and what the machine allows.
+"""The table of speeds: what each thing costs, beside its goal and the limits of the machine.
 
     python -m clothgym bench --table                                    # all of it, about a quarter of an hour
     python -m clothgym bench --table --select springs bending           # some groups; --json FILE writes the rows too
 
-All on one thread, by the processor time of that thread ("start": of whole processes).  What takes milliseconds is measured in
-turns, round after round over all of it, and its median counts: whatever else the machine does hits all alike, and ratios hold
-where figures do not.  What takes seconds is measured in turns with what it is held against, frame by frame, and beside each of its
-rows stands what a plain step took meanwhile.
+All on one thread, by its processor time ("start": of whole processes).  Cases that take milliseconds take turns, round after round,
+and the median counts: other load of the machine affects all alike, so ratios are more reliable than times.  Cases that take seconds
+take turns with what they are compared with, frame by frame, and each of their rows has the time of a plain step meanwhile.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ ROUNDS = 15
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Something that takes milliseconds.
+    """A case that takes milliseconds.
 
     Attributes:
-        group, what: its group, and what it is.
+        group: of rows; what: a description.
         call: what is timed.
-        scale: from seconds of a call to the unit.
-        wanted: in words, where there is no goal.
-        over, beyond: told as so many times that case's time, or as so much more.
-        goal: at most this, or so many times what another case takes.
-        visits: springs times substeps times environments of a call: what a physics row is also told by, in ns.
-        work, springs, size: of a substep, see ``bench_limits.stand``; with ``beyond``, of what it does more.
+        scale: factor from seconds of a call to ``unit``.
+        wanted: the goal in words, if it is not a number.
+        over, beyond: a case to which the result is the ratio, or the difference.
+        goal: at most this, or this factor times the result of another case.
+        visits: springs times substeps times environments in a call, for ns a spring.
+        work, springs, size: of a substep, see ``bench_limits.stand``; with ``beyond``, of the difference.
     """
 
     group: str
@@ -76,14 +75,14 @@ class Case:
 
 
 def row_of(group: str, what: str, now: float, unit: str, goal: float | None = None, wanted: str = "", least: bool = False) -> Row:
-    """A row; goal: at most, or at least, this."""
+    """A row of the table; goal: the largest result wanted, or the smallest if ``least``."""
     reached = None if goal is None else bool(now >= goal if least else now <= goal)
     wanted = wanted or ("" if goal is None else f"{goal:g}")
     return {"group": group, "what": what, "now": now, "unit": unit, "goal": goal, "wanted": wanted, "reached": reached}
 
 
 def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
-    """Median processor seconds of each case's calls; the cases take turns, and so does who begins."""
+    """Median processor time of a call of each case [s]; the cases take turns, starting with another one in each round."""
     times: dict[Case, list[float]] = {case: [] for case in cases}
     for case in cases:
         case.call()
@@ -98,7 +97,7 @@ def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
 
 
 def with_what_they_need(cases: Iterable[Case]) -> list[Case]:
-    """The cases, and those that they are held against, once each."""
+    """The cases, and those that they are compared with, once each."""
     found: dict[Case, None] = {}
 
     def add(case: Case) -> None:
@@ -115,7 +114,7 @@ def with_what_they_need(cases: Iterable[Case]) -> list[Case]:
 
 
 class Pace:
-    """How fast the machine is while something long runs: plain steps in between, by which figures of two runs can be compared."""
+    """The speed of the machine during a long measurement, from plain steps in between, to compare two runs."""
 
     def __init__(self) -> None:
         self.sheet = PlainSheet(25)
@@ -127,7 +126,7 @@ class Pace:
         self.times.append((time.thread_time() - begun) * 1e9 / (steps * self.sheet.springs))
 
     def take(self) -> float | None:
-        """Median nanoseconds of a plain step, a spring, since it was last asked."""
+        """Median time of a plain step per spring since the last call [ns]."""
         times, self.times = self.times, []
         return statistics.median(times) if times else None
 
@@ -138,7 +137,7 @@ def pace() -> Pace:
 
 
 def beat(text: str) -> None:
-    """Tell how far it is, and take the machine's pace."""
+    """Show progress, and sample the machine's speed."""
     pace().sample()
     tell(text)
 
@@ -151,9 +150,9 @@ def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]
     """All rows of those groups, or of all, with the machine and its limits.
 
     Raises:
-        ValueError: a group that there is not.
+        ValueError: an unknown group.
     """
-    from clothgym.lab.bench_cases import GROUPS as SHORT  # each looks at the other's rows
+    from clothgym.lab.bench_cases import GROUPS as SHORT  # imported here: these modules import this one
     from clothgym.lab.bench_episodes import GROUPS as LONG
 
     known = {**SHORT, **LONG}
@@ -193,8 +192,8 @@ def table(results: dict[str, Any]) -> str:
             lines += ["", f"{group:<66} {'now':>9} {'':<22} wanted"]
         mark = {True: "reached", False: "", None: ""}[row["reached"]]
         now = row["now"] if row["now"] is not None else float("nan")
-        told = f"{now:,.0f}" if abs(now) >= 1000 else f"{now:.3g}"
-        lines.append(f"  {row['what']:<64} {told:>9} {row['unit']:<22} {row['wanted']} {mark}".rstrip())
+        number = f"{now:,.0f}" if abs(now) >= 1000 else f"{now:.3g}"
+        lines.append(f"  {row['what']:<64} {number:>9} {row['unit']:<22} {row['wanted']} {mark}".rstrip())
         if "limits" in row:
             shares = ", ".join(f"{100 * share:.0f} % of {name}" for name, share in row["limits"]["shares"].items())
             lines.append(f"  {'':<64} {'':>9} {shares}")

@@ -33,7 +33,7 @@ def stage_named(name: str, seed: int = 0, policy: str = "expert", settings: Mapp
     playground, in place of the scene's own; a scene that begins without gravity gets it.
 
     Raises:
-        ValueError, FileNotFoundError: there is nothing or nobody of that name, or a setting makes no sense.
+        ValueError, FileNotFoundError: an unknown scene, environment or policy, or an invalid setting.
         ImportError: a trained policy needs Stable-Baselines3, and it is missing.
     """
     changes, runs = dict(settings or {}), [policy] if Path(policy).is_dir() else []
@@ -126,7 +126,7 @@ def export(
         raise ValueError(f"out={str(out)!r}: must end in .png, .gif, .mp4 or .glb, or be a folder (without an ending) for meshes")
     meshes = path.suffix in ("", ".glb")
     if meshes and color != "fabric":
-        raise ValueError(f"color={color!r}: meshes have the fabric's colour alone; ask for a picture or a film")
+        raise ValueError(f"color={color!r}: meshes only have the fabric's color; ask for a picture or a film")
     side = count("size", size if size is not None else PICTURE if path.suffix == ".png" else SIZE)
     one_of("kind", kind, *KINDS)
     stage = stage_named(name, seed, policy, settings)
@@ -171,7 +171,7 @@ def export(
 
 
 def tell(done: int, total: int) -> None:
-    """A line that counts frames where somebody sees it."""
+    """Count frames on a line, if stderr is a terminal."""
     if sys.stderr.isatty():
         print(f"\r{done} frames" if not total else f"\r{done} of {total} frames", end="", file=sys.stderr, flush=True)
         if done == total:

@@ -79,7 +79,7 @@ def write_moving_mesh(path: Path, recording: Recording, frames: Sequence[Frame],
 
 
 def lasting(solids: Sequence[Sequence[Solid]]) -> list[list[Solid]]:
-    """Those solids of each frame of which no frame has more or fewer: a hand that lets go has no place in one moving mesh."""
+    """The solids that all frames have: those that come or go, as a gripper that opens, cannot be part of one moving mesh."""
 
     def look(solid: Solid) -> tuple[Any, ...]:
         return solid.kind, solid.radius, solid.half_sides, solid.height, solid.color

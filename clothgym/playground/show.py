@@ -39,9 +39,9 @@ def ramp(values: NDArray) -> NDArray[np.uint8]:
     return np.stack([np.interp(values, STOPS, RAMP[:, c]) for c in range(3)], axis=-1).round().astype(np.uint8)
 
 
-def linear(colours: NDArray) -> NDArray[np.uint8]:
+def linear(colors: NDArray) -> NDArray[np.uint8]:
     """sRGB as linear light, in which a browser expects the colors of lines."""
-    return LINEAR[colours]
+    return LINEAR[colors]
 
 
 def spring_values(recording: Recording, frame: Frame, sheet: int, mode: str, springs: NDArray) -> tuple[NDArray, float]:
@@ -56,10 +56,10 @@ def spring_values(recording: Recording, frame: Frame, sheet: int, mode: str, spr
 
 def own_color(label: str) -> tuple[int, int, int] | None:
     """Color of a compared sheet: that of its integrator, paler without a strain limit; None if the label is not an integrator."""
-    colour = COLORS.get(label.removesuffix(UNLIMITED))
-    if colour is None:
+    color = COLORS.get(label.removesuffix(UNLIMITED))
+    if color is None:
         return None
-    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
     if label.endswith(UNLIMITED):
         red, green, blue = (round(0.35 * c + 0.65 * PALE) for c in (red, green, blue))
     return red, green, blue
@@ -93,12 +93,12 @@ class Show:
         compared = len(recording.labels) > 1
         self._sheets = []
         for number, (label, x) in enumerate(zip(recording.labels, frame.positions)):
-            colours = sides(label, compared)
+            colors = sides(label, compared)
             pair = [
-                scene.add_mesh_simple(f"/sheet{number}/{side}", x, mesh.triangles, color=colour, side=side)
-                for side, colour in zip(("front", "back"), colours)
+                scene.add_mesh_simple(f"/sheet{number}/{side}", x, mesh.triangles, color=color, side=side)
+                for side, color in zip(("front", "back"), colors)
             ]
-            self._sheets.append((pair, colours))
+            self._sheets.append((pair, colors))
         springs = yarns(mesh)
         points = frame.positions[0][mesh.springs.particles[springs]]
         self._yarns = [
@@ -107,9 +107,9 @@ class Show:
         ]
         self._dots = {
             name: scene.add_point_cloud(
-                f"/{name}", np.zeros((1, 3)), colour, point_size=size, point_shape="circle", precision="float32", visible=False
+                f"/{name}", np.zeros((1, 3)), color, point_size=size, point_shape="circle", precision="float32", visible=False
             )
-            for name, colour, size in (("touching", TOUCH, 0.011), ("held", HOLD, 0.018))
+            for name, color, size in (("touching", TOUCH, 0.011), ("held", HOLD, 0.018))
         }
         self._solids: dict[tuple[Solid, int], list[Any]] = defaultdict(list)
         self._handles: dict[int, Any] = {}
@@ -119,11 +119,11 @@ class Show:
         mesh = self.recording.mesh
         springs = yarns(mesh, diagonals)
         bold = mode in ("strain", "tension")
-        for number, ((pair, colours), lines) in enumerate(zip(self._sheets, self._yarns)):
+        for number, ((pair, colors), lines) in enumerate(zip(self._sheets, self._yarns)):
             x = frame.positions[number]
-            for node, colour, dark in zip(pair, colours, (DARK, DARK_BACK)):
+            for node, color, dark in zip(pair, colors, (DARK, DARK_BACK)):
                 node.vertices = x
-                node.color = colour if mode == "fabric" else dark
+                node.color = color if mode == "fabric" else dark
             lines.points = x[mesh.springs.particles[springs]]
             lines.thickness = BOLD if bold else THIN
             if bold:
@@ -132,7 +132,7 @@ class Show:
             else:
                 weave = WEAVE if mode == "fabric" else IDLE
                 if mode == "fabric" and len(self._sheets) > 1:
-                    weave = tuple(round(0.75 * c + 60) for c in colours[0])  # type: ignore[assignment]
+                    weave = tuple(round(0.75 * c + 60) for c in colors[0])  # type: ignore[assignment]
                 lines.colors = np.broadcast_to(linear(np.array(weave)), (len(springs), 2, 3))
         self._dot("touching", frame.positions[frame.touching] if mode == "contact" else np.zeros((0, 3)))
         self._place(frame.solids)

@@ -40,7 +40,7 @@ HEAT = heat_palette()
 
 class _Things(NamedTuple):
     """What comes with the cloth's positions in one frame: solids, which hold it up, markers, which need not, and a number of each
-    drawn vertex to be shown as a colour, (vertices,), or none."""
+    drawn vertex to show as a color, (vertices,), or none."""
 
     solids: list[Solid]
     markers: list[Solid]
@@ -277,7 +277,7 @@ class Renderer:
         for marker in markers:
             if not isinstance(marker, Solid):
                 if len(marker) != 2:
-                    raise ValueError(f"marker {marker!r}: must be (position in metres, color) or a clothgym.render.Solid")
+                    raise ValueError(f"marker {marker!r}: must be (position in meters, color) or a clothgym.render.Solid")
                 center, color = marker
                 marker = Solid(kind="sphere", center=tuple(center), radius=MARKER_RADIUS, color=color)  # type: ignore[arg-type]
             spheres.append(marker)

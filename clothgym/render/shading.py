@@ -22,7 +22,7 @@ STUDIO = ((226, 222, 214), (205, 200, 191), (240, 238, 234), (222, 227, 232))  #
 KEY = (0.90, 0.86, 0.79)  # light of the lamp, before the cosine
 SKY = (0.43, 0.43, 0.45)  # from straight above
 BOUNCE = (0.40, 0.36, 0.32)  # from the floor
-TILES = 10.0  # on a metre of the floor
+TILES = 10.0  # on a meter of the floor
 LINE_WIDTH = 0.0016  # [m]
 ROOF_HEIGHT = 0.10  # height above at which a surface blocks most of the sky's light [m]
 TEXELS_ASIDE = 1.5
@@ -200,10 +200,10 @@ def _fabric(uv, values, triangles, t, w0, w1, w2, footprint, check, palette, hea
         return heat[step, 0], heat[step, 1], heat[step, 2]
     u = w0 * uv[i, 0] + w1 * uv[j, 0] + w2 * uv[k, 0]
     v = w0 * uv[i, 1] + w1 * uv[j, 1] + w2 * uv[k, 1]
-    tone, thread = _tone(u, v, check, footprint)
+    tone, relief = _tone(u, v, check, footprint)
     dark, light = palette[FRONT if front else BACK], palette[FRONT_CHECK if front else BACK_CHECK]
     r, g, b = dark[0] + tone * (light[0] - dark[0]), dark[1] + tone * (light[1] - dark[1]), dark[2] + tone * (light[2] - dark[2])
-    return thread * r, thread * g, thread * b
+    return relief * r, relief * g, relief * b
 
 
 @kernel
