@@ -46,9 +46,7 @@ class Maneuver:
         options: of ``Simulation``, ``self_collision`` for instance.
 
     Attributes:
-        simulation: the batch.
-        seconds: duration [s].
-        time: since the start [s].
+        simulation: the batch.  seconds: duration [s].
     """
 
     seconds: float
@@ -254,11 +252,8 @@ class Fold(Maneuver):
 class Wring(Maneuver):
     """Two opposite edges are twisted against each other, each by particles around its middle, and moved closer.
 
-    Args:
-        turns: of one edge against the other.
-        turning: duration of the twist [s], after which the edges are held.
-        share: of each edge that is held.
-        approach: share of their distance by which the edges have moved closer at the end.
+    turns: of one edge against the other.  turning: duration of the twist [s]; then the edges are held.  share: of each edge that is
+    held.  approach: share of their distance by which the edges come closer.
     """
 
     holding = 2.0  # [s]
@@ -283,7 +278,6 @@ class Wring(Maneuver):
         return self.rest, 0.7 * self.side
 
     def _steer(self, time: float) -> None:
-        # opposite angles about the axis of the sheet
         share = min(time / self.turning, 1.0)
         middle = self.held.mean(axis=1, keepdims=True)
         offset = self.held - middle
@@ -295,12 +289,7 @@ class Wring(Maneuver):
 
 
 class Drag(Maneuver):
-    """A sheet above the floor is dragged by a corner from one random point to the next.
-
-    Args:
-        speed: of the corner [m/s].
-        seconds: duration [s].
-    """
+    """A sheet above the floor is dragged by a corner from one random point to the next, at ``speed`` [m/s]."""
 
     def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
         self.speed, self.seconds = positive("speed", speed), positive("seconds", seconds)
@@ -329,12 +318,9 @@ class Drag(Maneuver):
 
 
 class PickAndDrop(Maneuver):
-    """A sheet on the floor is picked up at a random point, carried and dropped, several times.
+    """A sheet on the floor is picked up at a random point, carried and dropped, ``picks`` times.
 
-    Args:
-        picks: how many times.
-        lift: lowest and highest height to which it is lifted, in sides.
-        carry: largest distance along x and y, in sides.
+    lift: lowest and highest height to which it is lifted, in sides.  carry: largest distance along x and y, in sides.
     """
 
     grippers = (Gripper(speed=1.0),)
@@ -363,7 +349,6 @@ class PickAndDrop(Maneuver):
             self.goal = np.array([random.uniform(low, high) for random in self.random]) * self.side
             self.goal[:, 2] += self.taken[:, 2]
             grippers.place(self.taken[:, None])
-        # close, carry, and open
         share = _eased(min(max(passed - self.closing, 0.0) / self.lifting, 1.0))
         opening = float(passed > self.closing + self.lifting)
         grippers.move((self.taken + share * (self.goal - self.taken))[:, None], np.full((len(self.random), 1), opening))
@@ -417,7 +402,6 @@ def make(
     checks.count("count", count)
     checks.count("seed", seed, least=0)
     options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options
-    # the maneuver, and then drag
     maneuver = STARTS[kind](mesh, material, range(seed, seed + count), thickness, **options)
     while not maneuver.over:
         maneuver.step()
@@ -438,7 +422,6 @@ def make(
         moving &= ~settled
         simulation.step(6)
         maneuver.frames += 6
-    # intersections
     found = find_intersections(mesh.triangles, x)
     if len(found):
         env, first, second = found[0].tolist()

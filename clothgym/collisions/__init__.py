@@ -7,8 +7,9 @@ The contact work of one substep, in the order of the main loop (``clothgym/simul
    every particle, and with ``contact="sheet"`` the points between particles, too (``solids/triangle_contact.py``).  One contact
    takes the inward velocity and Coulomb friction (``solids/contact_law.py``).
 3. ``keep_apart`` (``self/step.py``): impulses between what is closer than the cloth's thickness (``self/impulses.py``), then the
-   displacement bounds (``self/displacement_bounds.py``).  A vertex beyond its bound causes a query: which pairs are close
-   (``self/broad_phase.py``), and how far each vertex may go from here (``self/narrow_phase.py``).
+   displacement bounds (``self/displacement_bounds.py``).  A vertex beyond its bound causes its gap constraints to be evaluated
+   (``self/gap_constraints.py``), or a query: which pairs are close (``self/broad_phase.py``), and how far each vertex may move from
+   here (``self/narrow_phase.py``).
 
 Once a control step anchors and grippers are stopped at solids (``solids/attachment_contact.py``).
 

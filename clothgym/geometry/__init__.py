@@ -1,5 +1,5 @@
 """Floor 1: triangles, segments and points, and nothing about contact.
 
 ``closest_points``: on triangles and segments.  ``intersections``: which triangles of a sheet intersect, decided exactly
-(``exact_predicates``).  ``closed_mesh``: whether a mesh bounds a solid.
+(``filtered_predicates``, then ``exact_predicates``).  ``closed_mesh``: whether a mesh bounds a solid.
 """

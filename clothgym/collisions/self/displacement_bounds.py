@@ -3,37 +3,24 @@
 Everything happens between two certified states, the positions at the end of two substeps.  A move that is cut short ends on the
 straight line from the first state to the second; the first lies within every bound.
 
-Names: a vertex is *outside* if it has moved farther than its bound since the last query.  A gap constraint is *active* if one of
-its vertices is outside, and *violated* if its gap along its normal is smaller than the distance that it keeps.
+A vertex is *outside* if it has moved farther than its bound since the last query.  Then its gap constraints are evaluated (see
+``gap_constraints``), or a query gives new bounds.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.self.narrow_phase import GROUP_JAMMED, SHARE, query
-from clothgym.contact_memory import (
-    G_GROUP,
-    G_KEPT,
-    G_NUMBER,
-    G_OWN,
-    G_VERTICES,
-    REPORT_CLAMPED,
-    REPORT_CONTACTS,
-    REPORT_LAG,
-    REPORT_QUERIES,
-    REPORT_UNCERTAIN,
-)
+from clothgym._jit import inlined, kernel
+from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
+from clothgym.collisions.self.narrow_phase import SHARE, query
+from clothgym.contact_memory import REPORT_CLAMPED, REPORT_CONTACTS, REPORT_QUERIES, REPORT_UNCERTAIN
 
 INSIDE = 0.999  # share of each bound that is used; the rest allows for rounding
 CATCH_UP = 1.0  # speed at which a particle that lags behind its attachment catches up [m/s]
 FARTHEST = 16.0  # distance from the origin within which float32 is certified [m]
-PATIENCE = 4  # evaluations of all gap constraints after which a query, which gives the vertices new bounds, is cheaper
 AHEAD = 8  # substeps that a query should last: it looks farther around fast vertices
 AHEAD_MOST = 1.0  # largest distance beyond the reach that it looks, as a share of the reach
-HALVINGS = 4  # times that the moves of a gap constraint's vertices are halved before they stay in place
-INACTIVE_COST = 8  # inactive gap constraints that cost as much to skip as one active one to evaluate
 
 
 @inlined
@@ -67,11 +54,11 @@ def confine(x, v, w, sheet, block, h):
             for p in range(x.shape[1]):
                 own_outside[p] = outside[p, l]
             active = np.empty(memory.constraints[block, l], np.int32)
-            number = _list_active(memory.members[block, l], own_outside, active)
-            due, violated = _evaluate_constraints(x, memory, block, l, active[:number])
+            number = list_active(memory.members[block, l], own_outside, active)
+            due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                _hold_apart(x, v, w, sheet, block, l, own_outside, active, number)
+                hold_apart(x, v, w, sheet, block, l, own_outside, active, number)
                 # vertices that stayed in place have left the common motion, and so perhaps their limits
                 _, due = _find_outside_in_lane(x, start, bounds, limits, samples, l, own_outside)
         # a query at the certified positions gives new bounds
@@ -198,13 +185,13 @@ def _query_again(x, v, w, sheet, block, l, h, outside):
         members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
         violated = False
         for t in range(constraints):
-            violated |= _is_violated(x, members, planes, t, l)
+            violated |= is_violated(x, members, planes, t, l)
         if violated:
             _clamp(x, v, memory, block, l, h, p64, limits, held, zero, zero, zero)
             outside[:] = True
             active = np.empty(constraints, np.int32)
-            _hold_apart(x, v, w, sheet, block, l, outside, active, _list_active(members, outside, active))
-        _note_lag(w, memory, block, l)
+            hold_apart(x, v, w, sheet, block, l, outside, active, list_active(members, outside, active))
+        note_lag(w, memory, block, l)
 
 
 @kernel
@@ -232,138 +219,6 @@ def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
                 else:
                     v[c, p, l] = m / h + keep * (v[c, p, l] - m / h)
                 x[c, p, l] = goal
-
-
-@inlined
-def _is_active(members, t, outside):
-    """Whether a vertex of gap constraint t is outside its bound: the first four, which all have, are tested without a branch."""
-    some = (
-        outside[members[t, G_VERTICES]]
-        | outside[members[t, G_VERTICES + 1]]
-        | outside[members[t, G_VERTICES + 2]]
-        | outside[members[t, G_VERTICES + 3]]
-    )
-    for m in range(4, members[t, G_NUMBER]):
-        some |= outside[members[t, G_VERTICES + m]]
-    return some
-
-
-@kernel
-def _list_active(members, outside, active):
-    """List the active gap constraints in ``active``, which has room for all, (constraints,).  Returns how many there are."""
-    number = 0
-    for t in range(active.shape[0]):
-        # written without a branch: the next one takes the place of an inactive one
-        active[number] = t
-        number += _is_active(members, t, outside)
-    return number
-
-
-@kernel
-def _is_violated(x, members, planes, t, l):
-    """Whether gap constraint t of lane l is violated: min n . x_first - max n . x_second < the distance that it keeps."""
-    own = members[t, G_OWN]
-    nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
-    nearest, farthest = np.inf, -np.inf
-    for m in range(members[t, G_NUMBER]):
-        p = members[t, G_VERTICES + m]
-        place = nx * x[0, p, l] + ny * x[1, p, l] + nz * x[2, p, l]
-        if m < own:
-            nearest = min(nearest, place)
-        else:
-            farthest = max(farthest, place)
-    # false for NaN: a diverged lane is left alone
-    return nearest - farthest < planes[t, G_KEPT]
-
-
-@kernel
-def _evaluate_constraints(x, memory, block, l, active):
-    """Whether a query is due because of the active gap constraints of lane l, and whether one of them is violated.
-
-    active: their numbers.  Constraints that were enforced since the last query are jammed: a query would find the same again, so
-    they cause none until evaluating has cost more than a query would.
-    """
-    members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
-    due, violated = False, False
-    for c in range(active.shape[0]):
-        if _is_violated(x, members, planes, active[c], l):
-            violated = True
-            due |= members[active[c], G_GROUP] != GROUP_JAMMED
-    # inactive constraints cost a little, too
-    memory.looks[block, l] += constraints // INACTIVE_COST + active.shape[0]
-    return due or memory.looks[block, l] > PATIENCE * constraints, violated
-
-
-@apart
-def _hold_apart(x, v, w, sheet, block, l, outside, active, number):
-    """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
-    positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.
-
-    active: room for all gap constraints, (constraints,); the first ``number`` entries are the active ones.  outside: which vertices
-    are outside their bounds; becomes which have been moved, too, (particles,).
-    """
-    memory = sheet.memory
-    old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
-    members, planes, constraints = memory.members[block, l], memory.planes[block, l], active.shape[0]
-    zero, half = x.dtype.type(0), x.dtype.type(0.5)
-    # mark the violated constraints as jammed
-    again = False
-    for c in range(number):
-        if _is_violated(x, members, planes, active[c], l):
-            members[active[c], G_GROUP] = GROUP_JAMMED
-            again = True
-    halvings = np.zeros(x.shape[1], np.int64)
-    while again:
-        # rounds over the active constraints, in their order; when a move activates others, the round goes on over all of them
-        again, spread, c, t = False, False, 0, -1
-        while c < number or spread:
-            # the next constraint of this round
-            if spread:
-                t += 1
-                if t == constraints:
-                    break
-                if not _is_active(members, t, outside):
-                    continue
-            else:
-                t = active[c]
-                c += 1
-            if not _is_violated(x, members, planes, t, l):
-                continue
-            # halve the moves of its vertices, those of attached particles into their lag
-            for m in range(members[t, G_NUMBER]):
-                p = members[t, G_VERTICES + m]
-                if halvings[p] > HALVINGS:
-                    continue
-                report[REPORT_CLAMPED] += halvings[p] == 0
-                halvings[p] += 1
-                again = True
-                spread |= not outside[p]
-                outside[p] = True
-                share = half if halvings[p] <= HALVINGS else zero
-                for k in range(3):
-                    goal = old[k, p, l]
-                    if share > zero:  # zero times a move that is not finite is not zero
-                        goal += share * (x[k, p, l] - goal)
-                    if w[p, l] <= zero:
-                        lag[k, p, l] += x[k, p, l] - goal
-                    else:
-                        v[k, p, l] *= share
-                    x[k, p, l] = goal
-        if spread:
-            number = _list_active(members, outside, active)
-    _note_lag(w, memory, block, l)
-
-
-@kernel
-def _note_lag(w, memory, block, l):
-    """Note the largest lag of lane l [m]."""
-    lag = memory.lag[block]
-    largest = lag.dtype.type(0)
-    for p in range(w.shape[0]):
-        if w[p, l] <= 0:
-            largest = max(largest, lag[0, p, l] * lag[0, p, l] + lag[1, p, l] * lag[1, p, l] + lag[2, p, l] * lag[2, p, l])
-    memory.behind[block, l] = np.sqrt(largest)
-    memory.report[block, l, REPORT_LAG] = max(memory.report[block, l, REPORT_LAG], np.float64(memory.behind[block, l]))
 
 
 @inlined
