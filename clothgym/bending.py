@@ -19,7 +19,6 @@ same forces are in ``grid_forces``.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import disjoint, inlined, kernel, uncounted
+from clothgym.checks import known
 from clothgym.elements import ROWS, BendArrays
 from clothgym.mesh import ClothMesh
 
@@ -374,10 +374,7 @@ def model_of(name: str, mesh: ClothMesh) -> Bending:
     Raises:
         ValueError: no such name; the message lists the right ones.  Or a model that cannot hold this mesh.
     """
-    if not isinstance(name, str) or name not in BENDING:
-        near = difflib.get_close_matches(str(name), BENDING, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"no bending model {name!r}{hint} (there are: {', '.join(BENDING)})")
+    known("bending model", name, BENDING)
     if name == "quadratic" and mesh.hinges.rest_angle.any():
         steepest = float(np.abs(mesh.hinges.rest_angle).max())
         raise ValueError(

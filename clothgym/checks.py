@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,15 @@ def one_of(name: str, value: Any, *known: str) -> None:
     """One of a few words."""
     if value not in known:
         raise ValueError(f"{name}={value!r}: must be {' or '.join(map(repr, known))}")
+
+
+def known(what: str, name: Any, names: Iterable[str]) -> None:
+    """A name among these; the sentence on another one says which is near it, and lists them."""
+    names = list(names)
+    if not isinstance(name, str) or name not in names:
+        near = difflib.get_close_matches(str(name), names, n=1)
+        guess = f"; did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"no {what} {name!r}{guess} (there are: {', '.join(names)})")
 
 
 def finite(name: str, value: ArrayLike) -> NDArray:

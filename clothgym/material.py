@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import number
+from clothgym.checks import known, number
 from clothgym.mesh import BEND_X, BEND_Y, EDGE, NUM_KINDS, OPPOSITE, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
 
@@ -57,14 +56,9 @@ class Material:
     @staticmethod
     def preset(name: str, **changes: float) -> Material:
         """A measured fabric by name, with some figures changed if wanted: ``Material.preset("cotton", density=0.2)``."""
-        if not isinstance(name, str) or name not in PRESETS:
-            near = difflib.get_close_matches(str(name), PRESETS, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"no material preset {name!r}{hint} (there are: {', '.join(PRESETS)})")
-        known = [field.name for field in fields(Material)]
+        known("material preset", name, PRESETS)
         for figure in changes:
-            if figure not in known:
-                raise ValueError(f"no material figure {figure!r} (there are: {', '.join(known)})")
+            known("material figure", figure, [field.name for field in fields(Material)])
         return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
 
 

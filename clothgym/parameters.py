@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import finite, spread
+from clothgym.checks import finite, known, spread
 from clothgym.material import Material, spring_stiffness
 from clothgym.mesh import ClothMesh
 
@@ -38,18 +37,14 @@ def changed(
     parameters = parameters.copy()
     fields: dict[str, NDArray[np.float64]] = {}
     for name, value in changes.items():
+        known("parameter", name, (*FIGURES, *FIELDS))
         if name in FIGURES:
             values = spread(name, finite(name, value), (len(parameters),))
             for one in np.unique(values):
                 replace(material, **{name: float(one)})  # type: ignore[arg-type]
             parameters[:, FIGURES.index(name)] = values
-        elif name in FIELDS:
-            fields[name] = spread(name, finite(name, value), (len(parameters), 3))
         else:
-            known = (*FIGURES, *FIELDS)
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"no parameter {name!r}{hint} (there are: {', '.join(known)})")
+            fields[name] = spread(name, finite(name, value), (len(parameters), 3))
     return parameters, fields
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Mapping
 from typing import Any
 
+from clothgym.checks import known
 from clothgym.integrators.base import Integrator
 from clothgym.integrators.explicit_euler import EXPLICIT_EULER
 from clothgym.integrators.implicit_euler import IMPLICIT_EULER
@@ -44,10 +44,7 @@ def get(integrator: str | Mapping[str, Any] | Integrator) -> Integrator:
                 warnings.warn(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is left out", stacklevel=3)
                 del options[name]
         return method.with_options(**options)
-    if not isinstance(integrator, str) or integrator not in INTEGRATORS:
-        near = difflib.get_close_matches(str(integrator), INTEGRATORS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"no integrator {integrator!r}{hint} (there are: {', '.join(INTEGRATORS)})")
+    known("integrator", integrator, INTEGRATORS)
     return INTEGRATORS[integrator]
 
 

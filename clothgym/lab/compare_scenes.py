@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import known
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY, Simulation
@@ -242,8 +242,5 @@ def scene_named(name: str) -> Scene:
     Raises:
         ValueError: there is none; the message lists those that there are.
     """
-    if name not in SCENES:
-        near = difflib.get_close_matches(str(name), SCENES, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"no scene {name!r}{hint} (there are: {', '.join(SCENES)})")
+    known("scene", name, SCENES)
     return SCENES[name]
