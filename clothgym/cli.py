@@ -1,131 +1,244 @@
-"""The command line: what there is, a page to play with it, exports, its speed here, how integrators compare, compiling."""
+"""The command line: what there is, a page to play with it, exports, its speed here, how integrators compare, compiling.
+
+Options are checked before anything is compiled: values as they are parsed, names where their tables are, which takes a second.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+import os
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import clothgym
+from clothgym import progress
+from clothgym.registration import ACTORS, ENVIRONMENTS, actor_named
+
+STOPPED = 130  # the exit status of what Ctrl+C has ended, as shells have it
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m clothgym", description="Cloth that is fast enough to learn on.")
-    commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("list", help="environments, integrators and fabrics")
-    warmup = commands.add_parser("warmup", help="compile kernels now, so that nothing has to later")
-    warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; some minutes")
-    bench = commands.add_parser("bench", help="measure speed on this machine")
-    bench.add_argument("--json", type=Path, metavar="FILE", help="write the results there too")
-    bench.add_argument("--quick", action="store_true", help="fewer cases, in a few seconds")
-    bench.add_argument(
-        "--table", action="store_true", help="what everything costs, beside what is wanted and what the machine allows"
-    )
-    bench.add_argument("--select", nargs="*", default=[], metavar="GROUP", help="of the table: springs, strict, start, ...")
-    compare = commands.add_parser("compare", help="one scene, several integrators: errors, costs and pictures")
-    compare.add_argument("--scene", default="stiff_sheet", metavar="NAME", help="see --list (default: stiff_sheet)")
-    compare.add_argument("--list", action="store_true", help="the scenes, and what each breaks")
-    compare.add_argument("--integrators", nargs="+", metavar="NAME", help="those to compare; all by default")
-    compare.add_argument("--out", type=Path, metavar="DIR", help="folder of the results (default: runs/compare_SCENE)")
-    compare.add_argument("--quick", action="store_true", help="fewer settings")
-    compare.add_argument("--fresh", action="store_true", help="measure again what the folder has")
-    view = commands.add_parser("view", help="a page in the browser, where cloth can be touched")
+    """Run a command; its exit status.  What was given wrongly ends with a sentence and status 2."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    try:
+        options.run(options)
+    except KeyboardInterrupt as stop:
+        progress.clear()
+        print("; ".join(["stopped", *getattr(stop, "__notes__", [])]), file=sys.stderr)
+        return STOPPED
+    return 0
+
+
+# --- options --------------------------------------------------------------------------------------------------------------
+
+
+def _parser() -> argparse.ArgumentParser:
+    called = "python -m clothgym" if Path(sys.argv[0]).name == "__main__.py" else "clothgym"
+    parser = argparse.ArgumentParser(prog=called, description="Cloth that is fast enough to learn on.")
+    parser.add_argument("--version", action="version", version=f"clothgym {clothgym.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+
+    def command(run: Callable[[argparse.Namespace], None], name: str, about: str) -> argparse.ArgumentParser:
+        made = commands.add_parser(name, help=about, description=f"{about[0].upper()}{about[1:]}.")
+        made.set_defaults(run=run, refuse=made.error)
+        return made
+
+    command(_list, "list", "environments, scenes, integrators and fabrics")
+
+    view = command(_view, "view", "a page in the browser, where cloth can be touched")
     view.add_argument(
         "what", nargs="?", default="", metavar="SCENE", help="a scene or an environment's id (default: patch); see list"
     )
     view.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone can reach it)")
-    view.add_argument("--port", type=int, default=8080, help="port, or the next that is free; 0 for any (default: 8080)")
     view.add_argument(
-        "--policy", nargs="+", default=[], metavar="RUN", help="folders of training runs, which then act in their tasks"
+        "--port", type=_integer(0, 65535), default=8080, help="port, or the next that is free; 0 for any (default: 8080)"
     )
-    view.add_argument("--replay", type=Path, metavar="FILE", help="a recording that the page saved (.npz), to be shown again")
-    export = commands.add_parser("export", help="a scene or an environment as a picture, a film or meshes for Blender")
-    export.add_argument("name", metavar="NAME", help="a scene or an environment id, see list")
-    export.add_argument("--out", required=True, help=".png, .gif, .mp4 or .glb; without an ending a folder of meshes")
-    export.add_argument("--kind", default="obj", help="of the meshes in a folder: obj (default) or glb")
-    export.add_argument("--seconds", type=float, help="5 of a scene, and all of an episode by default")
-    export.add_argument("--fps", type=float, help="frames a second (30 by default, or as many as there are)")
-    export.add_argument("--size", type=int, help="pixels of a side")
-    export.add_argument("--seed", type=int, default=0)
-    export.add_argument("--color", default="fabric", help="of pictures and films: fabric (default) or strain")
-    export.add_argument("--policy", default="expert", help="who acts: expert (default), nothing, chance, or a run's folder")
-    export.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings: gravity=3 fabric=silk wind=4 ...")
-    options = parser.parse_args(arguments)
-    if options.command == "list":
-        _list()
-    elif options.command == "export":
-        _export(options, export)
-    elif options.command == "warmup":
-        _warm_up(options.all)
-    elif options.command == "compare":
-        _compare(options, compare)
-    elif options.command == "view":
-        _view(options, view)
-    else:
-        _bench(options, bench)
-    return 0
+    view.add_argument(
+        "--policy", type=_actor, nargs="+", default=[], metavar="POLICY",
+        help="who acts in an environment: expert (default), noop, random, or the folders of training runs",
+    )  # fmt: skip
+    view.add_argument("--replay", type=_readable, metavar="FILE", help="a recording that the page saved (.npz), to be shown again")
+
+    export = command(_export, "export", "a scene or an environment as a picture, a film or meshes for Blender")
+    export.add_argument("name", metavar="NAME", help="a scene or an environment's id, see list")
+    export.add_argument(
+        "--out", required=True, type=_writable, help=".png, .gif, .mp4 or .glb; without an ending a folder of meshes"
+    )
+    export.add_argument("--kind", choices=("obj", "glb"), default="obj", help="of the meshes in a folder (default: obj)")
+    export.add_argument("--seconds", type=_positive, help="5 of a scene, and all of an episode by default")
+    export.add_argument("--fps", type=_positive, help="frames a second (30 by default, or as many as there are)")
+    export.add_argument("--size", type=_integer(1), help="pixels of a side")
+    export.add_argument("--seed", type=_integer(0), default=0)
+    export.add_argument("--color", choices=("fabric", "strain"), default="fabric", help="of pictures and films (default: fabric)")
+    export.add_argument(
+        "--policy", type=_actor, default="expert", help="who acts: expert (default), noop, random, or a run's folder"
+    )
+    export.add_argument(
+        "--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help="settings: gravity=3 fabric=silk wind=4 ..."
+    )
+
+    compare = command(_compare, "compare", "one scene, several integrators: errors, costs and pictures")
+    compare.add_argument("--scene", default="stiff_sheet", metavar="NAME", help="see --list (default: stiff_sheet)")
+    compare.add_argument("--list", action="store_true", help="the scenes, and what each breaks")
+    compare.add_argument("--integrators", nargs="+", metavar="NAME", help="those to compare; all by default")
+    compare.add_argument("--out", type=_writable, metavar="DIR", help="folder of the results (default: runs/compare_SCENE)")
+    compare.add_argument("--quick", action="store_true", help="fewer settings")
+    compare.add_argument("--fresh", action="store_true", help="measure again what the folder has")
+
+    bench = command(_bench, "bench", "measure speed on this machine")
+    bench.add_argument("--json", type=_writable, metavar="FILE", help="write the results there too")
+    extent = bench.add_mutually_exclusive_group()
+    extent.add_argument("--quick", action="store_true", help="fewer cases, in a minute or two")
+    extent.add_argument(
+        "--table", action="store_true", help="what everything costs, beside what is wanted and what the machine allows"
+    )
+    bench.add_argument("--select", nargs="+", default=[], metavar="GROUP", help="of the table: springs, strict, start, ...")
+
+    warmup = command(_warm_up, "warmup", "compile kernels now, so that nothing has to later")
+    warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; some minutes")
+    return parser
 
 
-def _list() -> None:
+def _integer(least: int, most: int | None = None) -> Callable[[str], int]:
+    span = f"of at least {least}" if most is None else f"from {least} to {most}"
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if value < least or (most is not None and value > most):
+            raise argparse.ArgumentTypeError(f"{text!r}: must be an integer {span}")
+        return value
+
+    return parse
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a positive number")
+    return value
+
+
+def _actor(text: str) -> str:
+    try:
+        return actor_named(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """``NAME=VALUE`` with a number where it is one."""
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be NAME=VALUE, for instance gravity=3")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def _readable(text: str) -> Path:
+    path = Path(text)
+    if not path.is_file() or not os.access(path, os.R_OK):
+        raise argparse.ArgumentTypeError(f"{text!r}: there is no such file that can be read")
+    return path
+
+
+def _writable(text: str) -> Path:
+    """A file or a folder that can be made, or written to."""
+    path = Path(text)
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text!r}: there is no folder {str(path.parent)!r}; make it, or name another")
+    place = path if path.exists() else path.parent
+    if not os.access(place, os.W_OK):
+        raise argparse.ArgumentTypeError(f"{text!r}: {str(place)!r} cannot be written; name another place")
+    return path
+
+
+# --- commands -------------------------------------------------------------------------------------------------------------
+
+
+def _list(options: argparse.Namespace) -> None:
     from clothgym.integrators import INTEGRATORS
     from clothgym.material import PRESETS
     from clothgym.playground.scenes import TITLES
-    from clothgym.registration import ENVIRONMENTS
 
-    print("environments")
-    for env_id in ENVIRONMENTS:
-        print(f"  clothgym:{env_id}")
-    print("scenes")
-    for name, title in TITLES.items():
-        print(f"  {name:<22} {title}")
-    print("integrators")
-    for name, integrator in INTEGRATORS.items():
-        order = f"order {integrator.order}" if integrator.order else "no order"
-        print(f"  {name:<22} {order}; a substep costs {integrator.cost}")
-    print("fabrics")
-    for name, material in PRESETS.items():
-        print(f"  {name:<22} {material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m")
+    orders = {name: f"order {method.order}" if method.order else "no order" for name, method in INTEGRATORS.items()}
+    sections = {
+        "environments": {f"clothgym:{env_id}": about for env_id, (_, about) in ENVIRONMENTS.items()},
+        "scenes": TITLES,
+        "integrators": {name: f"{orders[name]}; a substep costs {method.cost}" for name, method in INTEGRATORS.items()},
+        "fabrics": {
+            name: f"{material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m"
+            for name, material in PRESETS.items()
+        },
+    }
+    for title, lines in sections.items():
+        width = max(map(len, lines))
+        print(title, *(f"  {name:<{width}}  {about}" for name, about in lines.items()), sep="\n")
 
 
-def _warm_up(everything: bool) -> None:
+def _warm_up(options: argparse.Namespace) -> None:
     import gymnasium as gym
 
     from clothgym.bending import BENDING
     from clothgym.integrators import INTEGRATORS
     from clothgym.mesh import grid
-    from clothgym.registration import ENVIRONMENTS
     from clothgym.simulation import Simulation
+
+    def episode(env_id: str, **kwargs: Any) -> None:
+        """To the judgement: it has kernels too."""
+        env = gym.make(env_id, render_mode="rgb_array", **kwargs)
+        env.reset(seed=0)
+        while not env.step(env.unwrapped.expert_action())[2]:  # type: ignore[attr-defined]
+            pass
+        env.render()
+        env.close()
+
+    def step(integrator: str, bending: str, limit: float | None) -> None:
+        Simulation(grid(3, 3, 0.1, 0.1), integrator=integrator, bending=bending, strain_limit=limit, substeps=1000).step()
 
     begun = time.perf_counter()
     # wind and slipping have kernels of their own
-    cases: list[tuple[str, dict[str, Any]]] = [(env_id, {}) for env_id in ENVIRONMENTS]
-    cases += [("ClothReach-v0", {"wind": {"gust": 0.5}}), ("ClothDrapeGripper-v0", {"slip_force": 1.0})]
-    for env_id, kwargs in cases:
-        env = gym.make(env_id, render_mode="rgb_array", **kwargs)
-        env.reset(seed=0)
-        # to the judgement: it has kernels too
-        terminated = False
-        while not terminated:
-            _, _, terminated, _, _ = env.step(env.unwrapped.expert_action())  # type: ignore[attr-defined]
-        env.render()
-        env.close()
+    cases: list[tuple[Callable[..., None], str, dict[str, Any]]] = [(episode, env_id, {}) for env_id in ENVIRONMENTS]
+    cases += [(episode, "ClothReach-v0", {"wind": {"gust": 0.5}}), (episode, "ClothDrapeGripper-v0", {"slip_force": 1.0})]
     for integrator in INTEGRATORS:
-        for bending in BENDING if everything else ["springs"]:
-            for limit in (None, 0.1) if everything else [None]:
-                Simulation(grid(3, 3, 0.1, 0.1), integrator=integrator, bending=bending, strain_limit=limit, substeps=1000).step()
-    what = "all kernels are" if everything else "all kernels of the environments and of every integrator are"
+        for bending in BENDING if options.all else ["springs"]:
+            for limit in (None, 0.1) if options.all else [None]:
+                cases.append((step, integrator, {"bending": bending, "limit": limit}))
+    for place, (run, name, kwargs) in enumerate(cases):
+        progress.show(name, place, len(cases))
+        run(name, **kwargs)
+    progress.clear()
+    what = "all kernels are" if options.all else "all kernels of the environments and of every integrator are"
     print(f"{what} ready ({time.perf_counter() - begun:.1f} s)")
 
 
-def _bench(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+def _bench(options: argparse.Namespace) -> None:
+    if options.select and not options.table:
+        options.refuse("argument --select: its groups are those of the table: add --table")
+
     from clothgym.lab import bench, bench_table
 
     if options.table:
         try:
             results = bench_table.run(options.select)
         except ValueError as error:
-            parser.error(str(error))
+            options.refuse(f"argument --select: {error}")
         print(bench_table.table(results))
     else:
         results = bench.run(options.quick)
@@ -135,7 +248,7 @@ def _bench(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None
         print(f"written to {options.json}")
 
 
-def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+def _compare(options: argparse.Namespace) -> None:
     from clothgym.lab import compare
 
     if options.list:
@@ -144,48 +257,45 @@ def _compare(options: argparse.Namespace, parser: argparse.ArgumentParser) -> No
     try:
         plan = compare.plan(options.scene, options.integrators, options.quick)
     except ValueError as error:
-        parser.error(str(error))
+        options.refuse(str(error))
     folder = options.out or Path("runs") / f"compare_{options.scene}"
     print(compare.table(compare.run(plan, folder, options.fresh)))
     print(f"written to {folder}: results.json, table.txt, work_precision.png, sheets.png")
 
 
-def _view(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    from clothgym.playground.server import policies_of, serve
+def _view(options: argparse.Namespace) -> None:
+    from clothgym.playground.server import Gallery, free_port, policies_of, serve
 
+    actor = next((name for name in options.policy if name in ACTORS), "expert")
     try:
+        if options.what:
+            Gallery().checked(options.what)
+        free_port(options.host, options.port)
         start, policies = policies_of(options.policy, options.what)
-        playground = serve(start, options.host, options.port, options.replay, policies)
+        playground = serve(start, options.host, options.port, options.replay, policies, actor)
     except (ValueError, OSError, ImportError) as error:
-        parser.error(str(error))
+        options.refuse(str(error))
     try:
         while True:
             time.sleep(3600)
-    except KeyboardInterrupt:
-        print("closing")
     finally:
         playground.stop()
 
 
-def _export(options: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    from clothgym.playground.exporting import export, tell
+def _export(options: argparse.Namespace) -> None:
+    from clothgym.playground.exporting import export
 
     given = {name: getattr(options, name) for name in ("seconds", "fps", "size", "seed", "color", "kind", "policy")}
     try:
-        settings = dict(_setting(text) for text in options.set)
-        print(f"written: {export(options.name, options.out, settings=settings, say=tell, **given)}")
+        said = export(options.name, options.out, settings=dict(options.set), say=_frames, **given)
     except (ValueError, OSError, ImportError) as error:
-        parser.error(str(error))
-    except (RuntimeError, KeyboardInterrupt) as error:
-        raise SystemExit("\n" + "\n".join([str(error) or "stopped", *getattr(error, "__notes__", [])])) from None
+        options.refuse(str(error))
+    except RuntimeError as error:  # the sheet has burst
+        progress.clear()
+        raise SystemExit("\n".join([str(error), *getattr(error, "__notes__", [])])) from None
+    progress.clear()
+    print(f"written: {said}")
 
 
-def _setting(text: str) -> tuple[str, Any]:
-    """``NAME=VALUE`` with a number where it is one."""
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"--set {text!r}: must be NAME=VALUE, for instance gravity=3")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value
+def _frames(done: int, total: int) -> None:
+    progress.show("frames", done, total)

@@ -1,23 +1,40 @@
-"""Gymnasium ids and where their environments are.  Strings only: nothing is imported until ``make`` needs it."""
+"""Gymnasium ids, where their environments are, and who may act in them.  Strings only: ``make`` imports what it needs."""
 
 from __future__ import annotations
 
 import difflib
 from importlib import import_module
+from pathlib import Path
 
 import gymnasium as gym
 
+from clothgym.checks import known
+
+# the name that the classes of an id begin with, and the first line of their manual page
 ENVIRONMENTS = {
-    "ClothReach-v0": "ClothReach",
-    "ClothDrape-v0": "ClothDrape",
-    "ClothDrapeGripper-v0": "ClothDrapeGripper",
-    "ClothStrain-v0": "ClothStrain",
+    "ClothReach-v0": (
+        "ClothReach",
+        "Bring the free corner of a hanging sheet to a point where it can rest, and calm it there.",
+    ),
+    "ClothDrape-v0": (
+        "ClothDrape",
+        "Lay a hanging sheet over a target and let go of it.",
+    ),
+    "ClothDrapeGripper-v0": (
+        "ClothDrapeGripper",
+        "Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.",
+    ),
+    "ClothStrain-v0": (
+        "ClothStrain",
+        "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
+    ),
 }
+ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 
 
 def register() -> None:
     """Register every id once; importing the package again, as worker processes do, changes nothing."""
-    for env_id, name in ENVIRONMENTS.items():
+    for env_id, (name, _) in ENVIRONMENTS.items():
         if env_id not in gym.registry:
             gym.register(env_id, entry_point=f"clothgym.envs:{name}Env", vector_entry_point=f"clothgym.envs:{name}VectorEnv")
 
@@ -50,8 +67,19 @@ def checked_id(env_id: str) -> str:
         entry = gym.spec(name).entry_point
         creator = load_env_creator(entry) if isinstance(entry, str) else entry
         if not (isinstance(creator, type) and issubclass(creator, ClothEnv)):
-            known = ", ".join(ENVIRONMENTS)
+            ours = ", ".join(ENVIRONMENTS)
             raise ValueError(
-                f"environment {env_id!r} is no clothgym environment ({known}): its entry point must be a subclass of ClothEnv"
+                f"environment {env_id!r} is no clothgym environment ({ours}): its entry point must be a subclass of ClothEnv"
             )
     return bare
+
+
+def actor_named(name: str, *others: str) -> str:
+    """One of ``ACTORS`` or of the others, or a path that exists.
+
+    Raises:
+        ValueError: neither; the message lists them.
+    """
+    if not Path(name).exists():
+        known("policy", name, (*ACTORS, *others, "the folder of a training run"))
+    return name

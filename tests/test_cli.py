@@ -1,21 +1,205 @@
 """The command line."""
 
 import json
+import os
 import subprocess
 import sys
 
+import gymnasium as gym
 import pytest
 
-from clothgym import INTEGRATORS
+import clothgym.envs
+from clothgym import INTEGRATORS, Simulation, progress
 from clothgym.cli import main
 from clothgym.lab import bench
-from clothgym.registration import ENVIRONMENTS
+from clothgym.playground.episode import POLICIES
+from clothgym.playground.server import Gallery
+from clothgym.playground.stage import SceneStage
+from clothgym.registration import ACTORS, ENVIRONMENTS
+
+
+def test_no_command_prints_help_and_a_version_is_told(capsys):
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    assert all(f"    {command} " in out for command in ("list", "view", "export", "compare", "bench", "warmup"))
+    with pytest.raises(SystemExit) as caught:
+        main(["--version"])
+    assert caught.value.code == 0 and capsys.readouterr().out == f"clothgym {clothgym.__version__}\n"
+
+
+def test_the_program_is_called_as_it_was_called():
+    done = subprocess.run([sys.executable, "-m", "clothgym"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith("usage: python -m clothgym ") and not done.stderr
 
 
 def test_list_names_what_there_is(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in (*ENVIRONMENTS, *INTEGRATORS, "cotton"))
+    # an environment's line is the first of its page
+    for env_id, (name, _) in ENVIRONMENTS.items():
+        page = getattr(clothgym.envs, f"{name}Env").__doc__
+        (line,) = [line for line in out.splitlines() if f"clothgym:{env_id} " in line]
+        assert line.split(maxsplit=1)[1] == page.splitlines()[0]
+
+
+# --- what is wrong is refused -----------------------------------------------------------------------------------------------
+
+BY_VALUE = {
+    "fold": "choose from",
+    "--verson": "",
+    "view --port abc": "--port: 'abc': must be an integer from 0 to 65535",
+    "view --port 65536": "from 0 to 65535",
+    "view --replay gone.npz": "no such file",
+    "view --policy nothing": "no policy 'nothing' (there are: noop, random, expert, the folder of a training run)",
+    "export patch": "required: --out",
+    "export patch --out a.gif --seconds -1": "--seconds: '-1': must be a positive number",
+    "export patch --out a.gif --seconds nan": "must be a positive number",
+    "export patch --out a.gif --fps 0": "--fps: '0': must be a positive number",
+    "export patch --out a.gif --size 0": "--size: '0': must be an integer of at least 1",
+    "export patch --out a.gif --seed 1.5": "--seed: '1.5': must be an integer",
+    "export patch --out a.gif --color heat": "'heat' (choose from",
+    "export patch --out a.gif --kind stl": "'stl' (choose from",
+    "export patch --out a.gif --policy chance": "(there are: noop, random, expert, the folder of a training run)",
+    "export patch --out a.gif --policy exprt": "did you mean 'expert'?",
+    "export patch --out a.gif --set gravity": "must be NAME=VALUE",
+    "export patch --out gone/a.gif": "there is no folder 'gone'",
+    "compare --out gone/results": "there is no folder 'gone'",
+    "bench --json gone/bench.json": "there is no folder 'gone'",
+    "bench --quick --table": "not allowed with",
+    "bench --select springs": "add --table",
+}
+BY_NAME = {
+    "view flagg": "no scene or environment 'flagg'; did you mean 'flag'?",
+    "view --host 203.0.113.7": "cannot listen there",
+    "view --policy .": "lacks config.json",
+    "export ClothReech-v0 --out a.gif": "did you mean 'ClothReach-v0'?",
+    "export patch --out a.fbx": "must end in",
+    "export patch --out a.glb --color strain": "meshes have the fabric's colour alone",
+    "export patch --out a.gif --fps 100": "patch has 30 frames a second",
+    "export ClothReach-v0 --out a.gif --fps 100": "ClothReach-v0 has 15 frames a second",
+    "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",
+    "export ClothReach-v0 --out a.gif --set fabric=silc": "did you mean 'silk'?",
+    "export ClothReach-v0 --out a.gif --policy .": "lacks config.json",
+    "bench --table --select nonsense": "no group 'nonsense' (there are: springs",
+    "compare --scene stif_sheet": "did you mean 'stiff_sheet'?",
+    "compare --integrators verlett": "no integrator 'verlett'; did you mean 'verlet'?",
+}
+
+
+def refusal(capsys, *arguments):
+    """The sentence, of a command that ends as one with a wrong flag does."""
+    with pytest.raises(SystemExit) as caught:
+        main([*map(str, arguments)])
+    assert caught.value.code == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("usage: ") and "Traceback" not in said.err
+    return said.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("command", [*BY_VALUE, *BY_NAME])
+def test_what_is_wrong_is_refused_before_anything_is_simulated(command, tmp_path, monkeypatch, capsys):
+    def never(*args, **kwargs):
+        raise AssertionError("too late")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gym, "make", never)
+    monkeypatch.setattr(Simulation, "__init__", never)
+    sentence = refusal(capsys, *command.split())
+    assert " error: " in sentence and (BY_VALUE | BY_NAME)[command] in sentence
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_wrong_value_is_refused_without_numba_and_a_wrong_name_without_what_is_optional(tmp_path):
+    done = subprocess.run([sys.executable, "-c", REFUSALS], capture_output=True, text=True, timeout=120, cwd=tmp_path)
+    assert done.stdout.split() == [str(len(BY_VALUE)), str(len(BY_NAME))], done.stderr
+
+
+REFUSALS = f"""
+import sys
+from clothgym.cli import main
+def refused(commands, heavy):
+    refused = 0
+    for command in commands:
+        try:
+            main(command.split())
+        except SystemExit as end:
+            refused += end.code == 2
+        loaded = [module for module in heavy if module in sys.modules]
+        assert not loaded, (command, loaded)
+    print(refused)
+refused({list(BY_VALUE)}, ["numba", "clothgym.envs", "torch", "viser", "matplotlib"])
+refused({list(BY_NAME)}, ["torch", "stable_baselines3", "viser", "matplotlib", "imageio", "mujoco"])
+"""
+
+
+def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys):
+    """The user who runs the tests may be one who can write everywhere."""
+    (tmp_path / "there.json").write_text("{}")
+    monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.W_OK))
+    for name in ("there.json", "new.json"):
+        assert "cannot be written" in refusal(capsys, "bench", "--quick", "--json", tmp_path / name)
+    assert (tmp_path / "there.json").read_text() == "{}" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_the_same_words_say_everywhere_who_acts():
+    assert set(POLICIES) == set(ACTORS) == {"noop", "random", "expert"}
+    assert Gallery(actor="noop").open("ClothReach-v0").policy == "noop"
+    assert Gallery().open("ClothReach-v0").policy == "expert"
+
+
+# --- while it runs ----------------------------------------------------------------------------------------------------------
+
+
+def test_an_interrupted_command_ends_with_a_line(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("PIL")
+    real, frames = SceneStage.advance, []
+
+    def advance(stage):
+        if len(frames) == 3:
+            raise KeyboardInterrupt
+        frames.append(real(stage))
+        return frames[-1]
+
+    monkeypatch.setattr(SceneStage, "advance", advance)
+    assert main(["export", "patch", "--out", str(tmp_path / "a.gif"), "--size", "32"]) == 130
+    said = capsys.readouterr()
+    (line,) = [line for line in said.err.splitlines() if "compiling" not in line]
+    assert line.startswith("stopped; ") and str(tmp_path / "a.part.gif") in line and said.out == ""
+
+
+def test_a_line_counts_steps_on_a_terminal_and_nowhere_else(monkeypatch, capsys):
+    progress.show("springs", 3, 12)
+    progress.clear()
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    progress.show("springs", 3, 12)
+    assert capsys.readouterr().err == "\r" + f"{'#####---------------'} 3 of 12  springs".ljust(78)
+    progress.show("frames", 7)
+    progress.show("a long name " * 20)
+    assert [line.rstrip() for line in capsys.readouterr().err.split("\r")[1:]] == ["7  frames", ("a long name " * 20)[:78].rstrip()]
+    progress.clear()
+    assert capsys.readouterr().err == "\r" + " " * 78 + "\r"
+
+
+def test_bench_says_what_it_is_at(monkeypatch, capsys):
+    """The name of each case is on the terminal before it is measured."""
+    seen = []
+
+    def cases(quick):
+        for name in ("one", "two"):
+            yield name, lambda: [{"start": seen.append(capsys.readouterr().err)}]
+
+    for section in ("start_cases", "env_cases", "core_cases"):
+        monkeypatch.setattr(bench, section, cases)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    results = bench.run(quick=True)
+    assert [len(results[section]) for section in ("start", "environments", "core")] == [2, 2, 2]
+    told = [text.split("\r")[-1].rstrip() for text in seen]
+    assert [text.split("  ")[1] for text in told] == [
+        f"{s}: {n}" for s in ("start", "environments", "core") for n in ("one", "two")
+    ]
+    assert [text.split("  ")[0][-6:] for text in told] == ["0 of 2", "1 of 2"] * 3
 
 
 def test_warmup_says_when_it_is_done(capsys):
@@ -44,7 +228,8 @@ def test_bench_writes_what_it_prints(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench, "seconds_per_call", lambda call, budget=0.5: (call(), 0.5)[1])
     assert main(["bench", "--quick", "--json", str(tmp_path / "bench.json")]) == 0
     results = json.loads((tmp_path / "bench.json").read_text())
-    out = capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "\r" not in err  # no terminal looks on
     assert results["machine"]["versions"]["clothgym"] and "ns/spring" in out
     measured = {(row["environment"], row["envs"]) for row in results["environments"]}
     assert measured == {(env_id, envs) for env_id in ENVIRONMENTS for envs in (1, 64, 256)}
@@ -52,9 +237,3 @@ def test_bench_writes_what_it_prints(tmp_path, capsys, monkeypatch):
     row = next(row for row in results["core"] if row["grid"] == "25x25" and row["envs"] == 64)
     assert row["frames/s"] == 128
     assert row["ns/spring"] == pytest.approx(0.5 * row["threads"] / (64 * row["substeps"] * 3502) * 1e9)
-
-
-def test_a_wrong_command_lists_the_right_ones(capsys):
-    with pytest.raises(SystemExit):
-        main(["fold"])
-    assert "warmup" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import pytest
 from test_export import read, shown
 
 from clothgym.cli import main
+from clothgym.playground import exporting
 from clothgym.playground.exporting import moments, stage_named
 from clothgym.playground.pictures import lasting, painter, strain_shares
 from clothgym.playground.scenes import scene_named
@@ -18,13 +19,6 @@ SHORT = ["--seconds", "0.2"]  # six frames
 
 def export(*arguments):
     assert main(["export", *map(str, arguments)]) == 0
-
-
-def refusal(capsys, *arguments):
-    with pytest.raises(SystemExit) as caught:
-        main(["export", *map(str, arguments)])
-    assert caught.value.code == 2
-    return capsys.readouterr().err
 
 
 def by_hand(frames):
@@ -57,9 +51,9 @@ def test_films_and_pictures_have_the_frames_and_pixels_asked_for(tmp_path):
     assert shown(tmp_path / "a.gif", 64, 64).shape == (6, 64, 64, 3)
     export("patch", "--out", tmp_path / "b.gif", "--size", 64, "--fps", 10, *SHORT)
     assert len(shown(tmp_path / "b.gif", 64, 64)) == 2
-    export("ClothReach-v0", "--out", tmp_path / "c.png", "--size", 64, "--seed", 3, "--policy", "nothing", *SHORT)
+    export("ClothReach-v0", "--out", tmp_path / "c.png", "--size", 64, "--seed", 3, "--policy", "noop", *SHORT)
     picture = pytest.importorskip("PIL.Image").open(tmp_path / "c.png")
-    stage = stage_named("ClothReach-v0", 3, "nothing")
+    stage = stage_named("ClothReach-v0", 3, "noop")
     for _ in range(round(0.2 / stage.recording.time_step)):
         stage.advance()
     np.testing.assert_array_equal(np.asarray(picture), painter(stage.recording, 64, 3)(stage.frame))
@@ -114,23 +108,30 @@ def test_a_burst_says_why_and_keeps_what_came_before(tmp_path, ending):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("options", "message"),
     [
-        (["flagg"], "no scene or environment 'flagg'; did you mean 'flag'?"),
-        (["patch", "--out", "a.fbx"], "must end in .png, .gif, .mp4 or .glb"),
-        (["patch", "--fps", "100"], "fps=100.0: Pinned patch has 30 frames a second"),
-        (["patch", "--seconds", "-1"], "seconds=-1.0: must be positive"),
-        (["patch", "--size", "0"], "size=0: must be an integer"),
-        (["patch", "--color", "heat"], "color='heat': must be 'fabric' or 'strain'"),
-        (["patch", "--out", "a.glb", "--color", "strain"], "meshes only have the fabric's color"),
-        (["patch", "--kind", "stl"], "kind='stl': must be 'obj' or 'glb'"),
-        (["patch", "--set", "gravity"], "'gravity': must be NAME=VALUE"),
-        (["patch", "--set", "gravty=1"], "no setting 'gravty'; did you mean 'gravity'?"),
-        (["ClothReach-v0", "--policy", "."], "which holds config.json"),
-        (["ClothReach-v0", "--policy", "exprt"], "no policy 'exprt'; did you mean 'expert'?"),
+        ({"fps": 100.0}, "fps=100.0: patch has 30 frames a second"),
+        ({"seconds": -1.0}, "seconds=-1.0: must be positive"),
+        ({"size": 0}, "size=0: must be an integer"),
+        ({"color": "heat"}, "color='heat': must be 'fabric' or 'strain'"),
+        ({"kind": "stl"}, "kind='stl': must be 'obj' or 'glb'"),
+        ({"policy": "nobody"}, "no policy 'nobody'"),
+        ({"settings": {"gravty": 1}}, "no setting 'gravty'"),
     ],
 )
-def test_wrong_exports_are_refused_with_a_sentence(tmp_path, monkeypatch, capsys, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    assert message in refusal(capsys, *arguments, *([] if "--out" in arguments else ["--out", "a.gif"]))
+def test_wrong_options_are_refused_before_a_stage_is_made(tmp_path, monkeypatch, options, message):
+    monkeypatch.setattr(exporting, "SceneStage", None)
+    with pytest.raises(ValueError, match=message):
+        exporting.export("patch", tmp_path / "a.gif", **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_holds_frames_and_a_missing_library_are_told_before_a_stage_is_made(tmp_path, monkeypatch):
+    monkeypatch.setattr(exporting, "SceneStage", None)
+    (tmp_path / "frame_00000.obj").touch()
+    with pytest.raises(FileExistsError, match="holds 1 frames already"):
+        exporting.export("patch", tmp_path)
+    monkeypatch.setattr(exporting, "find_spec", lambda name: None)
+    for ending, library in (("gif", "PIL"), ("mp4", "imageio_ffmpeg")):
+        with pytest.raises(ImportError, match=f"needs {library}: pip install"):
+            exporting.export("patch", tmp_path / f"a.{ending}")

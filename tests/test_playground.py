@@ -303,7 +303,7 @@ def test_an_environment_is_played_by_its_expert_and_its_frames_are_the_environme
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_a_dragged_hand_goes_to_the_visitor(env_id):
-    stage = EpisodeStage(env_id, policy="nothing")
+    stage = EpisodeStage(env_id, policy="noop")
     place = stage.hands()[0].position + (0.0, 0.0, 0.1)
     stage.drag(0, place)
     advanced(stage, 12)
@@ -311,7 +311,7 @@ def test_a_dragged_hand_goes_to_the_visitor(env_id):
 
 
 def test_settings_reach_an_episode_and_stay_through_a_reset():
-    stage = advanced(EpisodeStage("ClothReach-v0", policy="nothing"), 3)
+    stage = advanced(EpisodeStage("ClothReach-v0", policy="noop"), 3)
     stage.change(gravity=1.0, stretch_stiffness=100.0)
     for _ in range(2):
         state = stage.simulation.get_state()
@@ -326,7 +326,7 @@ def test_settings_reach_an_episode_and_stay_through_a_reset():
 
 
 def test_wind_begins_an_episode_anew_and_blows_in_it():
-    stage = advanced(EpisodeStage("ClothReach-v0", policy="nothing"), 3)
+    stage = advanced(EpisodeStage("ClothReach-v0", policy="noop"), 3)
     stage.change(wind=3.0)
     assert "begun again" in stage.notes["anew"] and stage.frame.time == 0
     advanced(stage, 1)
@@ -334,7 +334,7 @@ def test_wind_begins_an_episode_anew_and_blows_in_it():
 
 
 def test_an_environments_own_wind_is_on_the_sliders_and_can_be_stilled():
-    stage = EpisodeStage("ClothStrain-v0", policy="nothing")
+    stage = EpisodeStage("ClothStrain-v0", policy="noop")
     assert (stage.settings.wind, stage.settings.gust) == (1.0, 0.3) and "draws its wind" in stage.notes["air"]
     stage.change(bending="hinge")
     assert stage.env.task.wind.gust == 0.3 and tuple(stage.env.task.wind.speed) == (0.0, 1.0)
@@ -377,7 +377,7 @@ def test_a_policy_that_raises_and_a_recording_without_readings_are_told_on_the_p
     visitor.tick()
     assert not visitor.playing and len(client.notifications) == 1
     assert "RuntimeError, no weights" in client.notifications[0] and "no weights" in capsys.readouterr().err
-    visitor.controls["policy"].turn("nothing")
+    visitor.controls["policy"].turn("noop")
     visitor.controls["time"].turn("play / pause")
     visitor.tick()
     assert len(visitor.stage.recording.frames) == 2

@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -22,13 +23,14 @@ import numba
 import numpy as np
 
 import clothgym
-from clothgym import _jit
+from clothgym import _jit, progress
 from clothgym.integrators import INTEGRATORS
 from clothgym.mesh import grid
 from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
 
 Row = dict[str, Any]
+Case = tuple[str, Callable[[], list[Row]]]  # what is measured, and its rows
 
 
 def machine() -> Row:
@@ -63,73 +65,89 @@ def seconds_per_call(call: Callable[[], object], budget: float = 0.5) -> float:
     return statistics.median(times)
 
 
-def core_rows(quick: bool) -> Iterator[Row]:
+def core_cases(quick: bool) -> Iterator[Case]:
     """A sheet of a metre, hanging from two corners in air at 60 Hz, with automatic substeps."""
-    sides = (17, 25) if quick else (13, 17, 25, 35, 50)
-    batches = (1, 64) if quick else (1, 16, 64, 256)
     for integrator in INTEGRATORS:
-        for side in sides:
-            mesh = grid(side, side, 1.0, 1.0)
-            for num_envs in batches:
+        for side in (17, 25) if quick else (13, 17, 25, 35, 50):
+            for num_envs in (1, 64) if quick else (1, 16, 64, 256):
                 for threads in sorted({1, _jit.default_threads()}) if num_envs > 16 else (1,):
-                    s = Simulation(mesh, num_envs=num_envs, integrator=integrator, anchors=mesh.corners[2:], threads=threads)
-                    seconds = seconds_per_call(s.step, 0.2 if quick else 0.5)
-                    work = num_envs * s.substeps
-                    yield {
-                        "integrator": integrator,
-                        "grid": f"{side}x{side}",
-                        "envs": num_envs,
-                        "threads": threads,
-                        "substeps": s.substeps,
-                        "frames/s": num_envs / seconds,
-                        "particle-substeps/s": work * mesh.num_particles / seconds,
-                        "ns/spring": seconds * threads / (work * len(mesh.springs.kind)) * 1e9,
-                    }
+                    what = f"{integrator}, {side} x {side} particles, sheets {num_envs}, threads {threads}"
+                    yield what, partial(core_row, integrator, side, num_envs, threads, 0.2 if quick else 0.5)
 
 
-def env_rows(quick: bool) -> Iterator[Row]:
+def core_row(integrator: str, side: int, num_envs: int, threads: int, budget: float) -> list[Row]:
+    mesh = grid(side, side, 1.0, 1.0)
+    s = Simulation(mesh, num_envs=num_envs, integrator=integrator, anchors=mesh.corners[2:], threads=threads)
+    seconds = seconds_per_call(s.step, budget)
+    work = num_envs * s.substeps
+    return [
+        {
+            "integrator": integrator,
+            "grid": f"{side}x{side}",
+            "envs": num_envs,
+            "threads": threads,
+            "substeps": s.substeps,
+            "frames/s": num_envs / seconds,
+            "particle-substeps/s": work * mesh.num_particles / seconds,
+            "ns/spring": seconds * threads / (work * len(mesh.springs.kind)) * 1e9,
+        }
+    ]
+
+
+def env_cases(quick: bool) -> Iterator[Case]:
     """Environment steps a second with random actions, resets and rewards included, by batch size."""
     for env_id in ENVIRONMENTS:
-        env = gym.make(env_id)
-        env.reset(seed=0)
-        env.action_space.seed(0)
-
-        def steps_of_one(env: gym.Env = env) -> None:
-            for _ in range(100):
-                if env.step(env.action_space.sample())[2]:
-                    env.reset()
-
-        seconds = seconds_per_call(steps_of_one, 1.0) / 100
-        yield {"environment": env_id, "envs": 1, "threads": 1, "env-steps/s": 1 / seconds}
+        yield f"{env_id}, alone", partial(env_row, env_id)
         for num_envs in (64, 256) if quick else (16, 64, 256, 1024):
             for threads in sorted({1, _jit.default_threads()}):
-                vector = gym.make_vec(env_id, num_envs=num_envs, threads=threads, autoreset_mode="SameStep")
-                vector.reset(seed=0)
-                actions = np.random.default_rng(0).uniform(-1, 0.81, vector.action_space.shape)
                 steps = max(1, (20 if quick else 100) * 64 // num_envs)
-                seconds = seconds_per_call(lambda v=vector, a=actions, n=steps: [v.step(a) for _ in range(n)], 1.0)  # type: ignore[misc]
-                yield {
-                    "environment": env_id,
-                    "envs": num_envs,
-                    "threads": threads,
-                    "env-steps/s": num_envs * steps / seconds,
-                }
+                what = f"{env_id}, environments {num_envs}, threads {threads}"
+                yield what, partial(batch_row, env_id, num_envs, threads, steps)
+
+
+def env_row(env_id: str) -> list[Row]:
+    env = gym.make(env_id)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+
+    def steps_of_one() -> None:
+        for _ in range(100):
+            if env.step(env.action_space.sample())[2]:
+                env.reset()
+
+    seconds = seconds_per_call(steps_of_one, 1.0) / 100
+    return [{"environment": env_id, "envs": 1, "threads": 1, "env-steps/s": 1 / seconds}]
+
+
+def batch_row(env_id: str, num_envs: int, threads: int, steps: int) -> list[Row]:
+    vector = gym.make_vec(env_id, num_envs=num_envs, threads=threads, autoreset_mode="SameStep")
+    vector.reset(seed=0)
+    actions = np.random.default_rng(0).uniform(-1, 0.81, vector.action_space.shape)
+    seconds = seconds_per_call(lambda: [vector.step(actions) for _ in range(steps)], 1.0)
+    return [{"environment": env_id, "envs": num_envs, "threads": threads, "env-steps/s": num_envs * steps / seconds}]
 
 
 FIRST_STEP = "import gymnasium as gym; e = gym.make('clothgym:{}'); e.reset(seed=0); e.step(e.action_space.sample())"
 
 
-def start_rows(quick: bool) -> Iterator[Row]:
+def start_cases(quick: bool) -> Iterator[Case]:
     """Seconds from the start of Python to its end, whole process: the first step cold and warm, and bare imports."""
     runs = 3 if quick else 7
-    yield {"start": "import numba, gymnasium", "seconds": _process_seconds("import numba, gymnasium", runs)}
-    yield {"start": "import clothgym", "seconds": _process_seconds("import clothgym", runs)}
+    for code in ("import numba, gymnasium", "import clothgym"):
+        yield code, partial(import_row, code, runs)
     for env_id in ENVIRONMENTS:
-        code = FIRST_STEP.format(env_id)
-        with tempfile.TemporaryDirectory() as folder:
-            cold = _process_seconds(code, 1, CLOTHGYM_CACHE_DIR=folder)
-            yield {"start": f"{env_id}, first step, cold cache", "seconds": cold}
-            yield {"start": f"{env_id}, first step, warm cache", "seconds": _process_seconds(code, runs, CLOTHGYM_CACHE_DIR=folder)}
+        yield f"{env_id}, first step, cold and warm", partial(first_step_rows, env_id, runs)
+
+
+def import_row(code: str, runs: int) -> list[Row]:
+    return [{"start": code, "seconds": _process_seconds(code, runs)}]
+
+
+def first_step_rows(env_id: str, runs: int) -> list[Row]:
+    code = FIRST_STEP.format(env_id)
+    with tempfile.TemporaryDirectory() as folder:
+        times = {cache: _process_seconds(code, n, CLOTHGYM_CACHE_DIR=folder) for cache, n in (("cold", 1), ("warm", runs))}
+    return [{"start": f"{env_id}, first step, {cache} cache", "seconds": seconds} for cache, seconds in times.items()]
 
 
 def _process_seconds(code: str, runs: int, **environment: str) -> float:
@@ -143,14 +161,15 @@ def _process_seconds(code: str, runs: int, **environment: str) -> float:
 
 def run(quick: bool = False) -> dict[str, Any]:
     """All measurements, with the machine's description."""
-    sections = {"start": start_rows, "environments": env_rows, "core": core_rows}
+    sections = {"start": start_cases, "environments": env_cases, "core": core_cases}
     results: dict[str, Any] = {"machine": machine()}
-    for name, rows in sections.items():
+    for name, cases_of in sections.items():
         results[name] = []
-        for row in rows(quick):
-            results[name].append(row)
-            print(f"\r{name}: {len(results[name])} cases", end="", file=sys.stderr, flush=True)
-        print(file=sys.stderr)
+        cases = list(cases_of(quick))
+        for place, (what, rows_of) in enumerate(cases):
+            progress.show(f"{name}: {what}", place, len(cases))
+            results[name] += rows_of()
+    progress.clear()
     return results
 
 

@@ -11,13 +11,14 @@ take turns with what they are compared with, frame by frame, and each of their r
 from __future__ import annotations
 
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
+from clothgym import progress
+from clothgym.checks import known
 from clothgym.lab.bench import machine
 from clothgym.lab.bench_limits import PlainSheet, Work, measure_limits, stand
 
@@ -92,7 +93,7 @@ def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
             begun = time.thread_time()
             case.call()
             times[case].append(time.thread_time() - begun)
-        tell(f"round {turn + 1} of {rounds}, {len(cases)} cases")
+        progress.show(f"rounds of {len(cases)} cases", turn + 1, rounds)
     return {case: statistics.median(taken) for case, taken in times.items()}
 
 
@@ -139,11 +140,7 @@ def pace() -> Pace:
 def beat(text: str) -> None:
     """Show progress, and sample the machine's speed."""
     pace().sample()
-    tell(text)
-
-
-def tell(text: str) -> None:
-    print(f"\r{text:<78}", end="", file=sys.stderr, flush=True)
+    progress.show(text)
 
 
 def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]:
@@ -155,11 +152,10 @@ def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]
     from clothgym.lab.bench_cases import GROUPS as SHORT  # imported here: these modules import this one
     from clothgym.lab.bench_episodes import GROUPS as LONG
 
-    known = {**SHORT, **LONG}
+    groups = {**SHORT, **LONG}
     for name in select:
-        if name not in known:
-            raise ValueError(f"no group {name!r} (there are: {', '.join(known)})")
-    chosen = list(select) or list(known)
+        known("group", name, groups)
+    chosen = list(select) or list(groups)
     results: dict[str, Any] = {"machine": machine(), "limits": measure_limits(), "rows": []}
     cases = with_what_they_need(case for name in chosen if name in SHORT for case in SHORT[name]())
     if cases:
@@ -172,7 +168,7 @@ def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]
             beat(name)
             plain = pace().take()
             results["rows"] += [row | {"plain step ns": plain} for row in rows]
-    tell("")
+    progress.clear()
     return results
 
 

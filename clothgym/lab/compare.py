@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym import progress
 from clothgym.lab import compare_pictures
 from clothgym.lab.bench import machine
 from clothgym.lab.compare_plan import LANES, Plan, Row, Setting, described, sheet_name
@@ -163,23 +164,24 @@ def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
     scene, settings, shown = plan.scene, plan.settings(), plan.shown()
     record = Record(folder, scene, fresh)
     if record.results["reference"] is None:
-        _tell(f"{scene.name}: converging the reference")
+        progress.show(f"{scene.name}: converging the reference")
         record.sheets["reference"], record.results["reference"] = reference(scene)
         record.write()
     for place, setting in enumerate(settings):
         if record.find(setting) is None:
-            _tell(f"{scene.name}: error {place + 1} of {len(settings)}, {sheet_name(setting)}")
+            progress.show(f"{scene.name}: error of {sheet_name(setting)}", place, len(settings))
             row, sheet = measure(scene, setting, record.sheets["reference"], record.results["reference"])
             if sheet is not None and setting in shown:
                 record.sheets[sheet_name(setting)] = sheet
             record.results["rows"].append(row)
             record.write()
     rows = [row for row in map(record.find, settings) if row is not None]
-    for group in _to_be_timed(rows):
-        _tell(f"{scene.name}: cost of {len(group)} settings with {group[0]['substeps']} substeps")
+    groups = list(_to_be_timed(rows))
+    for place, group in enumerate(groups):
+        progress.show(f"{scene.name}: cost of {len(group)} settings with {group[0]['substeps']} substeps", place, len(groups))
         add_costs(scene, group)
         record.write()
-    print(file=sys.stderr)
+    progress.clear()
     results = record.results | {"rows": rows}
     (folder / "table.txt").write_text(table(results) + "\n")
     compare_pictures.draw_work_precision(results, folder / "work_precision.png")
@@ -194,10 +196,6 @@ def _to_be_timed(rows: Sequence[Row]) -> Iterator[list[Row]]:
         group = [row for row in rows if row["substeps"] == substeps and row["stable"] and "ms_batch" not in row]
         if group:
             yield group
-
-
-def _tell(text: str) -> None:
-    print(f"\r{text:<79}", end="", file=sys.stderr, flush=True)
 
 
 # --- as text ------------------------------------------------------------------------------------------------------------

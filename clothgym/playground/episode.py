@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import indices, vector
+from clothgym.checks import indices, known, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.envs.definition import HELD
 from clothgym.envs.episode import within_ball
@@ -18,7 +18,7 @@ from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stability, visible
 from clothgym.playground.world import FIGURES as SLIDERS
-from clothgym.playground.world import Settings, hint
+from clothgym.playground.world import Settings
 from clothgym.registration import checked_id
 from clothgym.render import Solid
 from clothgym.render.renderer import MARKER_RADIUS
@@ -37,17 +37,17 @@ def expert(env: Any, observation: NDArray) -> NDArray:
     return env.expert_action()
 
 
-def nothing(env: Any, observation: NDArray) -> NDArray:
+def noop(env: Any, observation: NDArray) -> NDArray:
     """What keeps the hands where they are."""
     return np.zeros(env.action_space.shape, np.float32)
 
 
-def chance(env: Any, observation: NDArray) -> NDArray:
+def random(env: Any, observation: NDArray) -> NDArray:
     """Random actions, drawn from the action space's own generator."""
     return env.action_space.sample()
 
 
-POLICIES: dict[str, Policy] = {"expert": expert, "nothing": nothing, "chance": chance}
+POLICIES: dict[str, Policy] = {"expert": expert, "noop": noop, "random": random}
 
 
 class EpisodeStage(Stage):
@@ -55,7 +55,7 @@ class EpisodeStage(Stage):
 
     Args:
         env_id: a registered id, with or without its namespace.
-        policies: who may act, by name, besides the expert, chance and nobody.
+        policies: who may act, by name, besides those of ``POLICIES``.
         policy: who does at first.
 
     Raises:
@@ -100,8 +100,7 @@ class EpisodeStage(Stage):
         Raises:
             ValueError: nobody has that name.
         """
-        if policy not in self.policies:
-            raise ValueError(f"no policy {policy!r}{hint(policy, self.policies)} (there are: {', '.join(self.policies)})")
+        known("policy", policy, self.policies)
         trained = getattr(self.policies[policy], "env_kwargs", None)
         if trained is not None and trained != self._given:
             self._begin(trained)

@@ -3,42 +3,48 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import count, one_of, positive
 from clothgym.playground.episode import EpisodeStage
 from clothgym.playground.pictures import joined, painter, together, write_moving_mesh
-from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.scenes import SCENES
+from clothgym.playground.recording import Frame
+from clothgym.playground.scenes import SCENES, scene_named
 from clothgym.playground.server import Gallery, policies_of
-from clothgym.playground.stage import SceneStage, Stage
+from clothgym.playground.stage import STEPS, SceneStage, Stage
+from clothgym.playground.world import FRAME, Settings
+from clothgym.registration import ACTORS, actor_named
 from clothgym.render import MeshSequence, write_picture, write_video
-from clothgym.render.meshes import KINDS
+from clothgym.render.meshes import KINDS, without_frames
 from clothgym.simulation import GRAVITY
 
 SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
+NEEDED = {".png": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
 Say = Callable[[int, int], None]
 
 
 def stage_named(name: str, seed: int = 0, policy: str = "expert", settings: Mapping[str, Any] | None = None) -> Stage:
     """A scene of the playground or an environment, at its start.
 
-    policy: who acts in an environment: "expert", "nothing", "chance", or the folder of a training run.  settings: of the
-    playground, in place of the scene's own; a scene that begins without gravity gets it.
+    policy: who acts in an environment: "expert", "noop", "random", or the folder of a training run.  settings: of the
+    playground, in place of the scene's own; a scene that begins without gravity gets it.  All are checked before the stage is made.
 
     Raises:
         ValueError, FileNotFoundError: an unknown scene, environment or policy, or an invalid setting.
         ImportError: a trained policy needs Stable-Baselines3, and it is missing.
     """
-    changes, runs = dict(settings or {}), [policy] if Path(policy).is_dir() else []
+    bare, changes = Gallery().checked(name), dict(settings or {})
+    scene = scene_named(bare) if bare in SCENES else None
+    (scene.settings if scene else Settings()).changed(**changes)
+    runs = [] if actor_named(policy) in ACTORS else [policy]
     _, learnt = policies_of(runs, name)
-    bare = Gallery().checked(name)
     if bare in SCENES:
         stage: Stage = SceneStage(bare, seed=seed)
         if stage.settings.gravity == 0:
@@ -63,7 +69,7 @@ def moments(stage: Stage, seconds: float | None = None, fps: float | None = None
         ValueError: fps is more than the stage has.
         RuntimeError: the sheet has blown up; the frames before it have been given.
     """
-    stride = stride_for(stage.recording, fps)
+    stride = stride_for(stage.recording.title, stage.recording.time_step, fps)
     if seconds is None and isinstance(stage, SceneStage):
         seconds = SECONDS
     total = 0 if seconds is None else max(1, math.ceil(positive("seconds", seconds) / (stride * stage.recording.time_step)))
@@ -81,14 +87,23 @@ def moments(stage: Stage, seconds: float | None = None, fps: float | None = None
             raise RuntimeError(stage.notes["burst"].replace("**", ""))
 
 
-def stride_for(recording: Recording, fps: float | None) -> int:
-    """Frames of a recording for one of a film that shows ``fps`` a second, or the next higher rate that divides its own; None
-    for 30 a second, or its own if that is less."""
-    own = 1 / recording.time_step
+def stride_for(title: str, time_step: float, fps: float | None) -> int:
+    """Frames of a stage, a time step [s] apart, for one of a film that shows ``fps`` a second, or the next higher rate that
+    divides its own; None for 30 a second, or its own if that is less."""
+    own = 1 / time_step
     fps = min(FPS, own) if fps is None else fps
     if positive("fps", fps) > 1.01 * own:
-        raise ValueError(f"fps={fps!r}: {recording.title} has {own:.4g} frames a second; ask for that or fewer")
+        raise ValueError(f"fps={fps!r}: {title} has {own:.4g} frames a second; ask for that or fewer")
     return max(1, int(1.01 * own / fps))
+
+
+def time_step_of(name: str) -> float:
+    """Of the frames of a scene or an environment [s]."""
+    if name in SCENES:
+        return STEPS * FRAME
+    entry: Any = gym.spec(name).entry_point
+    environment = gym.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
+    return environment.task_class.physics.time_step  # type: ignore[attr-defined]
 
 
 def export(
@@ -129,11 +144,19 @@ def export(
         raise ValueError(f"color={color!r}: meshes only have the fabric's color; ask for a picture or a film")
     side = count("size", size if size is not None else PICTURE if path.suffix == ".png" else SIZE)
     one_of("kind", kind, *KINDS)
+    one_of("color", color, "fabric", "strain")
+    if path.suffix == "":
+        without_frames(path)
+    if path.suffix in NEEDED and find_spec(NEEDED[path.suffix]) is None:
+        raise ImportError(f"out={str(out)!r}: a {path.suffix} needs {NEEDED[path.suffix]}: pip install 'clothgym[video]'")
+    if seconds is not None:
+        positive("seconds", seconds)
+    step = time_step_of(Gallery().checked(name))
+    rate = 1 / (step * stride_for(name, step, fps))
     stage = stage_named(name, seed, policy, settings)
     recording = stage.recording
-    rate = 1 / (recording.time_step * stride_for(recording, fps))
     if path.suffix == ".png" and seconds is not None:
-        seconds = positive("seconds", seconds) + 1 / rate  # the first frame is at 0
+        seconds += 1 / rate  # the first frame is at 0
     frames = moments(stage, seconds, fps, say)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == "":
@@ -168,11 +191,3 @@ def export(
 
     write_video(path, film(), rate)
     return f"{path}: {drawn} frames, {drawn / rate:.3g} s"
-
-
-def tell(done: int, total: int) -> None:
-    """Count frames on a line, if stderr is a terminal."""
-    if sys.stderr.isatty():
-        print(f"\r{done} frames" if not total else f"\r{done} of {total} frames", end="", file=sys.stderr, flush=True)
-        if done == total:
-            print(file=sys.stderr)

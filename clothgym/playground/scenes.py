@@ -7,9 +7,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import known
 from clothgym.collisions import Box, Capsule, MeshCollider, Plane, Sphere
 from clothgym.mesh import ClothMesh, grid
-from clothgym.playground.world import Scene, Settings, Targets, hint
+from clothgym.playground.world import Scene, Settings, Targets
 from clothgym.render import Camera, Solid
 
 STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colors of solids
@@ -246,6 +247,5 @@ def scene_named(name: str) -> Scene:
     Raises:
         ValueError: there is none; the message lists those that there are.
     """
-    if name not in SCENES:
-        raise ValueError(f"no scene {name!r}{hint(name, SCENES)} (there are: {', '.join(SCENES)})")
+    known("scene", name, SCENES)
     return SCENES[name]()

@@ -18,14 +18,15 @@ from typing import Any
 import gymnasium as gym
 from numpy.typing import NDArray
 
+from clothgym.adapters import runs
+from clothgym.checks import known
 from clothgym.playground.episode import EpisodeStage, Policy, Replay
 from clothgym.playground.page import Page
 from clothgym.playground.recording import Recording
 from clothgym.playground.scenes import SCENES, TITLES
 from clothgym.playground.show import furnish
 from clothgym.playground.stage import SceneStage, Stage
-from clothgym.playground.world import hint
-from clothgym.registration import ENVIRONMENTS, checked_id
+from clothgym.registration import ACTORS, ENVIRONMENTS, checked_id
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
@@ -39,10 +40,16 @@ class Gallery:
     Args:
         recording: to show again.
         policies: policies for each environment besides its expert, by id and then by name.
+        actor: who acts at first in an environment without such a policy.
     """
 
-    def __init__(self, recording: Recording | None = None, policies: Mapping[str, Mapping[str, Policy]] | None = None) -> None:
-        self.recording, self.policies = recording, policies or {}
+    def __init__(
+        self,
+        recording: Recording | None = None,
+        policies: Mapping[str, Mapping[str, Policy]] | None = None,
+        actor: str = "expert",
+    ) -> None:
+        self.recording, self.policies, self.actor = recording, policies or {}, actor
         self.titles = {title: name for name, title in TITLES.items()} | {env_id: env_id for env_id in ENVIRONMENTS}
         if recording is not None:
             self.titles = {f"recording of {recording.title}": REPLAY} | self.titles
@@ -54,11 +61,10 @@ class Gallery:
             ValueError: there is nothing of that name.
         """
         bare = name.removeprefix("clothgym:")
-        known = list(self.titles.values())
-        if bare in known:
+        if bare in self.titles.values():
             return bare
         if ":" not in bare and bare not in gym.registry:
-            raise ValueError(f"no scene or environment {name!r}{hint(bare, known)} (there are: {', '.join(known)})")
+            known("scene or environment", bare, self.titles.values())
         # an id that somebody else has registered, which the page lists from now on
         bare = checked_id(bare)
         self.titles = {**self.titles, bare: bare}
@@ -73,7 +79,7 @@ class Gallery:
         if name in SCENES:
             return SceneStage(name)
         own = self.policies.get(name, {})
-        return EpisodeStage(name, own, next(iter(own), "expert"))
+        return EpisodeStage(name, own, next(iter(own), self.actor))
 
 
 class Visit:
@@ -148,28 +154,21 @@ class Playground:
         self.server.stop()
 
 
-def policies_of(runs: Sequence[str], start: str) -> tuple[str, dict[str, dict[str, Policy]]]:
+def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[str, Policy]]]:
     """What is shown first, the first run's environment if nothing is asked; and the runs' policies, by environment and folder.
+
+    names: the runs' folders; who may act in any environment is left out.
 
     Raises:
         ImportError: Stable-Baselines3 is missing; the message says how to get it.
         FileNotFoundError, ValueError: a folder without a run that can be used here.
     """
+    # what is wrong with any of them is said before the first is loaded, which takes seconds
+    configs = {name: runs.read_config(Path(name)) for name in names if name not in ACTORS}
     policies: dict[str, dict[str, Policy]] = {}
-    for run in runs:
-        try:
-            from clothgym.adapters.runs import learnt, read_config
-        except ImportError as error:
-            raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
-        try:
-            config = read_config(Path(run))
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"policy {run!r}: is no folder of a training run, which holds config.json and checkpoint.pt. "
-                "Train one with: python training/train.py --env ClothDrape-v0"
-            ) from error
+    for run, config in configs.items():
         env_id = config["env"]
-        act = learnt(Path(run), env_id)
+        act = runs.learnt(Path(run), env_id)
         own = policies.setdefault(env_id, {})
         name = Path(run).resolve().name
         # runs of the same name are distinguished by their full paths
@@ -232,9 +231,11 @@ def say(line: str) -> None:
 
 def serve(
     start: str, host: str = LOOPBACK, port: int = PORT, replay: Path | None = None,
-    policies: Mapping[str, Mapping[str, Policy]] | None = None, tell: Callable[[str], None] = say,
+    policies: Mapping[str, Mapping[str, Policy]] | None = None, actor: str = "expert", tell: Callable[[str], None] = say,
 ) -> Playground:  # fmt: skip
     """Begin to serve, after a first look at what is shown first, which compiles what it needs.
+
+    policies, actor: see ``Gallery``.
 
     Raises:
         ImportError: viser is missing.
@@ -242,7 +243,7 @@ def serve(
     """
     imported_viser()
     recording = Recording.load(replay) if replay is not None else None
-    gallery = Gallery(recording, policies)
+    gallery = Gallery(recording, policies, actor)
     start = gallery.checked(REPLAY if recording is not None and not start else start or "patch")
     free_port(host, port)
     tell(f"opening {start} (the first time on a machine it is compiled, up to a minute, once) ...")

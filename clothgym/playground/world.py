@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from clothgym import integrators
 from clothgym.bending import BENDING
-from clothgym.checks import count, not_negative, one_of
+from clothgym.checks import count, known, not_negative, one_of
 from clothgym.collisions import Box, Capsule, Collider, MeshCollider, Plane, Sphere
 from clothgym.limiting import checked_limit
 from clothgym.material import Material
@@ -85,10 +84,8 @@ class Settings:
         Raises:
             ValueError: an unknown name, or an invalid value.
         """
-        known = [item.name for item in fields(self)]
         for name in changes:
-            if name not in known:
-                raise ValueError(f"no setting {name!r}{hint(name, known)} (there are: {', '.join(known)})")
+            known("setting", name, [item.name for item in fields(self)])
         if "fabric" in changes and changes["fabric"] != self.fabric:
             changes = {name: None for name in FIGURES if name != "air_drag"} | changes
         return replace(self, **changes)
@@ -212,9 +209,3 @@ def solid_of(collider: Collider, center: Vector, colour: tuple[int, int, int]) -
                 kind="mesh", center=center, vertices=vertices, triangles=triangles, rotation=collider.rotation, color=colour
             )
     raise ValueError(f"collider={collider!r}: has no picture")
-
-
-def hint(name: str, known: Iterable[str]) -> str:
-    """A clause with the nearest name, if one is near."""
-    near = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""

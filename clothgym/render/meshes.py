@@ -27,6 +27,23 @@ class _Cloth(NamedTuple):
     color: Color
 
 
+def without_frames(folder: Path) -> Path:
+    """The folder, to which frames may be written.
+
+    Raises:
+        FileExistsError: it is a file, or holds frames already.
+    """
+    if folder.is_file():
+        raise FileExistsError(f"{str(folder)!r} is a file: name a folder for the meshes")
+    others = sorted(file.name for ending in KINDS for file in folder.glob(f"frame_*.{ending}"))
+    if others:
+        raise FileExistsError(
+            f"{str(folder)!r} holds {len(others)} frames already ({others[0]} to {others[-1]}), which would be mixed with "
+            "the new ones: name another folder, or remove them first"
+        )
+    return folder
+
+
 class MeshSequence:
     """A folder of ``frame_00000.obj`` (or ``.glb``) and so on, written one by one; finished files stay if a later one fails.
 
@@ -51,13 +68,7 @@ class MeshSequence:
         one_of("mesh kind", kind, *KINDS)
         self.folder, self.kind, self.written = Path(folder), kind, 0
         self._cloth = _checked_cloth(triangles, uv, color)
-        others = sorted(file.name for ending in KINDS for file in self.folder.glob(f"frame_*.{ending}"))
-        if others:
-            raise FileExistsError(
-                f"{str(self.folder)!r} holds {len(others)} frames already ({others[0]} to {others[-1]}), which would be mixed with "
-                "the new ones: name another folder, or remove them first"
-            )
-        self.folder.mkdir(parents=True, exist_ok=True)
+        without_frames(self.folder).mkdir(parents=True, exist_ok=True)
 
     def add(self, positions: ArrayLike, solids: Sequence[Solid] = ()) -> Path:
         """Write the next frame, the cloth at ``positions`` [m], (particles, 3), and the solids; where it went.
