@@ -129,7 +129,7 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, s
         frames = with_simulation(*given, option)
     begun = time.perf_counter()
     bad, worst, count, gap, lag, clamped = np.zeros(seeds, int), 0, 0, np.inf, 0.0, 0
-    for state in tqdm(frames, desc=f"{maneuver}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False):
+    for state in tqdm(frames, desc=f"{maneuver}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False, disable=None):
         found = count_intersections(sheet.triangles, state.simulation.positions)
         bad += found > 0
         worst = max(worst, int(found.max()))
@@ -154,7 +154,7 @@ def measure_drape(target: str, steps: int = STEPS) -> Row:
     random = np.random.default_rng(0)
     simulation = env.unwrapped.task.simulation
     bad, worst, failures, gap = 0, 0, 0, np.inf
-    for _ in tqdm(range(-(-steps // lanes)), desc=f"drape, {target}", leave=False):
+    for _ in tqdm(range(-(-steps // lanes)), desc=f"drape, {target}", leave=False, disable=None):
         _, _, terminated, truncated, info = env.step(random.uniform(-1, 1, env.action_space.shape).astype(np.float32))
         found = count_intersections(simulation.mesh.triangles, simulation.positions)
         bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
@@ -189,7 +189,7 @@ def fill(path: Path, sections: dict[str, list[Case]], select: list[str], fresh: 
     results: Row = {"machine": machine(), "about": about} | (json.loads(path.read_text()) if path.exists() and not fresh else {})
     wanted = [(name, *case) for name, rows in sections.items() for case in rows]
     wanted = [(name, measure, key) for name, measure, key in wanted if all(word in f"{name} {key}" for word in select)]
-    for name, measure, key in tqdm(wanted, unit="case"):
+    for name, measure, key in tqdm(wanted, unit="case", disable=None):
         rows = results.setdefault(name, [])
         if not any(key.items() <= row.items() for row in rows):
             rows.append(key | measure(**key))
@@ -219,7 +219,7 @@ ABOUT = {
 def quick() -> None:
     """Whether it runs: a second of each case on a coarse sheet."""
     rows = []
-    for name in tqdm(MANEUVERS, unit="case"):
+    for name in tqdm(MANEUVERS, unit="case", disable=None):
         for mode in ("none", "spheres", "fast", "strict"):
             key = {"maneuver": name, "mesh": "13x13", "mode": mode, "thickness_mm": 8}
             rows.append(key | measure_maneuver(**key, seeds=1, seconds=1.0))

@@ -86,7 +86,7 @@ def option(mode: str, thickness: float = THICKNESS) -> Row:
 def interleaved(steps: dict[str, Callable[[], object]], frames: int) -> dict[str, list[float]]:
     """Seconds that each frame took, by mode; the modes take turns, and so does who begins."""
     times: dict[str, list[float]] = {mode: [] for mode in steps}
-    for frame in tqdm(range(frames), unit="frame", leave=False):
+    for frame in tqdm(range(frames), unit="frame", leave=False, disable=None):
         order = list(steps)
         for mode in order[frame % len(order) :] + order[: frame % len(order)]:
             begun = time.perf_counter()
@@ -199,7 +199,7 @@ def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECON
     best, counts, warned = np.full(round(seconds / FRAME), np.inf), [], 0
     for _ in range(ROUNDS):
         data = start_of(model)
-        for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {steps}", leave=False):
+        for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {steps}", leave=False, disable=None):
             begun = time.perf_counter()
             mujoco.mj_step(model, data, nstep=steps)
             best[frame] = min(best[frame], time.perf_counter() - begun)
@@ -217,7 +217,7 @@ def measure_ours(engine: str, contact: str, lanes: int, seconds: float = SECONDS
     best, counts = np.full(round(seconds / FRAME), np.inf), []
     for _ in range(ROUNDS):
         simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
-        for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {lanes}", leave=False):
+        for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {lanes}", leave=False, disable=None):
             begun = time.perf_counter()
             simulation.step()
             best[frame] = min(best[frame], time.perf_counter() - begun)

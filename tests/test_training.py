@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import clothgym
+
 ROOT = Path(__file__).parent.parent
 SHORT = """
 ClothDrape-v0:
@@ -52,6 +54,12 @@ def run(script, *arguments, cwd):
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
 
 
+@pytest.fixture
+def scripts(monkeypatch):
+    """The scripts' folder, to import from."""
+    monkeypatch.syspath_prepend(str(ROOT / "training"))
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("training")
@@ -84,7 +92,7 @@ def test_a_run_leaves_its_story(trained):
 def test_a_run_is_resumed_and_never_overwritten(trained):
     folder, options = trained
     again = run("train.py", "--run", folder / "run", *options, cwd=folder)
-    assert again.returncode != 0 and "--resume" in again.stderr
+    assert again.returncode == 2 and "holds a run already" in said(again.stderr)
     resumed = run("train.py", "--resume", folder / "run", "--timesteps", 1600, *options[2:], cwd=folder)
     assert resumed.returncode == 0, resumed.stderr
     assert "at 800 of 1,600 steps" in resumed.stdout
@@ -106,27 +114,93 @@ def test_the_learnt_policy_is_evaluated_beside_the_references(trained):
     assert one.returncode == 0 and json.loads(out.read_text())["success_rate"] > 0.5
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--policy", "nowhere"), "neither noop, random, expert, careless nor a run"),
-        (("--episodes", "0"), "must be at least 1"),
-        (("--policy", "careless", "--episodes", "2"), "careless: only ClothStrain-v0 has a careless expert"),
-    ],
-)
-def test_errors_are_sentences(arguments, sentence, tmp_path):
-    done = run("evaluate.py", *arguments, cwd=tmp_path)
-    assert done.returncode != 0 and sentence in done.stderr
+# --- what is wrong, and Ctrl+C ---------------------------------------------------------------------------------------------
+
+WRONG = {
+    "train --algo sac": "invalid choice 'sac'",
+    "train --env ClothDrap-v0": "no environment 'ClothDrap-v0'; did you mean 'ClothDrape-v0'?",
+    "train --env ClothReach-v0 --algo ppo_lagrange": "has no hyperparameters for 'ClothReach-v0' (there are: ClothStrain-v0",
+    "train --hyperparams gone.yml": "--hyperparams gone.yml: there is no such file",
+    "train --hyperparams thin.yml": "thin.yml lacks n_envs, policy, n_steps for 'ClothDrape-v0'",
+    "train --resume gone": "'gone' is not the folder of a training run",
+    "train --timesteps 0": "--timesteps 0: must be at least 1",
+    "train --seed -1": "--seed -1: must be from 0",
+    "train --env-kwargs {": "'{' is not JSON",
+    "evaluate --env ClothReech-v0": "no environment 'ClothReech-v0'; did you mean 'ClothReach-v0'?",
+    "evaluate --policy nothing": "no policy 'nothing' (there are: noop, random, expert, careless, the folder of a training run)",
+    "evaluate --policy noop chance": "no policy 'chance'",
+    "evaluate --policy .": "'.' is not the folder of a training run",
+    "evaluate --policy careless": "careless: only ClothStrain-v0 has a careless expert",
+    "evaluate --policy learnt --env ClothReach-v0": "'learnt' was trained on ClothDrape-v0, not on ClothReach-v0",
+    "evaluate --policy old": "'old' was trained with clothgym 0.0.1",
+    "evaluate --episodes 0": "--episodes 0: must be at least 1",
+    "evaluate --seed -1": "--seed -1: must be zero or positive",
+    "evaluate --env-kwargs []": "must be a JSON object",
+    "evaluate --json .": "--json .: is a folder",
+}
 
 
-def test_a_checkpoint_of_another_version_is_refused(trained, tmp_path):
-    folder, _ = trained
-    config = json.loads((folder / "run" / "config.json").read_text())
-    (tmp_path / "old").mkdir()
-    (tmp_path / "old" / "config.json").write_text(json.dumps(config | {"clothgym": "0.0.1"}))
-    (tmp_path / "old" / "checkpoint.pt").write_bytes((folder / "run" / "checkpoint.pt").read_bytes())
-    done = run("evaluate.py", "--policy", tmp_path / "old", "--episodes", 2, cwd=tmp_path)
-    assert done.returncode != 0 and "0.0.1" in done.stderr
+@pytest.fixture
+def wrong(tmp_path, monkeypatch, scripts):
+    """A folder with files to name, and no environment and no learner to be had in it."""
+    (tmp_path / "thin.yml").write_text("ClothDrape-v0: {n_timesteps: 100}")
+    for name, version in (("learnt", clothgym.__version__), ("old", "0.0.1")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "checkpoint.pt").touch()
+        (tmp_path / name / "config.json").write_text(json.dumps({"env": "ClothDrape-v0", "clothgym": version, "env_kwargs": {}}))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(gym, "make_vec", None)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+
+
+def said(box):
+    """What is in tyro's box, in one line."""
+    return " ".join(line.strip("│╭╮╰╯─ ") for line in box.splitlines())
+
+
+@pytest.mark.parametrize("command", WRONG)
+def test_wrong_names_are_refused_as_wrong_flags_are_before_anything_slow(command, wrong, tmp_path, capsys):
+    import evaluate
+    import train
+    import tyro
+
+    before = sorted(tmp_path.rglob("*"))
+    script, *arguments = command.split()
+    with pytest.raises(SystemExit) as caught:
+        tyro.cli({"train": train, "evaluate": evaluate}[script].Args, args=arguments)
+    assert caught.value.code == 2 and WRONG[command] in said(capsys.readouterr().err)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_scripts_load_torch_only_when_they_begin():
+    code = "import sys, train, evaluate; print([name for name in ('torch', 'stable_baselines3', 'numba') if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "training", capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_what_an_environment_does_not_take_is_a_sentence(tmp_path):
+    done = run("evaluate.py", "--env", "ClothReach-v0", "--env-kwargs", '{"integratr": "xpbd"}', cwd=tmp_path)
+    assert done.returncode == 2 and "integratr" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, capsys):
+    """What has been learnt is saved first."""
+    import endings
+    import learning
+
+    class Learner:
+        n_steps = 5
+
+        def learn(self, *args, **kwargs):
+            raise KeyboardInterrupt
+
+    saved = []
+    monkeypatch.setattr(learning.policies, "save_checkpoint", lambda folder, model: saved.append(folder))
+    config = {"num_envs": 2, "clone": {}, "algo": "ppo", "timesteps": 100}
+    with pytest.raises(SystemExit) as caught, endings.stopped(lambda: ": go on"):
+        learning.train(tmp_path, config, Learner(), 0, 1, 1)
+    assert caught.value.code == 130 and saved == [tmp_path]
+    assert capsys.readouterr().err.strip() == "stopped: go on"
 
 
 def test_a_checkpoint_is_never_unpickled(trained, tmp_path):
@@ -138,16 +212,10 @@ def test_a_checkpoint_is_never_unpickled(trained, tmp_path):
     (tmp_path / "evil" / "config.json").write_text((folder / "run" / "config.json").read_text())
     (tmp_path / "evil" / "checkpoint.pt").write_bytes(pickle.dumps(Path("/tmp")))
     done = run("evaluate.py", "--policy", tmp_path / "evil", "--episodes", 2, cwd=tmp_path)
-    assert done.returncode != 0 and "cannot be read as a checkpoint" in done.stderr
+    assert done.returncode == 2 and "cannot be read as a checkpoint" in done.stderr and "Traceback" not in done.stderr
 
 
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def scripts(monkeypatch):
-    """The scripts' folder, to import from."""
-    monkeypatch.syspath_prepend(str(ROOT / "training"))
 
 
 class Learner:
@@ -210,7 +278,7 @@ def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
     common = ("--env", "ClothStrain-v0", "--algo", "ppo_lagrange")
     done = run("train.py", *common, "--run", tmp_path / "run", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    # a policy of pure chance costs far more than the excess of 10 that counts: 0.01 times that for each of two rollouts
+    # a policy of pure noise costs far more than the excess of 10 that counts: 0.01 times that for each of two rollouts
     path = tmp_path / "run" / "multiplier.json"
     assert json.loads(path.read_text())["multiplier"] == pytest.approx(2 * 0.01 * 10)
     assert "cost" in done.stdout and "careless" in done.stdout

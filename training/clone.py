@@ -27,7 +27,7 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int) -> tuple
     steps = task.acting_steps + task.settling_steps
     observations, actions = [], []
     seen: Any = env.reset()
-    for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False):
+    for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False, disable=None):
         strength = noise * rng.uniform(size=(env.num_envs, 1))
         for _ in range(steps):
             wanted = np.clip(task.expert_actions(), -1, 1).astype(np.float32)
@@ -49,7 +49,7 @@ def clone(model: PPO, observations: NDArray, actions: NDArray, epochs: int, batc
     steps = max(1, epochs * len(x) // batch_size)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
     errors = []
-    for batch in tqdm(_batches(len(x), batch_size, steps, model.seed or 0), total=steps, desc="cloning", leave=False):
+    for batch in tqdm(_batches(len(x), batch_size, steps, model.seed or 0), total=steps, desc="cloning", leave=False, disable=None):
         error = torch.mean((policy.get_distribution(x[batch]).distribution.mean - y[batch]) ** 2)
         optimizer.zero_grad()
         error.backward()

@@ -1,4 +1,4 @@
-"""Score policies on held-out episodes: one table for doing nothing, chance, the scripted expert and what was learnt.
+"""Score policies on held-out episodes: one table for noop, random, the scripted expert and what was learnt.
 
     python training/evaluate.py --env ClothDrape-v0 --policy noop random expert runs/ClothDrape-v0_0 --episodes 500
 
@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 import policies
 import tyro
+from endings import refused, stopped
 from numpy.typing import NDArray
 from tqdm import tqdm
 
@@ -48,6 +49,19 @@ class Args:
     json: Path | None = None
     """Where to write the scores, if anywhere."""
 
+    def __post_init__(self) -> None:
+        """Everything is checked here, before torch is imported; an error is told as that of a wrong flag is."""
+        self.env = checked_id(self.env)
+        if self.episodes < 1:
+            raise ValueError(f"--episodes {self.episodes}: must be at least 1")
+        if self.seed < 0:
+            raise ValueError(f"--seed {self.seed}: must be zero or positive")
+        if self.json is not None and self.json.is_dir():
+            raise ValueError(f"--json {self.json}: is a folder, name a file in it")
+        policies.parsed_kwargs(self.env_kwargs)
+        for name in self.policy:
+            policies.checked(name, self.env)
+
 
 def run_episodes(
     env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any
@@ -55,7 +69,7 @@ def run_episodes(
     """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
     env = gym.make_vec(env_id, num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
     batches = []
-    with tqdm(total=len(seeds), unit="episode", disable=not progress, leave=False) as bar:
+    with tqdm(total=len(seeds), unit="episode", disable=None if progress else True, leave=False) as bar:
         for first in range(0, len(seeds), env.num_envs):
             wanted = seeds[first : first + env.num_envs]
             # the last batch may be short: its spare environments run too, and are not counted
@@ -139,17 +153,16 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def main(args: Args) -> None:
-    args.env = checked_id(args.env)
-    if args.episodes < 1:
-        raise ValueError(f"--episodes {args.episodes}: must be at least 1")
     scores = {}
     # a run is scored on the environment that it was trained on, and so are the references beside it
     kwargs: dict[str, Any] = {}
     for name in args.policy:
         kwargs |= policies.env_kwargs(name)
     kwargs |= policies.parsed_kwargs(args.env_kwargs)
-    # a name that is none is told before anything runs
-    chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
+    # what the environment or a checkpoint does not take is told before anything runs
+    with refused():
+        chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
+        gym.make_vec(args.env, num_envs=1, **kwargs).close()
     for name, policy in chosen.items():
         episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
         scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
@@ -161,4 +174,5 @@ def main(args: Args) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    with stopped():
+        main(tyro.cli(Args))

@@ -9,14 +9,16 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
 
 from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, learnt, load_tensors, read_config
+from clothgym.registration import ACTORS, actor_named
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
 
 __all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "learnt", "read_config"]
 
@@ -45,10 +47,9 @@ def named(name: str, env_id: str, seed: int) -> Policy:
     """The policy called noop, random, expert or careless, or the learnt one in the run's folder of that path.
 
     Raises:
-        FileNotFoundError, ValueError: no such policy, or a checkpoint of another environment or version.
+        ValueError: no such policy, or a checkpoint of another environment or version.
     """
-    if name == "careless" and env_id != "ClothStrain-v0":
-        raise ValueError(f"careless: only ClothStrain-v0 has a careless expert, not {env_id}")
+    checked(name, env_id)
     if name in SCRIPTED:
         return SCRIPTED[name]
     if name == "random":
@@ -56,9 +57,24 @@ def named(name: str, env_id: str, seed: int) -> Policy:
     return learnt(Path(name), env_id)
 
 
+def checked(name: str, env_id: str) -> None:
+    """A policy's name or a run's folder, for that environment; torch is not needed to say no.
+
+    Raises:
+        ValueError: no such policy, or a checkpoint of another environment or version.
+    """
+    if name == "careless" and env_id != "ClothStrain-v0":
+        raise ValueError(f"careless: only ClothStrain-v0 has a careless expert, not {env_id}")
+    if actor_named(name, "careless") not in (*ACTORS, "careless"):
+        try:
+            read_config(Path(name), env_id)
+        except OSError as error:
+            raise ValueError(str(error)) from error
+
+
 def env_kwargs(name: str) -> dict[str, Any]:
     """Keyword arguments of the environment that a learnt policy was trained on; none for the others."""
-    return {} if name in (*SCRIPTED, "random") else dict(read_config(Path(name))["env_kwargs"])
+    return {} if name in (*ACTORS, "careless") else dict(read_config(Path(name))["env_kwargs"])
 
 
 def parsed_kwargs(text: str) -> dict[str, Any]:
@@ -78,6 +94,8 @@ def parsed_kwargs(text: str) -> dict[str, Any]:
 
 def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
     """Write the learner's tensors; a crash in the middle leaves the previous checkpoint whole."""
+    import torch
+
     state = {
         "policy": model.policy.state_dict(),
         "optimizer": model.policy.optimizer.state_dict(),

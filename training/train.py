@@ -14,29 +14,19 @@ hyperparams/ALGO.yml, in the format of rl_zoo3.
 
 from __future__ import annotations
 
-import json
-import math
 import platform
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import evaluate
 import numpy as np
 import policies
-import torch
 import tyro
 import yaml
-from clone import clone, demonstrations
-from lagrange import LagrangeMultiplier
-from report import draw_learning_curve, film
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecMonitor
+from endings import refused, stopped
 
 import clothgym
-from clothgym.adapters.sb3 import make_sb3_vec_env
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
@@ -68,8 +58,11 @@ class Args:
     """Held-out episodes of the final evaluation."""
     threads: int = 1
     """Threads of torch while it learns; two gain little on nets as small as these, and wait for each other on a busy machine."""
+    folder: Path = field(init=False)
+    config: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
+        """Everything is checked here, before what is slow is imported; an error is told as that of a wrong flag is."""
         self.env = checked_id(self.env)
         for name in ("timesteps", "eval_episodes", "final_episodes", "threads"):
             value = getattr(self, name)
@@ -77,211 +70,75 @@ class Args:
                 raise ValueError(f"--{name.replace('_', '-')} {value}: must be at least 1")
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"--seed {self.seed}: must be from 0 to 2^32 - 1")
-
-
-class HeldOutEvaluation(BaseCallback):
-    """Every so many rollouts: score the policy on held-out seeds, append a line to progress.jsonl, save a checkpoint."""
-
-    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int) -> None:
-        super().__init__()
-        self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
-        self.rollouts = 0
-        self.best = max((_rank(line, config) for line in _lines(folder)), default=-math.inf)
-        self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
-        self.evaluating = 0.0
-        self.started = time.perf_counter()
-
-    @property
-    def training_seconds(self) -> float:
-        """Time spent on training, evaluations left out."""
-        return self.trained_before + time.perf_counter() - self.started - self.evaluating
-
-    def _on_training_start(self) -> None:
-        self.started = time.perf_counter()
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        # OpenMP's idle workers spin: while the environments run, torch must not have any
-        torch.set_num_threads(1)
-        if self.rollouts % self.every == 0 and (self.rollouts or self.config["clone"]):
-            self.evaluate()
-        self.rollouts += 1
-
-    def _on_rollout_end(self) -> None:
-        torch.set_num_threads(self.config["threads"])
-
-    def evaluate(self) -> None:
-        begun = time.perf_counter()
-        policies.save_checkpoint(self.folder, self.model)
-
-        def policy(env: Any, observations: Any) -> Any:
-            return self.model.predict(observations, deterministic=True)[0]
-
-        # the tail of the held-out seeds: the final score's are others
-        first = evaluate.HELD_OUT + 1_000_000
-        seeds = list(range(first, first + self.episodes))
-        episodes = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
-        line = {
-            "timesteps": self.num_timesteps,
-            "training_seconds": self.training_seconds - (time.perf_counter() - begun),
-            "success_rate": float(episodes["is_success"].mean()),
-            "normalized_performance": float(episodes["normalized_performance"].mean()),
-            "return": float(episodes["return"].mean()),
-        }
-        if "episode_cost" in episodes:
-            line["cost"] = float(episodes["episode_cost"].mean())
-        if _rank(line, self.config) >= self.best:
-            self.best = _rank(line, self.config)
-            policies.save_checkpoint(self.folder, self.model, policies.BEST)
-        with open(self.folder / "progress.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
-        for key in line.keys() - {"timesteps", "training_seconds"}:
-            self.logger.record(f"held_out/{key}", line[key])
-        self.evaluating += time.perf_counter() - begun
-
-
-def configure(args: Args) -> tuple[Path, dict[str, Any]]:
-    """The run's folder and configuration: a new one, or that of the run to go on with."""
-    if args.resume is not None:
-        config = policies.read_config(args.resume)
-        if args.run is not None:
-            raise ValueError("--resume goes on in the run's own folder: leave --run away")
-        if args.timesteps is not None:
-            config["timesteps"] = args.timesteps
-        return args.resume, config
-    path = args.hyperparams or HERE / "hyperparams" / f"{args.algo}.yml"
-    table = yaml.safe_load(path.read_text())
-    if args.env not in table:
-        raise ValueError(
-            f"{path} has no hyperparameters for {args.env!r} (there are: {', '.join(table)}): give a file with --hyperparams"
-        )
-    hyperparameters = dict(table[args.env])
-    config = {
-        "clothgym": clothgym.__version__,
-        "env": args.env,
-        "algo": args.algo,
-        "lagrange": hyperparameters.pop("lagrange", {}),
-        "clone": hyperparameters.pop("clone", {}),
-        "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(args.env_kwargs),
-        "num_envs": hyperparameters.pop("n_envs"),
-        "timesteps": args.timesteps if args.timesteps is not None else int(hyperparameters["n_timesteps"]),
-        "seed": args.seed,
-        "threads": args.threads,
-        "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
-        "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
-    }
-    bare = args.env.rpartition(":")[2]
-    name = bare if args.algo == "ppo" else f"{bare}_{args.algo}"
-    folder = args.run or Path("runs") / f"{name}_{args.seed}"
-    if (folder / policies.CHECKPOINT).exists():
-        raise FileExistsError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
-    folder.mkdir(parents=True, exist_ok=True)
-    evaluate.write_json(folder / policies.CONFIG, config)
-    return folder, config
-
-
-def training_seed(seed: int, done: int, num_envs: int) -> int:
-    """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
-    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
-
-
-def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
-    """The learner of a configuration, on its own batch of environments."""
-    options = dict(config["hyperparameters"])
-    policy = options.pop("policy")
-    for key in ("learning_rate", "clip_range"):
-        if isinstance(options.get(key), str):
-            options[key] = _linear(options[key])
-    env = VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **config["env_kwargs"]))
-    return PPO(policy, env, seed=seed, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
-
-
-def _linear(text: str) -> Any:
-    """rl_zoo3's "lin_0.001": from there to zero over the run."""
-    kind, _, value = text.partition("_")
-    if kind != "lin":
-        raise ValueError(f"hyperparameter {text!r}: a schedule is written lin_VALUE")
-    start = float(value)
-    return lambda remaining: start * remaining
-
-
-def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
-    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit, and where
-    costs have a price the return tells."""
-    if config["env_kwargs"].get("cost_penalty"):
-        return line["return"]
-    limit = config["lagrange"].get("cost_limit", math.inf)
-    return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
-
-
-def _lines(folder: Path) -> list[dict[str, float]]:
-    path = folder / "progress.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-
-
-def train(args: Args) -> Path:
-    folder, config = configure(args)
-    done = 0
-    if args.resume is not None:
-        done = int(torch.load(folder / policies.CHECKPOINT, weights_only=True)["num_timesteps"])
-    model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
-    if args.resume is not None:
-        policies.load_checkpoint(folder, model)
-        print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
-    per_rollout = config["num_envs"] * model.n_steps
-    watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), args.eval_episodes)
-    if config["clone"] and done == 0:
-        watch.trained_before += learn_from_expert(model, config)
-    callbacks: list[BaseCallback] = [watch]
-    if config["algo"] == "ppo_lagrange":
-        callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
-    seconds = watch.trained_before
-    if config["timesteps"] > done:
         try:
-            # learn() counts its steps on top of those done when the counter is not reset
-            left = config["timesteps"] - done
-            model.learn(left, callback=callbacks, progress_bar=True, reset_num_timesteps=False, tb_log_name="ppo")
-        except KeyboardInterrupt:
-            policies.save_checkpoint(folder, model)
-            raise SystemExit(f"interrupted: go on with  python training/train.py --resume {folder}") from None
-        seconds = watch.training_seconds
-        watch.evaluate()
-        model.save(folder / "model.zip")
-    finish(folder, config, seconds, args.final_episodes)
-    return folder
+            self.folder, self.config = self.new_run() if self.resume is None else self.resumed_run(self.resume)
+        except OSError as error:
+            raise ValueError(str(error)) from error
+
+    def resumed_run(self, folder: Path) -> tuple[Path, dict[str, Any]]:
+        """Folder and configuration of the run to go on with."""
+        config = policies.read_config(folder)
+        if self.run is not None:
+            raise ValueError("--resume goes on in the run's own folder: leave --run away")
+        if self.timesteps is not None:
+            config["timesteps"] = self.timesteps
+        return folder, config
+
+    def new_run(self) -> tuple[Path, dict[str, Any]]:
+        """Folder and configuration of a new one."""
+        path = self.hyperparams or HERE / "hyperparams" / f"{self.algo}.yml"
+        if not path.is_file():
+            raise ValueError(f"--hyperparams {path}: there is no such file")
+        table = yaml.safe_load(path.read_text())
+        if not isinstance(table, dict) or self.env not in table:
+            raise ValueError(
+                f"{path} has no hyperparameters for {self.env!r} (there are: {', '.join(table or ())}): give a file with --hyperparams"
+            )
+        hyperparameters = dict(table[self.env])
+        missing = [key for key in ("n_envs", "n_timesteps", "policy", "n_steps") if key not in hyperparameters]
+        if missing:
+            raise ValueError(f"{path} lacks {', '.join(missing)} for {self.env!r}")
+        config = {
+            "clothgym": clothgym.__version__,
+            "env": self.env,
+            "algo": self.algo,
+            "lagrange": hyperparameters.pop("lagrange", {}),
+            "clone": hyperparameters.pop("clone", {}),
+            "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
+            "num_envs": hyperparameters.pop("n_envs"),
+            "timesteps": self.timesteps if self.timesteps is not None else int(hyperparameters["n_timesteps"]),
+            "seed": self.seed,
+            "threads": self.threads,
+            "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
+            "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+        }
+        bare = self.env.rpartition(":")[2]
+        name = bare if self.algo == "ppo" else f"{bare}_{self.algo}"
+        folder = self.run or Path("runs") / f"{name}_{self.seed}"
+        if (folder / policies.CHECKPOINT).exists():
+            raise ValueError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
+        return folder, config
 
 
-def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
-    """Clone the scripted expert into the policy; the time it took [s]."""
-    begun = time.perf_counter()
-    options = dict(config["clone"])
-    samples = demonstrations(model.env, options.pop("episodes"), options.pop("noise"), config["seed"])  # type: ignore[arg-type]
-    torch.set_num_threads(config["threads"])
-    error = clone(model, *samples, **options)
-    print(f"cloned the expert from {len(samples[0]):,} samples: mean squared error {error:.4f}")
-    return time.perf_counter() - begun
+def main(args: Args) -> None:
+    from learning import learner, train  # imported here: torch takes seconds, and what is wrong has been said by now
 
-
-def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:
-    """Final score beside the references, learning curve and film."""
-    scores = {}
-    names = ["noop", "random", "expert", str(folder)]
-    if config["env"] == "ClothStrain-v0":
-        names.insert(3, "careless")
-    for name in names:
-        policy = policies.named(name, config["env"], evaluate.HELD_OUT)
-        seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + episodes))
-        scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))
-    print(f"{config['env']}, {episodes} held-out episodes\n{evaluate.table(scores)}")
-    learnt = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
-    evaluate.write_json(folder / "evaluation.json", learnt | {"timesteps": config["timesteps"], "references": scores})
-    draw_learning_curve(folder, _lines(folder), {name: scores[name]["success_rate"] for name in ("noop", "expert")})
-    film(folder / "policy.gif", config["env"], policies.learnt(folder, config["env"]), config["env_kwargs"])
-    print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
+    folder, config = args.folder, args.config
+    with refused():
+        model, done = learner(folder, config, args.resume is not None)
+    if args.resume is None:
+        folder.mkdir(parents=True, exist_ok=True)
+        evaluate.write_json(folder / policies.CONFIG, config)
+    train(folder, config, model, done, args.eval_episodes, args.final_episodes)
 
 
 if __name__ == "__main__":
     np.seterr(all="ignore")
-    train(tyro.cli(Args))
+    given = tyro.cli(Args)
+
+    def remedy() -> str:
+        left = (given.folder / policies.CHECKPOINT).exists()
+        return f": go on with  python training/train.py --resume {given.folder}" if left else ""
+
+    with stopped(remedy):
+        main(given)

@@ -1,0 +1,27 @@
+"""How a script ends that cannot go on: with a line on stderr, without a traceback."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def refused() -> Iterator[None]:
+    """What was given wrongly, found while it is put to use: a sentence, and the status of a wrong flag."""
+    try:
+        yield
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+@contextmanager
+def stopped(remedy: Callable[[], str] = lambda: "") -> Iterator[None]:
+    """Ctrl+C: a word, what to do next, and the status that shells have for it."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        print(f"\nstopped{remedy()}", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -1,0 +1,194 @@
+"""How ``train.py`` learns: the learner of a configuration, held-out evaluations on the way, and the final score."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import evaluate
+import numpy as np
+import policies
+import torch
+from clone import clone, demonstrations
+from lagrange import LagrangeMultiplier
+from report import draw_learning_curve, film
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecMonitor
+
+from clothgym.adapters.runs import load_tensors
+from clothgym.adapters.sb3 import make_sb3_vec_env
+
+
+class HeldOutEvaluation(BaseCallback):
+    """Every so many rollouts: score the policy on held-out seeds, append a line to progress.jsonl, save a checkpoint."""
+
+    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int) -> None:
+        super().__init__()
+        self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
+        self.rollouts = 0
+        self.best = max((_rank(line, config) for line in _lines(folder)), default=-math.inf)
+        self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
+        self.evaluating = 0.0
+        self.started = time.perf_counter()
+
+    @property
+    def training_seconds(self) -> float:
+        """Time spent on training, evaluations left out."""
+        return self.trained_before + time.perf_counter() - self.started - self.evaluating
+
+    def _on_training_start(self) -> None:
+        self.started = time.perf_counter()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        # OpenMP's idle workers spin: while the environments run, torch must not have any
+        torch.set_num_threads(1)
+        if self.rollouts % self.every == 0 and (self.rollouts or self.config["clone"]):
+            self.evaluate()
+        self.rollouts += 1
+
+    def _on_rollout_end(self) -> None:
+        torch.set_num_threads(self.config["threads"])
+
+    def evaluate(self) -> None:
+        begun = time.perf_counter()
+        policies.save_checkpoint(self.folder, self.model)
+
+        def policy(env: Any, observations: Any) -> Any:
+            return self.model.predict(observations, deterministic=True)[0]
+
+        # the tail of the held-out seeds: the final score's are others
+        first = evaluate.HELD_OUT + 1_000_000
+        seeds = list(range(first, first + self.episodes))
+        episodes = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
+        line = {
+            "timesteps": self.num_timesteps,
+            "training_seconds": self.training_seconds - (time.perf_counter() - begun),
+            "success_rate": float(episodes["is_success"].mean()),
+            "normalized_performance": float(episodes["normalized_performance"].mean()),
+            "return": float(episodes["return"].mean()),
+        }
+        if "episode_cost" in episodes:
+            line["cost"] = float(episodes["episode_cost"].mean())
+        if _rank(line, self.config) >= self.best:
+            self.best = _rank(line, self.config)
+            policies.save_checkpoint(self.folder, self.model, policies.BEST)
+        with open(self.folder / "progress.jsonl", "a") as file:
+            file.write(json.dumps(line) + "\n")
+        for key in line.keys() - {"timesteps", "training_seconds"}:
+            self.logger.record(f"held_out/{key}", line[key])
+        self.evaluating += time.perf_counter() - begun
+
+
+def training_seed(seed: int, done: int, num_envs: int) -> int:
+    """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
+    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
+
+
+def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
+    """The learner of a configuration, on its own batch of environments."""
+    options = dict(config["hyperparameters"])
+    policy = options.pop("policy")
+    for key in ("learning_rate", "clip_range"):
+        if isinstance(options.get(key), str):
+            options[key] = _linear(options[key])
+    env = VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **config["env_kwargs"]))
+    return PPO(policy, env, seed=seed, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
+
+
+def _linear(text: str) -> Any:
+    """rl_zoo3's "lin_0.001": from there to zero over the run."""
+    kind, _, value = text.partition("_")
+    if kind != "lin":
+        raise ValueError(f"hyperparameter {text!r}: a schedule is written lin_VALUE")
+    start = float(value)
+    return lambda remaining: start * remaining
+
+
+def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
+    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit, and where
+    costs have a price the return tells."""
+    if config["env_kwargs"].get("cost_penalty"):
+        return line["return"]
+    limit = config["lagrange"].get("cost_limit", math.inf)
+    return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
+
+
+def _lines(folder: Path) -> list[dict[str, float]]:
+    path = folder / "progress.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, int]:
+    """The learner of a new run, or of one that goes on, and the environment steps that it has done.
+
+    Raises:
+        ValueError, TypeError: the environment or the learner does not take one of its options, or the checkpoint is none.
+    """
+    done = int(load_tensors(folder)["num_timesteps"]) if resume else 0
+    model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
+    if resume:
+        policies.load_checkpoint(folder, model)
+        print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
+    return model, done
+
+
+def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_episodes: int, final_episodes: int) -> None:
+    """Learn, with held-out evaluations on the way, and score what was learnt."""
+    per_rollout = config["num_envs"] * model.n_steps
+    watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), eval_episodes)
+    if config["clone"] and done == 0:
+        watch.trained_before += learn_from_expert(model, config)
+    callbacks: list[BaseCallback] = [watch]
+    if config["algo"] == "ppo_lagrange":
+        callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
+    seconds = watch.trained_before
+    if config["timesteps"] > done:
+        try:
+            # learn() counts its steps on top of those done when the counter is not reset
+            left = config["timesteps"] - done
+            seen = sys.stdout.isatty() and sys.stderr.isatty()
+            model.learn(left, callback=callbacks, progress_bar=seen, reset_num_timesteps=False, tb_log_name="ppo")
+        except KeyboardInterrupt:
+            policies.save_checkpoint(folder, model)
+            raise
+        seconds = watch.training_seconds
+        watch.evaluate()
+        model.save(folder / "model.zip")
+    finish(folder, config, seconds, final_episodes)
+
+
+def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
+    """Clone the scripted expert into the policy; the time it took [s]."""
+    begun = time.perf_counter()
+    options = dict(config["clone"])
+    samples = demonstrations(model.env, options.pop("episodes"), options.pop("noise"), config["seed"])  # type: ignore[arg-type]
+    torch.set_num_threads(config["threads"])
+    error = clone(model, *samples, **options)
+    print(f"cloned the expert from {len(samples[0]):,} samples: mean squared error {error:.4f}")
+    return time.perf_counter() - begun
+
+
+def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:
+    """Final score beside the references, learning curve and film."""
+    scores = {}
+    names = ["noop", "random", "expert", str(folder)]
+    if config["env"] == "ClothStrain-v0":
+        names.insert(3, "careless")
+    for name in names:
+        policy = policies.named(name, config["env"], evaluate.HELD_OUT)
+        seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + episodes))
+        scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))
+    print(f"{config['env']}, {episodes} held-out episodes\n{evaluate.table(scores)}")
+    learnt = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
+    evaluate.write_json(folder / "evaluation.json", learnt | {"timesteps": config["timesteps"], "references": scores})
+    draw_learning_curve(folder, _lines(folder), {name: scores[name]["success_rate"] for name in ("noop", "expert")})
+    film(folder / "policy.gif", config["env"], policies.learnt(folder, config["env"]), config["env_kwargs"])
+    print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
