@@ -5,10 +5,10 @@
     python benchmarks/bits.py --select Drape strict       # only rows whose names hold all these words
     python benchmarks/bits.py --batches                   # some minutes: is environment i the same in every batch?
 
-Rows: each id with its expert in every other environment and chance in the rest, without self-collision and with "strict", its
-first 30 steps and 30 steps from the 41st on, when experts' sheets lie on their targets; each integrator with each bending model on
-a sheet in the wind, and strain limits; each kind of collider, at rest and moving, under a falling sheet; and sheets that are folded
-onto themselves.  A digest is of shapes, types and bytes: it tells -0.0 from 0.0.
+Rows: each id with its expert in every other environment and random actions in the rest, without self-collision and with
+"strict", its first 30 steps and 30 steps from the 41st on, when experts' sheets lie on their targets; each integrator with each
+bending model on a sheet in the wind, and strain limits; each kind of collider, at rest and moving, under a falling sheet; and
+sheets that are folded onto themselves.  A digest is of shapes, types and bytes: it tells -0.0 from 0.0.
 
 With ``--batches`` environment ``i`` of each id is compared over a whole episode and the beginning of the next, in batches of 1, 7,
 64 and 256, on one thread and on two, and restored in mid-episode.
@@ -42,14 +42,14 @@ VARIANTS: tuple[tuple[str, Row], ...] = (
     ("ClothDrape-v0", {"randomize": {"density": [0.15, 0.2]}, "obs_mode": "particles"}),
     ("ClothDrapeGripper-v0", {"slip_force": 0.3}),
 )
-LETS_GO = 0.81  # chance acts below this, and so lets go in a step of a hundred
+LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a hundred
 
 
 # --- environments -------------------------------------------------------------------------------------------------------------
 
 
 class Episodes:
-    """A batch of an id: the expert acts in even environments, chance in odd ones, and what is over begins anew."""
+    """A batch of an id: the expert acts in even environments, and odd ones get random actions, and what is over begins anew."""
 
     def __init__(self, env_id: str, num_envs: int, threads: int, options: Row, **kwargs: Any) -> None:
         self.env: Any = gym.make_vec(
@@ -182,7 +182,7 @@ def rows(select: list[str]) -> dict[str, Row]:
     makers += core()
     chosen = [(name, make) for name, make in makers if all(word in name for word in select)]
     made: dict[str, Row] = {}
-    for name, make in (bar := tqdm(chosen, unit="scene", file=sys.stderr)):
+    for name, make in (bar := tqdm(chosen, unit="scene", disable=None)):
         bar.set_postfix_str(name)
         row = make()
         made |= {name: row} if "digest" in row else row

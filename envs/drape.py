@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from clothgym.render import Camera
 
 GUIDE_REACH = 0.15 * SIDE
-LETS_GO = 0.8  # an action above this opens the anchor: chance seldom lets go before the agent has seen why it should hold
+LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.25, 0.55, 0.25

@@ -372,7 +372,7 @@ class ClothStrainEnv(ClothEnv):
 
     | policy | arrives | mean cost | at no cost | steps |
     | --- | --- | --- | --- | --- |
-    | nothing | 0.000 | 0.00 | | 150 |
+    | noop | 0.000 | 0.00 | | 150 |
     | random | 0.000 | 149.6 | | 41, then it tears |
     | careless | 1.000 | 9.37 | 0.000 | 46 |
     | expert | 1.000 | 0.15 | 0.956 | 97 |

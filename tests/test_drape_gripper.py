@@ -186,7 +186,7 @@ def test_a_gripper_takes_what_lies_within_3_cm_of_its_tip_and_moves_no_faster_th
 # --- reward and evaluation -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", ["expert", "chance"])
+@pytest.mark.parametrize("policy", ["expert", "random"])
 def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices(policy):
     env, _ = start(seed=4)
     rng, effort, total, terminated, steps = np.random.default_rng(0), 0.0, 0.0, False, 0

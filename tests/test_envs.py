@@ -84,14 +84,14 @@ def test_observations_lie_in_their_space_and_are_fresh(env_id, obs_mode):
 
 
 @every_id
-@pytest.mark.parametrize("policy", ["chance", "expert"])
+@pytest.mark.parametrize("policy", ["random", "expert"])
 def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
     env = make(env_id)
     env.reset(seed=0)
     of_evaluation = {"normalized_performance", "is_success", *(name for name, *_ in env.unwrapped.task.evaluation)}
     steps, terminated, actions = 0, False, drawn(env)
     while not terminated:
-        action = next(actions) if policy == "chance" else env.unwrapped.expert_action()
+        action = next(actions) if policy == "random" else env.unwrapped.expert_action()
         _, reward, terminated, truncated, info = env.step(action)
         steps += 1
         assert not truncated
@@ -101,7 +101,7 @@ def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
         assert terminated or not (info["is_success"] or info["normalized_performance"] or info["failure"])
     assert info["failure"] or steps <= length(env.unwrapped.task)
     assert not (info["failure"] and (info["is_success"] or info["normalized_performance"]))
-    assert policy == "chance" or info["normalized_performance"] > 0.3
+    assert policy == "random" or info["normalized_performance"] > 0.3
 
 
 @every_id

@@ -53,7 +53,7 @@ def evaluated(env, distance, velocity=(0.0, 0.0, 0.0)):
 # --- reward ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", ["expert", "chance"])
+@pytest.mark.parametrize("policy", ["expert", "random"])
 def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices(policy):
     env, _ = start()
     rng = np.random.default_rng(0)
@@ -269,7 +269,7 @@ def test_who_goes_away_as_far_as_possible_scores_nothing():
     assert info["goal_distance"].min() > 0.5
 
 
-def test_chance_scores_little():
+def test_random_actions_score_little():
     rng = np.random.default_rng(0)
     info = play(lambda env: rng.uniform(-1, 1, (60, 3)), num_envs=60)
     assert info["is_success"].mean() < 0.05 and info["normalized_performance"].mean() < 0.2

@@ -35,7 +35,7 @@ from clothgym import INTEGRATORS
 # --- strain and cost ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("policy", ["careless", "chance"])
+@pytest.mark.parametrize("policy", ["careless", "random"])
 def test_the_strain_is_that_of_the_threads_and_more_than_the_threshold_costs(policy):
     env, rng, threshold = batch(6, threshold=0.08), np.random.default_rng(0), 0.08
     total, over, costs = np.zeros(6), np.zeros(6, bool), []
@@ -146,7 +146,7 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
 
 
 @pytest.mark.parametrize("reward_mode", ["delta", "sparse"])
-@pytest.mark.parametrize("policy", ["careless", "chance"])
+@pytest.mark.parametrize("policy", ["careless", "random"])
 def test_the_penalty_is_taken_from_the_reward_and_at_a_failure_for_all_steps_that_are_left(policy, reward_mode):
     price, rng = 0.3, np.random.default_rng(0)
     env, plain = batch(5, seed=7, cost_penalty=price, reward_mode=reward_mode), batch(5, seed=7, reward_mode=reward_mode)
@@ -381,7 +381,7 @@ def test_the_careless_one_arrives_sooner_and_pays():
     assert last["episode_cost"].mean() > 5 and not last["is_safe_success"].any()
 
 
-def test_chance_never_arrives():
+def test_random_actions_never_arrive():
     rng = np.random.default_rng(0)
     last = play(lambda env: rng.uniform(-1, 1, (20, 6)))
     assert not last["is_success"].any() and last["normalized_performance"].max() < 0.1

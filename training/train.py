@@ -91,9 +91,8 @@ class Args:
             raise ValueError(f"--hyperparams {path}: there is no such file")
         table = yaml.safe_load(path.read_text())
         if not isinstance(table, dict) or self.env not in table:
-            raise ValueError(
-                f"{path} has no hyperparameters for {self.env!r} (there are: {', '.join(table or ())}): give a file with --hyperparams"
-            )
+            known = ", ".join(table or ())
+            raise ValueError(f"{path} has no hyperparameters for {self.env!r} (there are: {known}): give a file with --hyperparams")
         hyperparameters = dict(table[self.env])
         missing = [key for key in ("n_envs", "n_timesteps", "policy", "n_steps") if key not in hyperparameters]
         if missing:

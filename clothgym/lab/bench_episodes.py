@@ -28,7 +28,7 @@ from clothgym.starts import Fold, Maneuver, ZFold
 
 DRAPE = "ClothDrape-v0"
 MANY, STEPS = 128, 100  # environments and steps of an episode
-LETS_GO = 0.81  # chance acts below this, and so lets go in a step of a hundred
+LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a hundred
 SPACING, LEAF = 1 / 24, 8  # of the sheets that grow [m], and cells of a leaf
 FRAME, THICKNESS = 1 / 60, 0.008
 
@@ -81,13 +81,13 @@ def play(variants: dict[str, Row], expert: bool, num_envs: int = MANY, steps: in
         for env in envs.values():
             env.reset(seed=0)
         for step in range(steps):
-            chance = random.uniform(-1, LETS_GO, next(iter(envs.values())).action_space.shape).astype(np.float32)
+            drawn = random.uniform(-1, LETS_GO, next(iter(envs.values())).action_space.shape).astype(np.float32)
             for name, env in envs.items():
-                action = env.expert_actions() if expert else chance
+                action = env.expert_actions() if expert else drawn
                 begun = time.thread_time()
                 env.step(action)
                 best[name][step] = min(best[name][step], time.thread_time() - begun)
-            beat(f"{DRAPE} {'expert' if expert else 'chance'}: round {turn + 1} of {rounds}, step {step + 1} of {steps}")
+            beat(f"{DRAPE} {'expert' if expert else 'random'}: round {turn + 1} of {rounds}, step {step + 1} of {steps}")
     return {name: float(times.mean()) * 1e6 / num_envs for name, times in best.items()}
 
 
@@ -107,9 +107,9 @@ def contact() -> list[Row]:
 def strict() -> list[Row]:
     both = {**SHEET, "self_collision": "strict"}
     expert = play({"without": PARTICLES, "with": STRICT, "both": both, "rigid": {**both, "bending": "quadratic"}}, expert=True)
-    chance = play({"without": PARTICLES, "with": STRICT}, expert=False)
+    random = play({"without": PARTICLES, "with": STRICT}, expert=False)
     name, rows = f"{DRAPE}, strict self-collision", []
-    for actor, us, goal in (("expert", expert, 120), ("chance", chance, 350)):
+    for actor, us, goal in (("expert", expert, 120), ("random", random, 350)):
         rows.append(row_of("strict", f"{name}, {actor}, {MANY}", us["with"] - us["without"], "us more", goal))
     rows.append(row_of("strict", f"{name} and sheet, expert, {MANY}", 1e6 / expert["both"], "steps/s", 3500, least=True))
     rigid = f"{name}, sheet and rigidity (quadratic), expert, {MANY}"
@@ -122,7 +122,7 @@ def strict() -> list[Row]:
 def env() -> list[Row]:
     """Steps per second of ``gym.make``, with resets."""
     rows = []
-    cases = [(env_id, actor) for env_id in ENVIRONMENTS for actor in ("chance", "expert")]
+    cases = [(env_id, actor) for env_id in ENVIRONMENTS for actor in ("random", "expert")]
     made = {case: make(case[0], physics="fast") for case in cases}
     times: dict[tuple[str, str], list[float]] = {case: [] for case in cases}
     for turn in range(6):
@@ -165,7 +165,7 @@ def overhead() -> list[Row]:
 
 
 def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> float:
-    """Time of an environment step without its physics, with resets and random actions [us]: median of rounds."""
+    """Microseconds of an environment step without its physics, resets included, the median of rounds, with random actions."""
     random, adapted = np.random.default_rng(0), not isinstance(one, gym.Env | gym.vector.VectorEnv)
     simulation = (one.env if adapted else one).unwrapped.task.simulation
     one.reset() if adapted else one.reset(seed=0)
