@@ -1,20 +1,28 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
+# make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 ENV ?= ClothDrape-v0
 SEED ?= 0
+QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 
-.PHONY: train test bench clean
+.PHONY: train check lint test bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
 
-test: $(VENV)/ready
+lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -q -n 2
+
+check: lint
+	$(BIN)/python -m pytest -q -n 2 $(QUICK:%=tests/test_%.py)
+	$(BIN)/python -m pytest -q -k "refused or wrong" tests/test_cli.py tests/test_training.py
+
+test: lint
+	$(BIN)/python -m pytest -q -n 2 --durations=10
 
 bench: $(VENV)/ready
 	$(BIN)/python -m clothgym bench
