@@ -102,8 +102,8 @@ def time_step_of(name: str) -> float:
     if name in SCENES:
         return STEPS * FRAME
     entry: Any = gym.spec(name).entry_point
-    environment = gym.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
-    return environment.task_class.physics.time_step  # type: ignore[attr-defined]
+    environment: Any = gym.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
+    return environment.task_class.physics.time_step
 
 
 def export(
