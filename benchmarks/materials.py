@@ -15,10 +15,11 @@ import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.collisions import Capsule
 from clothgym.lab.bench import machine
 from clothgym.lab.scenes import Drape, bending_length, cantilever, cusick_drape
 from clothgym.material import PRESETS, Material
-from clothgym.render import Camera, Renderer, Solid
+from clothgym.render import Camera, Renderer
 
 RESULT = Path(__file__).parent / "results" / "materials.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "materials.png"
@@ -93,7 +94,7 @@ def table(rows: list[Row]) -> str:
 def draw(drapes: list[Drape]) -> NDArray[np.uint8]:
     """The specimens from above and from the side, (height, width, 3)."""
     mesh = drapes[0].mesh
-    support = Solid(kind="capsule", center=(0.0, 0.0, HEIGHT / 2 - 0.005), radius=0.02, height=HEIGHT - 0.01)
+    support = Capsule(center=(0.0, 0.0, HEIGHT / 2 - 0.005), radius=0.02, height=HEIGHT - 0.01)
     rows = []
     for eye in ((0.0, -0.02, 0.72), (0.0, -0.52, 0.2)):
         camera = Camera(eye, target=(0.0, 0.0, 0.06), vertical_fov=32.0)

@@ -20,7 +20,6 @@ from clothgym import Box, MeshCollider, Plane, Simulation, grid
 from clothgym.envs.pictures import draw, renderer_of
 from clothgym.render.camera import Camera
 from clothgym.render.renderer import Renderer
-from clothgym.render.solids import Solid
 from clothgym.starts import MANEUVERS
 
 HERE = Path(__file__).parent
@@ -89,20 +88,14 @@ def draw_contact() -> None:
     above = mesh.rest_positions * [0.95, 0.95, 1] + [0, 0, 0.32]
     vertices, triangles = stool()
     on_corner = (0.88, 0.3647, -0.2798, 0.1159)  # a box whose diagonal stands upright
-    scenes = [
-        (
-            MeshCollider(vertices=vertices, triangles=triangles, friction=0.4),
-            Solid(kind="mesh", center=(0, 0, 0), vertices=vertices, triangles=triangles),
-        ),
-        (
-            Box(center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner, friction=0.4),
-            Solid(kind="box", center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner),
-        ),
+    solids = [
+        MeshCollider(vertices=vertices, triangles=triangles, friction=0.4),
+        Box(center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner, friction=0.4),
     ]
     camera = Camera(eye=(1.0, -1.1, 0.8), target=(0, 0, 0.1))
     frames = []
-    for collider, solid in scenes:
-        cloth = Simulation(mesh, colliders=[Plane(friction=0.5), collider], self_collision="strict")
+    for solid in solids:
+        cloth = Simulation(mesh, colliders=[Plane(friction=0.5), solid], self_collision="strict")
         cloth.set_parameters(air_drag=1.0)
         cloth.reset(positions=above)
         cloth.step(150)
@@ -116,7 +109,7 @@ def draw_contact() -> None:
     iio.imwrite(HERE / "contact.png", np.concatenate(frames, axis=1))
 
 
-def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Solid]) -> Any:
+def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any:
     """One sheet, (height, width, 3)."""
     renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3, grid_shape=mesh.shape)
     return renderer.rgb(positions[0], solids)

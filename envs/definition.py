@@ -22,7 +22,7 @@ from clothgym.envs.stepping import IN_NUMPY, Kernels
 from clothgym.simulation import Simulation
 
 if TYPE_CHECKING:
-    from clothgym.render import Camera, Solid
+    from clothgym.render import Camera, Drawable
 
 HELD = (250, 200, 60)  # color of the anchors' markers
 POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
@@ -171,13 +171,13 @@ class TaskDefinition:
         """The particles that are observed with ``obs_mode="keypoints"``."""
         return key_particles(self.physics.mesh)
 
-    def solids(self, env: int) -> list[Solid]:
+    def solids(self, env: int) -> list[Drawable]:
         """What the renderer draws beside the sheet and the floor: by default all solids but planes, where they are now."""
-        from clothgym.envs.pictures import solid_of  # imported here: training draws nothing
+        from clothgym.render.solids import drawn  # imported here: training draws nothing
 
         colliders = dict(enumerate(self.simulation.colliders)) | dict(self.episode_colliders(env))
-        places = self.simulation.collider_positions[env].tolist()
-        return [solid_of(one, tuple(places[k])) for k, one in colliders.items() if not isinstance(one, Plane)]
+        places = self.simulation.collider_positions[env]
+        return [drawn(one).at(places[k]) for k, one in colliders.items() if not isinstance(one, Plane)]
 
     def markers(self, env: int) -> list[Any]:
         """What is drawn and casts no shadow: by default the anchors that hold the sheet."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
+from clothgym.collisions import Box
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.task import Task
 
@@ -51,8 +52,6 @@ class GripperTask(Task):
 
     def markers(self, env: int) -> list[Any]:
         """The grippers: two fingers and a palm each."""
-        from clothgym.render import Solid  # imported here: training draws nothing
-
         solids, grippers = [], self.simulation.grippers
         for k, gripper in enumerate(self.physics.grippers):
             x, y, z = grippers.positions[env, k].tolist()
@@ -60,6 +59,6 @@ class GripperTask(Task):
             opening = 0.0 if grippers.held[env, k] else float(grippers.openings[env, k])
             half = 0.006 + opening * gripper.span / 2
             for finger in (x - half, x + half):
-                solids.append(Solid(kind="box", center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03), color=FINGER))
-            solids.append(Solid(kind="box", center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012), color=PALM))
+                solids.append((Box(center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03)), FINGER))
+            solids.append((Box(center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012)), PALM))
         return solids

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import one_of
-from clothgym.collisions import Box, Capsule, Collider, MeshCollider, Sphere
 from clothgym.envs.task import Task
 from clothgym.forces import structural_strain
 
 if TYPE_CHECKING:
-    from clothgym.render import Renderer, Solid
+    from clothgym.render import Renderer
 
 RENDER_MODES = ["rgb_array", "depth_array"]
 RENDER_COLORS = ("fabric", "strain")
@@ -33,23 +32,6 @@ def renderer_of(task: Task, width: int, height: int, antialias: int = 2) -> Rend
 
     mesh, uv = task.physics.mesh, task.physics.mesh.rest_positions[:, :2]
     return Renderer(mesh.triangles, uv, task.camera(), width, height, antialias, task.threads, grid_shape=mesh.shape)
-
-
-def solid_of(collider: Collider, center: tuple[float, float, float]) -> Solid:
-    """A collider as the renderer draws it, with its center there [m]."""
-    from clothgym.render import Solid  # imported here: training draws nothing
-
-    match collider:
-        case Sphere():
-            return Solid(kind="sphere", center=center, radius=collider.radius)
-        case Capsule():
-            return Solid(kind="capsule", center=center, radius=collider.radius, height=collider.height)
-        case Box():
-            return Solid(kind="box", center=center, half_sides=collider.half_sides, yaw=collider.yaw, rotation=collider.rotation)
-        case MeshCollider():
-            vertices, triangles = collider.surface
-            return Solid(kind="mesh", center=center, vertices=vertices, triangles=triangles, rotation=collider.rotation)
-    raise ValueError(f"collider={collider!r}: has no picture")
 
 
 def draw(task: Task, renderer: Renderer, mode: str, envs: Sequence[int], color: str = "fabric") -> NDArray:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import vector
-from clothgym.collisions import Collider
+from clothgym.collisions import Collider, Sphere
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
@@ -152,10 +152,8 @@ class ReachTask(Task):
         return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
 
     def markers(self, env: int) -> list[Any]:
-        from clothgym.render import Solid  # imported here: training draws nothing
-
-        goal = Solid(kind="sphere", center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE, color=GOAL)
-        return [*super().markers(env), goal]
+        goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE)
+        return [*super().markers(env), (goal, GOAL)]
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

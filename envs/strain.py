@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clothgym import integrators
 from clothgym._jit import inlined
 from clothgym.checks import not_negative, positive
-from clothgym.collisions import Capsule, Collider
+from clothgym.collisions import Capsule, Collider, Sphere
 from clothgym.envs import carriers
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
@@ -296,10 +296,8 @@ class StrainTask(Task):
         return (velocities / self.physics.hand_speed).reshape(self.num_envs, 6)
 
     def markers(self, env: int) -> list[Any]:
-        from clothgym.render import Solid  # imported here: training draws nothing
-
         ahead = [
-            Solid(kind="sphere", center=tuple(x.tolist()), radius=0.02, color=GOAL if k == WAYPOINTS - 1 else WAYPOINT)
+            (Sphere(center=tuple(x.tolist()), radius=0.02), GOAL if k == WAYPOINTS - 1 else WAYPOINT)
             for k in range(int(self.episode["next"][env]), WAYPOINTS)
             for x in self.episode["places"][env, k]
         ]

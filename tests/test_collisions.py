@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from clothgym import INTEGRATORS, Box, Capsule, Material, Plane, Simulation, Sphere, grid
+from clothgym.collisions.solids.shapes import KIND_MESH, Collider
 
 NAMES = list(INTEGRATORS)
 # explicit Euler moves on with the velocity of before: what gravity has just added is stopped a substep later
@@ -31,6 +32,20 @@ def test_plane_distance():
     assert distances(Plane(point=(0.1, 0, 0), normal=(1, 2, 2), thickness=0.01), x) == pytest.approx(
         (x - (0.1, 0, 0)) @ normal - 0.01
     )
+
+
+@pytest.mark.parametrize("kind", [3, -1, KIND_MESH])
+def test_shapes_that_no_kernel_knows_are_refused(kind):
+    """Of another kind, or a mesh without a grid; and in a simulation too, should a class of somebody's own leave out the checks."""
+    message = f"Cone kind={kind}: .* Plane, Sphere, Capsule, Box or MeshCollider"
+    cone = type("Cone", (Collider,), {"kind": kind, "_shape": lambda self, rows: None})
+    with pytest.raises(TypeError, match=message):
+        cone()
+    cone.__post_init__ = lambda self: None
+    with pytest.raises(TypeError, match=message):
+        Simulation(grid(2, 2, 1.0, 1.0), colliders=[cone()])
+    with pytest.raises(ValueError, match="is a Sphere: a Cone cannot take its place"):
+        Simulation(grid(2, 2, 1.0, 1.0), colliders=[Sphere()]).set_collider(0, [cone()])
 
 
 def test_sphere_distance():

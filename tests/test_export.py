@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from clothgym import Simulation, Sphere, grid
-from clothgym.render import MeshSequence, Solid, write_animation, write_meshes, write_picture, write_video
+from clothgym.render import MeshSequence, write_animation, write_meshes, write_picture, write_video
 
 trimesh = pytest.importorskip("trimesh")
 
 MESH = grid(6, 5, 0.5, 0.4)
 UV = MESH.rest_positions[:, :2] / 0.5 + 0.5
-BALL = Solid(kind="sphere", center=(0.0, 0.0, 0.1), radius=0.1)
+BALL = Sphere(center=(0.0, 0.0, 0.1), radius=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def accessor(document, binary, number):
 
 def test_an_animation_gives_each_frame_back_at_its_time(simulated, tmp_path):
     path = tmp_path / "film.glb"
-    moved = [[Solid(kind="sphere", center=(0.1 * k, 0.0, 0.1), radius=0.1), BALL] for k in range(5)]
+    moved = [[Sphere(center=(0.1 * k, 0.0, 0.1), radius=0.1), BALL] for k in range(5)]
     write_animation(path, simulated, MESH.triangles, UV, fps=20, solids=moved)
     np.testing.assert_array_equal(read(path)[1]["cloth"].vertices.astype(np.float32), simulated[0])
     document, binary = chunks(path)

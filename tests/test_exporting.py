@@ -7,12 +7,13 @@ import pytest
 from test_export import read, shown
 
 from clothgym.cli import main
+from clothgym.collisions import Sphere
 from clothgym.playground import exporting
 from clothgym.playground.exporting import moments, stage_named
 from clothgym.playground.pictures import lasting, painter, strain_shares
 from clothgym.playground.scenes import scene_named
 from clothgym.playground.world import FRAME, drive
-from clothgym.render import Solid
+from clothgym.render import Drawn
 
 SHORT = ["--seconds", "0.2"]  # six frames
 
@@ -70,8 +71,8 @@ def test_an_episode_is_told_to_its_end_and_plays_as_one_mesh(tmp_path):
 
 
 def test_what_comes_or_goes_has_no_place_in_one_moving_mesh():
-    ball, pin = Solid(kind="sphere", center=(0, 0, 1), radius=0.2), Solid(kind="sphere", center=(0, 0, 1), radius=0.01)
-    there = Solid(kind="sphere", center=(0, 1, 1), radius=0.2)
+    ball, pin = (Drawn(Sphere(center=(0, 0, 1), radius=radius)) for radius in (0.2, 0.01))
+    there = Drawn(Sphere(center=(0, 1, 1), radius=0.2))
     assert lasting([[pin, ball, pin], [there, pin]]) == [[ball], [there]]
 
 

@@ -1,5 +1,7 @@
 """Colliders of any closed mesh: their distances against brute force, and refusals that say what to do."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from solids import ON_ITS_CORNER, bowl, box_distance, box_mesh, chair, mesh_distance, rotation
@@ -126,6 +128,8 @@ def test_places_in_a_batch():
     for wrong, message in ((other, "MeshCollider of another mesh"), (Plane(), "Plane")):
         with pytest.raises(ValueError, match=message):
             simulation.set_collider(0, [wrong], envs=[0])
+    again = MeshCollider(vertices=vertices.copy(), triangles=triangles.copy())
+    assert again == solid and hash(again) == hash(solid) and solid not in (other, replace(solid, center=(0, 0, 1)))
     state = simulation.get_state()
     simulation.step(3)
     after = simulation.positions

@@ -9,8 +9,9 @@ import sys
 import numpy as np
 import pytest
 
+from clothgym.collisions import Box, Capsule, Plane, Sphere
 from clothgym.mesh import grid
-from clothgym.render import Camera, Renderer, Solid
+from clothgym.render import Camera, Renderer
 from clothgym.render.surface import push_out
 
 SIDE = 0.6
@@ -78,10 +79,11 @@ def test_sky_is_infinitely_far():
 @pytest.mark.parametrize(
     ("solid", "nearest"),
     [
-        (Solid(kind="sphere", center=(0, 0, 0.5), radius=0.2), 1.8),
-        (Solid(kind="box", center=(0, 0.1, 0.5), half_sides=(0.1, 0.3, 0.2)), 1.8),
-        (Solid(kind="box", center=(0, 0.1, 0.5), half_sides=(0.3, 0.1, 0.2), yaw=math.pi / 2), 1.8),
-        (Solid(kind="capsule", center=(0, 0, 0.4), radius=0.1, height=0.6), 1.9),
+        (Sphere(center=(0, 0, 0.5), radius=0.2, thickness=0.05), 1.8),
+        (Box(center=(0, 0.1, 0.5), half_sides=(0.1, 0.3, 0.2)), 1.8),
+        (Box(center=(0, 0.1, 0.5), half_sides=(0.3, 0.1, 0.2), yaw=math.pi / 2), 1.8),
+        (Capsule(center=(0, 0, 0.4), radius=0.1, height=0.6), 1.9),
+        (Capsule(center=(0, 0.3, 0.5), radius=0.1, height=0.6, axis=(0, 1, 0)), 2.0),
     ],
 )
 def test_depth_of_solids_in_the_middle(solid, nearest):
@@ -92,7 +94,7 @@ def test_depth_of_solids_in_the_middle(solid, nearest):
 
 def test_sphere_depth_off_the_middle():
     # ray (0.05, 1, 0) from 2 m before a ball of radius 0.2: (1 + s^2) t^2 - 4 t + 4 - r^2 = 0
-    camera_depth = renderer(FACING, width=401, height=401).depth(FAR_AWAY, [Solid(kind="sphere", center=(0, 0, 0.5), radius=0.2)])
+    camera_depth = renderer(FACING, width=401, height=401).depth(FAR_AWAY, [Sphere(center=(0, 0, 0.5), radius=0.2)])
     scale = 200.5 / math.tan(math.radians(15))
     column = 200 + round(0.05 * scale)
     s = (column - 200) / scale
@@ -140,7 +142,7 @@ def test_triangles_leave_no_gap_along_common_edges():
 
 def test_the_nearer_surface_wins():
     draw = renderer(FACING, width=121, height=121)
-    ball = Solid(kind="sphere", center=(0, 0.4, 0.5), radius=0.2)
+    ball = Sphere(center=(0, 0.4, 0.5), radius=0.2)
     before = draw.depth(upright(y=0.1), [ball])[60, 60]
     behind = draw.depth(upright(y=0.7), [ball])[60, 60]
     assert before == pytest.approx(2.1, abs=1e-4)
@@ -149,7 +151,7 @@ def test_the_nearer_surface_wins():
 
 def test_cloth_resting_on_a_solid_hides_it():
     # the cloth lies 2 mm inside the front of the box, as chords between resting particles do
-    box = Solid(kind="box", center=(0, 0.2, 0.5), half_sides=(0.25, 0.2, 0.25), color=(20, 20, 200))
+    box = (Box(center=(0, 0.2, 0.5), half_sides=(0.25, 0.2, 0.25)), (20, 20, 200))
     draw = renderer(FACING)
     image = draw.rgb(upright(y=0.002), [box]).astype(float)[35:85, 35:85]
     assert np.all(image[..., 0] > image[..., 2])
@@ -202,7 +204,7 @@ def test_a_batch_equals_single_pictures(threads):
     draw = renderer(smooth=True, threads=threads, width=64, height=48, antialias=2)
     rng = np.random.default_rng(1)
     x = np.stack([sheet(z=0.1 + 0.1 * i) + rng.normal(0, 0.01, (81, 3)) for i in range(5)])
-    solids = [[Solid(kind="sphere", center=(0, 0, 0.1), radius=0.1)] * (i % 3) for i in range(5)]
+    solids = [[Sphere(center=(0, 0, 0.1), radius=0.1)] * (i % 3) for i in range(5)]
     markers = [[(x[i, 0], (250, 250, 250))] for i in range(5)]
     images, depths = draw.rgb_batch(x, solids, markers), draw.depth_batch(x, solids, markers)
     hot = rng.uniform(0, 1, (5, 81))
@@ -275,23 +277,19 @@ def test_wrong_renderers_are_refused(options, message):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("solid", "message"),
     [
-        ({"kind": "cone", "radius": 1.0}, "kind='cone': must be one of sphere, box, capsule"),
-        ({"kind": "sphere"}, "radius=None"),
-        ({"kind": "sphere", "radius": -1.0}, "radius=-1.0"),
-        ({"kind": "sphere", "radius": 1.0, "height": 1.0}, "has no height"),
-        ({"kind": "box", "half_sides": (1.0, 1.0)}, "half_sides"),
-        ({"kind": "box", "half_sides": (1.0, 1.0, 0.0)}, "half_sides"),
-        ({"kind": "box", "half_sides": (1.0, 1.0, 1.0), "yaw": math.nan}, "yaw=nan"),
-        ({"kind": "capsule", "radius": 1.0, "height": 1.5}, "at least twice"),
-        ({"kind": "sphere", "radius": 1.0, "color": (1, 2)}, "color"),
-        ({"kind": "sphere", "radius": 1.0, "center": (0, math.nan, 0)}, "center"),
+        ("ball", "'ball' cannot be drawn: must be a Sphere, Capsule, Box or MeshCollider"),
+        ((0, 0, 0), r"\(0, 0, 0\) cannot be drawn"),
+        (Plane(), "Plane.* cannot be drawn: .* the floor z = 0 is always drawn"),
+        ((Sphere(), (1, 2)), r"color of Sphere.*=\(1, 2\): must be three numbers from 0 to 255"),
+        (((0, math.nan, 0), (1, 2, 3)), "center holds a value that is not finite"),
     ],
 )
-def test_wrong_solids_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        Solid(**{"center": (0.0, 0.0, 0.0), **arguments})
+def test_what_cannot_be_drawn_is_refused(solid, message):
+    for things in ({"solids": [solid]}, {"markers": [solid]}):
+        with pytest.raises(ValueError, match=message):
+            renderer().depth(sheet(), **things)
 
 
 @pytest.mark.parametrize(
@@ -316,13 +314,9 @@ def test_wrong_scenes_are_refused():
         renderer().rgb_batch(sheet())
     with pytest.raises(ValueError, match="solids has 1 entries for 2 environments"):
         renderer().rgb_batch(np.stack([sheet(), sheet()]), [[]])
-    with pytest.raises(ValueError, match="must be a clothgym"):
-        renderer().rgb(sheet(), ["ball"])
     for values in (np.zeros(80), np.full(81, np.nan)):
         with pytest.raises(ValueError, match=r"values have shape .* one for each particle"):
             renderer().rgb(sheet(), values=values)
-    with pytest.raises(ValueError, match=r"marker \(0, 0, 0\)"):
-        renderer().rgb(sheet(), (), [(0, 0, 0)])
 
 
 def test_import_is_light():

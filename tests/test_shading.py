@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from test_render import FACING, FAR_AWAY, SIDE, renderer, sheet, upright
 
+from clothgym.collisions import Box, MeshCollider, Sphere
 from clothgym.forces import structural_strain
 from clothgym.mesh import grid
-from clothgym.render import Camera, Solid
+from clothgym.render import Camera, Drawn
 from clothgym.render.heat import heat_colors, largest_at_particles
 from clothgym.render.shading import CREAM
 
@@ -96,7 +97,7 @@ def test_a_shadow_is_softer_the_farther_above_the_floor_its_caster_is():
     empty = linear(draw.rgb(FAR_AWAY))[..., 0]
     steepest = {}
     for z in (0.15, 0.55):
-        plate = [Solid(kind="box", center=(-0.1, 0, z), half_sides=(0.05, 0.05, 0.005))]
+        plate = [Box(center=(-0.1, 0, z), half_sides=(0.05, 0.05, 0.005))]
         kept = linear(draw.rgb(FAR_AWAY, plate))[..., 0] / empty
         covered = draw.depth(FAR_AWAY, plate) < 1.59
         near = [np.roll(covered, way, axis) for way in (-2, -1, 0, 1, 2) for axis in (0, 1)]
@@ -179,13 +180,13 @@ def test_markers_are_spheres_of_their_colour():
     draw = renderer(FACING, width=121, height=121)
     image = draw.rgb(FAR_AWAY, (), [((0, 0, 0.5), (20, 200, 20))])
     assert image[60, 60, 1] > 1.5 * image[60, 60, 0]
-    large = draw.rgb(FAR_AWAY, (), [Solid(kind="sphere", center=(0, 0, 0.5), radius=0.1, color=(20, 200, 20))])
+    large = draw.rgb(FAR_AWAY, (), [(Sphere(center=(0, 0, 0.5), radius=0.1), (20, 200, 20))])
     assert large[60, 70, 1] > 1.5 * large[60, 70, 0]
 
 
 def test_supersampling_averages_linear_light():
     """Doubling the samples keeps the mean light: what is bright once is not lost to the gamma curve."""
-    x, ball = sheet(z=0.2), [Solid(kind="sphere", center=(0, 0, 0.1), radius=0.1)]
+    x, ball = sheet(z=0.2), [Sphere(center=(0, 0, 0.1), radius=0.1)]
 
     def light(antialias):
         return linear(renderer(antialias=antialias).rgb(x, ball)).mean()
@@ -196,7 +197,7 @@ def test_supersampling_averages_linear_light():
 def test_a_mesh_is_smooth_but_at_its_creases():
     trimesh = pytest.importorskip("trimesh")
     ball, cube = trimesh.creation.icosphere(subdivisions=3, radius=0.2), trimesh.creation.box((0.2, 0.2, 0.2))
-    shapes = [Solid(kind="mesh", center=(0, 0, 0), vertices=m.vertices, triangles=m.faces) for m in (ball, cube)]
+    shapes = [Drawn(MeshCollider(vertices=m.vertices, triangles=m.faces, resolution=8)) for m in (ball, cube)]
     smooth, edged = (shape.mesh() for shape in shapes)
     np.testing.assert_allclose(smooth.normals, smooth.positions / 0.2, atol=0.02)
     assert np.all(np.sort(np.abs(edged.normals), axis=1) == [0, 0, 1])

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices, known, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.envs.definition import HELD
 from clothgym.envs.episode import within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
@@ -20,8 +19,7 @@ from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stab
 from clothgym.playground.world import FIGURES as SLIDERS
 from clothgym.playground.world import Settings
 from clothgym.registration import checked_id
-from clothgym.render import Solid
-from clothgym.render.renderer import MARKER_RADIUS
+from clothgym.render.solids import drawn
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
@@ -143,13 +141,12 @@ class EpisodeStage(Stage):
 
     def _look(self, terms: Mapping[str, float]) -> Frame:
         s, task = self.simulation, self.env.task
-        markers = [mark if isinstance(mark, Solid) else _dot(*mark) for mark in task.markers(0)]
         return Frame(
             time=self._time,
             positions=visible(s.positions),
             stiffness=stiffness(s)[None],
             touching=touching(s)[None],
-            solids=(*task.solids(0), *markers),
+            solids=tuple(map(drawn, [*task.solids(0), *task.markers(0)])),
             readings={
                 name: np.array([value])
                 for name, value in read(s, self._cost, float(s.penetration()[0]) if s.colliders else 0.0).items()
@@ -280,11 +277,6 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
         strain_limit=simulation.strain_limit,
         substeps=simulation.substeps,
     )
-
-
-def _dot(center: Any, color: tuple[int, int, int] = HELD) -> Solid:
-    x, y, z = np.asarray(center, float).tolist()
-    return Solid(kind="sphere", center=(x, y, z), radius=MARKER_RADIUS, color=color)
 
 
 def _judgement(info: Mapping[str, Any], total: float) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from clothgym.checks import one_of
 from clothgym.forces import structural_strain
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.show import sides
-from clothgym.render import Camera, Renderer, Solid, write_animation
+from clothgym.render import Camera, Drawn, Renderer, write_animation
 from clothgym.render.heat import largest_at_particles
 
 COLORS = ("fabric", "strain")
@@ -78,12 +77,8 @@ def write_moving_mesh(path: Path, recording: Recording, frames: Sequence[Frame],
     write_animation(path, np.stack([together(frame) for frame in frames]), *joined(recording), rate, solids)
 
 
-def lasting(solids: Sequence[Sequence[Solid]]) -> list[list[Solid]]:
+def lasting(solids: Sequence[Sequence[Drawn]]) -> list[list[Drawn]]:
     """The solids that all frames have: those that come or go, as a gripper that opens, cannot be part of one moving mesh."""
-
-    def look(solid: Solid) -> tuple[Any, ...]:
-        return solid.kind, solid.radius, solid.half_sides, solid.height, solid.color
-
-    counts = [Counter(map(look, things)) for things in solids]
-    kept = {key for key, number in counts[0].items() if all(other[key] == number for other in counts)}
-    return [[solid for solid in things if look(solid) in kept] for things in solids]
+    counts = [Counter(solid.at_origin for solid in things) for things in solids]
+    kept = {shape for shape, number in counts[0].items() if all(other[shape] == number for other in counts)}
+    return [[solid for solid in things if solid.at_origin in kept] for things in solids]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import positive
+from clothgym.collisions import MeshCollider
 from clothgym.material import spring_stiffness
 from clothgym.mesh import SHEAR, ClothMesh, Hinges, Springs, frozen
 from clothgym.parameters import FIGURES
-from clothgym.render import Camera, Solid
+from clothgym.render import Camera, Drawn
+from clothgym.render.solids import KINDS
 from clothgym.simulation import Simulation
 
 TOUCHING = 1e-3  # distance from where it would rest within which a particle touches a solid [m]
@@ -41,7 +43,7 @@ class Frame:
     positions: NDArray[np.float32]
     stiffness: NDArray[np.float64]
     touching: NDArray[np.bool_]
-    solids: tuple[Solid, ...] = ()
+    solids: tuple[Drawn, ...] = ()
     readings: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     terms: Mapping[str, float] = field(default_factory=dict)
 
@@ -130,9 +132,9 @@ class Recording:
         if not self.frames:
             raise ValueError(f"{str(path)!r}: there are no frames to save yet")
         frames = self.frames
-        shapes: dict[str, int] = {}
+        shapes: dict[Drawn, int] = {}
         solids = [
-            (number, shapes.setdefault(_told(replace(solid, center=(0.0, 0.0, 0.0))), len(shapes)), *solid.center)
+            (number, shapes.setdefault(solid.at_origin, len(shapes)), *solid.collider.center)
             for number, frame in enumerate(frames)
             for solid in frame.solids
         ]
@@ -149,7 +151,7 @@ class Recording:
                 arrays[f"{kind}: {name}"] = _column([getattr(frame, kind).get(name) for frame in frames])
         about = {
             "title": self.title, "time_step": self.time_step, "labels": list(self.labels), "strained": self.strained,
-            "camera": asdict(self.camera), "shapes": list(shapes), "grid": self.mesh.shape, "size": self.mesh.size,
+            "camera": asdict(self.camera), "shapes": list(map(_as_text, shapes)), "grid": self.mesh.shape, "size": self.mesh.size,
         }  # fmt: skip
         mesh = {f"mesh: {name}": getattr(self.mesh, name) for name in MESH}
         mesh |= {f"springs: {name}": value for name, value in self.mesh.springs._asdict().items()}
@@ -200,10 +202,10 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
             raise ValueError(f"{name} name particles that there are not")
     if len(about["labels"]) != positions.shape[1]:
         raise ValueError(f"it has {positions.shape[1]} sheets and names for {len(about['labels'])}")
-    shapes = [_solid(text) for text in about["shapes"]]
-    solids: list[list[Solid]] = [[] for _ in range(count)]
+    shapes = [_from_text(text) for text in about["shapes"]]
+    solids: list[list[Drawn]] = [[] for _ in range(count)]
     for number, shape, *center in arrays["solids"].tolist():
-        solids[int(number)].append(replace(shapes[int(shape)], center=tuple(center)))
+        solids[int(number)].append(shapes[int(shape)].at(center))
     readings, terms = fields_of("readings"), fields_of("terms")
     frames = [
         Frame(
@@ -223,12 +225,22 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
     )
 
 
-def _told(solid: Solid) -> str:
-    return json.dumps({k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(solid).items()}, sort_keys=True)
+def _as_text(solid: Drawn) -> str:
+    collider = solid.collider
+    written = {"kind": solid.kind, "color": solid.color} | {item.name: getattr(collider, item.name) for item in fields(collider)}
+    if isinstance(collider, MeshCollider):  # its file may be gone when it is read
+        vertices, triangles = collider.surface
+        written |= {"path": None, "scale": 1.0, "vertices": vertices, "triangles": triangles}
+    return json.dumps(written, default=lambda value: value.tolist())
 
 
-def _solid(text: str) -> Solid:
+def _from_text(text: str) -> Drawn:
     given: dict[str, Any] = json.loads(text)
-    for name in ("vertices", "triangles"):
-        given[name] = None if given[name] is None else np.array(given[name])
-    return Solid(**{name: tuple(value) if isinstance(value, list) else value for name, value in given.items()})  # type: ignore[arg-type]
+    kind = KINDS[given["kind"]]
+    # in older files each solid has the sizes of all kinds, and those that are not its own are null
+    own = {item.name: _tuple(given[item.name]) for item in fields(kind) if given.get(item.name) is not None}
+    return Drawn(kind(**own), _tuple(given["color"]))
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

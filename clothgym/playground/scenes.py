@@ -11,7 +11,7 @@ from clothgym.checks import known
 from clothgym.collisions import Box, Capsule, MeshCollider, Plane, Sphere
 from clothgym.mesh import ClothMesh, grid
 from clothgym.playground.world import Scene, Settings, Targets
-from clothgym.render import Camera, Solid
+from clothgym.render import Camera, Drawn
 
 STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colors of solids
 SWING_DRAG = 0.75  # linear drag that damps slow swinging [N s/m^3]
@@ -122,7 +122,7 @@ def flag() -> Scene:
     columns = mesh.grid_shape[1]
     hoist = tuple(range((mesh.grid_shape[0] - 1) * columns, -1, -columns))
     start = hung(mesh, 1.5)
-    pole = Solid(kind="capsule", center=(-0.462, 0.0, 0.79), radius=0.012, height=1.58, color=STEEL)
+    pole = Drawn(Capsule(center=(-0.462, 0.0, 0.79), radius=0.012, height=1.58), STEEL)
     return Scene(
         name="flag",
         title=TITLES["flag"],

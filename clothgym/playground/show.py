@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from clothgym.lab.compare_pictures import COLORS
 from clothgym.mesh import EDGE, STRUCTURAL_X
 from clothgym.playground.recording import Frame, Recording, strains, tensions, yarns
 from clothgym.playground.stage import UNLIMITED, Hand
-from clothgym.render import Solid
+from clothgym.render import Drawn
 from clothgym.render.shading import CORAL, INDIGO
 from clothgym.render.solids import linear_color
 
@@ -111,7 +110,7 @@ class Show:
             )
             for name, color, size in (("touching", TOUCH, 0.011), ("held", HOLD, 0.018))
         }
-        self._solids: dict[tuple[Solid, int], list[Any]] = defaultdict(list)
+        self._solids: dict[Drawn, list[Any]] = defaultdict(list)
         self._handles: dict[int, Any] = {}
 
     def draw(self, frame: Frame, mode: str, diagonals: bool = False) -> None:
@@ -142,14 +141,14 @@ class Show:
         if len(points):
             self._dots[name].points = np.asarray(points, np.float32)
 
-    def _place(self, solids: Sequence[Solid]) -> None:
+    def _place(self, solids: Sequence[Drawn]) -> None:
         """Each solid has a node of its shape; those without a solid now are hidden."""
-        used: dict[tuple[Solid, int], int] = defaultdict(int)
+        used: dict[Drawn, int] = defaultdict(int)
         for solid in solids:
-            shape = replace(solid, center=(0.0, 0.0, 0.0)), id(solid.vertices)
+            shape = solid.at_origin
             nodes = self._solids[shape]
             if used[shape] == len(nodes):
-                mesh = shape[0].mesh()
+                mesh = shape.mesh()
                 name = f"/solids/{len(self._solids)}_{len(nodes)}"
                 nodes.append(
                     self.scene.add_mesh_simple(
@@ -157,7 +156,7 @@ class Show:
                     )
                 )
             node = nodes[used[shape]]
-            node.position, node.visible = solid.center, True
+            node.position, node.visible = solid.collider.center, True
             used[shape] += 1
         for shape, nodes in self._solids.items():
             for node in nodes[used[shape] :]:

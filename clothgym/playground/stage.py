@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,6 @@ from clothgym.parameters import FIGURES, of_material
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.scenes import scene_named
 from clothgym.playground.world import FRAME, Scene, Settings, Targets, begin, drive
-from clothgym.render import Solid
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
@@ -296,7 +295,7 @@ class SceneStage(Stage):
             stiffness=np.stack([stiffness(sheet.simulation) for sheet in self.sheets]),
             touching=np.stack([sheet.touching for sheet in self.sheets]),
             solids=tuple(
-                moved(solid, offset)
+                solid.at(np.add(solid.collider.center, offset))
                 for sheet, offset in zip(self.sheets, self.offsets)
                 for solid in self.scene.solids(sheet.simulation)
             ),
@@ -430,9 +429,3 @@ def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Si
 def visible(x: NDArray) -> NDArray[np.float32]:
     """Positions that can be drawn [m]: values that are not finite or far away are clipped to the edge of the view."""
     return np.clip(np.nan_to_num(x, nan=0.0, posinf=9.0, neginf=-9.0), -9.0, 9.0).astype(np.float32)
-
-
-def moved(solid: Solid, offset: NDArray) -> Solid:
-    """The same solid somewhere else."""
-    x, y, z = (np.asarray(solid.center) + offset).tolist()
-    return replace(solid, center=(x, y, z))

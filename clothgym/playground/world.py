@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 from clothgym import integrators
 from clothgym.bending import BENDING
 from clothgym.checks import count, known, not_negative, one_of
-from clothgym.collisions import Box, Capsule, Collider, MeshCollider, Plane, Sphere
+from clothgym.collisions import Collider, Plane
 from clothgym.limiting import checked_limit
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
-from clothgym.render import Camera, Solid
+from clothgym.render import Camera, Drawn
+from clothgym.render.solids import WARM_GREY, drawn
 from clothgym.simulation import GRAVITY, Simulation
 
 FRAME = 1 / 60  # control step [s]
 Vector = tuple[float, float, float]
 FIGURES = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
-CLAY = (196, 189, 178)  # colour of solids
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ class Scene:
     handles: tuple[int, ...] = ()
     colliders: tuple[Collider, ...] = ()
     colours: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
-    scenery: tuple[Solid, ...] = ()
+    scenery: tuple[Drawn, ...] = ()
     motion: Callable[[float], tuple[NDArray, Targets]] | None = None
     rests: float = np.inf
     strained: float = 0.05
@@ -153,15 +153,17 @@ class Scene:
         begin(s, self)
         return s
 
-    def solids(self, simulation: Simulation | None = None) -> list[Solid]:
+    def solids(self, simulation: Simulation | None = None) -> list[Drawn]:
         """What is drawn beside the sheet and the floor: the solids where they are now, or at first."""
-        moved = None if simulation is None else simulation.collider_positions[0]
-        drawn = []
-        for number, collider in enumerate(self.colliders):
-            if not isinstance(collider, Plane):
-                center = collider.center if moved is None else tuple(moved[number].tolist())  # type: ignore[attr-defined]
-                drawn.append(solid_of(collider, center, self.colours.get(number, CLAY)))
-        return [*drawn, *self.scenery]
+        visible = [
+            (number, drawn((collider, self.colours.get(number, WARM_GREY))))
+            for number, collider in enumerate(self.colliders)
+            if not isinstance(collider, Plane)
+        ]
+        if simulation is None:
+            return [*(solid for _, solid in visible), *self.scenery]
+        places = simulation.collider_positions[0]
+        return [*(solid.at(places[number]) for number, solid in visible), *self.scenery]
 
 
 def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None:
@@ -191,21 +193,3 @@ def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | N
         simulation.move_anchors(targets)
     if scene.rests < time <= scene.rests + FRAME:
         simulation.release([0] * len(scene.held), scene.held)
-
-
-def solid_of(collider: Collider, center: Vector, colour: tuple[int, int, int]) -> Solid:
-    """A collider as it is drawn."""
-    match collider:
-        case Sphere():
-            return Solid(kind="sphere", center=center, radius=collider.radius, color=colour)
-        case Capsule():
-            return Solid(kind="capsule", center=center, radius=collider.radius, height=collider.height, color=colour)
-        case Box():
-            turn = {"yaw": collider.yaw, "rotation": collider.rotation}
-            return Solid(kind="box", center=center, half_sides=collider.half_sides, color=colour, **turn)  # type: ignore[arg-type]
-        case MeshCollider():
-            vertices, triangles = collider.surface
-            return Solid(
-                kind="mesh", center=center, vertices=vertices, triangles=triangles, rotation=collider.rotation, color=colour
-            )
-    raise ValueError(f"collider={collider!r}: has no picture")

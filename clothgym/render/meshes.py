@@ -13,7 +13,7 @@ from clothgym.checks import finite, one_of, positive
 from clothgym.render.export import replace_file
 from clothgym.render.gltf import Part, glb
 from clothgym.render.shading import CORAL
-from clothgym.render.solids import Color, Solid, check_color
+from clothgym.render.solids import Color, Drawable, check_color, drawn
 from clothgym.render.surface import vertex_normals
 
 KINDS = ("obj", "glb")
@@ -70,7 +70,7 @@ class MeshSequence:
         self._cloth = _checked_cloth(triangles, uv, color)
         without_frames(self.folder).mkdir(parents=True, exist_ok=True)
 
-    def add(self, positions: ArrayLike, solids: Sequence[Solid] = ()) -> Path:
+    def add(self, positions: ArrayLike, solids: Sequence[Drawable] = ()) -> Path:
         """Write the next frame, the cloth at ``positions`` [m], (particles, 3), and the solids; where it went.
 
         Raises:
@@ -89,7 +89,7 @@ def write_meshes(
     triangles: ArrayLike,
     uv: ArrayLike | None = None,
     kind: str = "obj",
-    solids: Sequence[Sequence[Solid]] | None = None,
+    solids: Sequence[Sequence[Drawable]] | None = None,
 ) -> list[Path]:
     """Write a ``MeshSequence`` in one call; its files.
 
@@ -107,7 +107,7 @@ def write_animation(
     triangles: ArrayLike,
     uv: ArrayLike | None = None,
     fps: float = 30.0,
-    solids: Sequence[Sequence[Solid]] | None = None,
+    solids: Sequence[Sequence[Drawable]] | None = None,
     color: Color = CORAL,
 ) -> None:
     """Write one ``.glb`` in which cloth and solids move; Blender plays it as it is.
@@ -126,15 +126,16 @@ def write_animation(
     replace_file(path, glb(_parts(frames, _checked_solids(solids, len(frames)), cloth), positive("fps", fps)))
 
 
-def _parts(frames: NDArray[np.float32], solids: Sequence[Sequence[Solid]], cloth: _Cloth) -> list[Part]:
+def _parts(frames: NDArray[np.float32], solids: Sequence[Sequence[Drawable]], cloth: _Cloth) -> list[Part]:
     """The cloth, and each solid, through all frames."""
     normals = np.empty_like(frames)
     for x, out in zip(frames, normals):
         vertex_normals(x, cloth.triangles, out)
     parts = [Part("cloth", frames, normals, cloth.triangles, cloth.uv, cloth.color)]
-    if len({tuple(solid.kind for solid in things) for things in solids}) > 1:
+    shown = [[drawn(solid) for solid in things] for things in solids]
+    if len({tuple(solid.kind for solid in things) for things in shown}) > 1:
         raise ValueError("the solids change in number or kind from frame to frame: an animation needs the same ones throughout")
-    for number, same in enumerate(zip(*solids)):
+    for number, same in enumerate(zip(*shown)):
         meshes = [solid.mesh() for solid in same]
         x, n = (np.stack([getattr(mesh, name) for mesh in meshes]) for name in ("positions", "normals"))
         parts.append(Part(f"{same[0].kind}_{number}", x, n, meshes[0].triangles, None, same[0].color))
@@ -190,7 +191,7 @@ def _checked_frames(positions: ArrayLike, cloth: _Cloth) -> NDArray[np.float32]:
     return frames
 
 
-def _checked_solids(solids: Sequence[Sequence[Solid]] | None, frames: int) -> Sequence[Sequence[Solid]]:
+def _checked_solids(solids: Sequence[Sequence[Drawable]] | None, frames: int) -> Sequence[Sequence[Drawable]]:
     solids = [()] * frames if solids is None else solids
     if len(solids) != frames:
         raise ValueError(f"solids has {len(solids)} entries for {frames} frames: give one sequence for each")

@@ -25,12 +25,9 @@ from clothgym.render.shading import (
     shade_surfaces,
     survey,
 )
-from clothgym.render.solids import Color, Solid, check_color, linear_color
+from clothgym.render.solids import Color, Drawable, Drawn, check_color, drawn, linear_color
 from clothgym.render.surface import place_vertices, plain_surface, push_out, smooth_surface, vertex_curvature, vertex_normals
 
-Marker = Solid | tuple[Sequence[float], Color]
-
-MARKER_RADIUS = 0.011  # [m]
 BIAS = 0.006  # distance by which the cloth is drawn closer to the eye [m]
 HIGHEST_LIFT, DEEPEST = 0.006, 0.03  # smooth cloth up to this deep in a solid is drawn above it, at most so high [m]
 FINE_CELLS, COARSE_CELLS = 64, 32  # cells along the longer side of the drawn cloth, in large and in small pictures
@@ -42,8 +39,8 @@ class _Things(NamedTuple):
     """What comes with the cloth's positions in one frame: solids, which hold it up, markers, which need not, and a number of each
     drawn vertex to show as a color, (vertices,), or none."""
 
-    solids: list[Solid]
-    markers: list[Solid]
+    solids: list[Drawn]
+    markers: list[Drawn]
     values: NDArray[np.float32]
 
 
@@ -127,13 +124,14 @@ class Renderer:
     def rgb(
         self,
         positions: ArrayLike,
-        solids: Sequence[Solid] = (),
-        markers: Sequence[Marker] = (),
+        solids: Sequence[Drawable] = (),
+        markers: Sequence[Drawable] = (),
         values: ArrayLike | None = None,
     ) -> NDArray[np.uint8]:
         """A picture, (height, width, 3) sRGB.
 
-        positions: of the particles [m], (particles, 3).  markers: small spheres, each a (position [m], color), or solids.
+        positions: of the particles [m], (particles, 3).  solids: colliders, each alone or as (collider, color).  markers: the
+        same, which the cloth need not lie upon, or small spheres, each a (position [m], color).
         values: a number of each particle, (particles,), that colors the fabric instead of its pattern, from the cream of
         ``heat.heat_colors`` at 0 and below to its violet at 1 and above.
         """
@@ -142,7 +140,7 @@ class Renderer:
         self._draw_rgb(x, self._checked_things(solids, markers, self._checked_values(values, x.shape[:1])), out)
         return out
 
-    def depth(self, positions: ArrayLike, solids: Sequence[Solid] = (), markers: Sequence[Marker] = ()) -> NDArray[np.float32]:
+    def depth(self, positions: ArrayLike, solids: Sequence[Drawable] = (), markers: Sequence[Drawable] = ()) -> NDArray[np.float32]:
         """Depth along the view axis at the middle of each pixel [m], (height, width); +inf where nothing is seen.
 
         The floor is seen up to its horizon.  Arguments as for ``rgb``.
@@ -155,8 +153,8 @@ class Renderer:
     def rgb_batch(
         self,
         positions: ArrayLike,
-        solids: Sequence[Sequence[Solid]] | None = None,
-        markers: Sequence[Sequence[Marker]] | None = None,
+        solids: Sequence[Sequence[Drawable]] | None = None,
+        markers: Sequence[Sequence[Drawable]] | None = None,
         values: ArrayLike | None = None,
     ) -> NDArray[np.uint8]:
         """Pictures of many environments, (environments, height, width, 3), with the pixels of ``rgb``.
@@ -172,8 +170,8 @@ class Renderer:
     def depth_batch(
         self,
         positions: ArrayLike,
-        solids: Sequence[Sequence[Solid]] | None = None,
-        markers: Sequence[Sequence[Marker]] | None = None,
+        solids: Sequence[Sequence[Drawable]] | None = None,
+        markers: Sequence[Sequence[Drawable]] | None = None,
     ) -> NDArray[np.float32]:
         """Depths of many environments [m], (environments, height, width), with the values of ``depth``."""
         x, things = self._checked_batch(positions, solids, markers)
@@ -221,9 +219,10 @@ class Renderer:
         normals = np.empty((first[-1], 3), np.float32)
         place_vertices(x, cloth.index, cloth.weight, vertices)
         lift = min(0.6 * cloth.cell, HIGHEST_LIFT)  # a cell across a sharp edge then just spans it
-        for solid in (solid for solid in things.solids if lift > 0 and solid.upright):
-            (half, radius), center = solid.rounded_box(), tuple(map(float, solid.center))
-            push_out(vertices, len(cloth.uv), center, math.cos(solid.yaw), math.sin(solid.yaw), half, radius, lift, DEEPEST)
+        for solid in (solid for solid in things.solids if lift > 0 and solid.kind != "mesh"):
+            (axes, half, radius), center = solid.rounded_box(), tuple(map(float, solid.collider.center))
+            if axes[2, 2] == 1:  # turned about z alone
+                push_out(vertices, len(cloth.uv), center, axes[0, 0], axes[0, 1], tuple(half.tolist()), radius, lift, DEEPEST)
         vertex_normals(vertices[: first[0]], cloth.triangles, normals[: first[0]])
         for mesh, start, end in zip(meshes, first, first[1:]):
             vertices[start:end], normals[start:end] = mesh.positions, mesh.normals
@@ -268,28 +267,17 @@ class Renderer:
         return numbers
 
     def _checked_things(
-        self, solids: Sequence[Solid], markers: Sequence[Marker], values: NDArray[np.float32] | None = None
+        self, solids: Sequence[Drawable], markers: Sequence[Drawable], values: NDArray[np.float32] | None = None
     ) -> _Things:
-        for solid in solids:
-            if not isinstance(solid, Solid):
-                raise ValueError(f"solid {solid!r}: must be a clothgym.render.Solid")
-        spheres = []
-        for marker in markers:
-            if not isinstance(marker, Solid):
-                if len(marker) != 2:
-                    raise ValueError(f"marker {marker!r}: must be (position in meters, color) or a clothgym.render.Solid")
-                center, color = marker
-                marker = Solid(kind="sphere", center=tuple(center), radius=MARKER_RADIUS, color=color)  # type: ignore[arg-type]
-            spheres.append(marker)
         cloth = self._cloth
-        drawn = np.empty(0, np.float32) if values is None else np.sum(cloth.weight * values[cloth.index], axis=1)
-        return _Things(list(solids), spheres, drawn)
+        shown = np.empty(0, np.float32) if values is None else np.sum(cloth.weight * values[cloth.index], axis=1)
+        return _Things(list(map(drawn, solids)), list(map(drawn, markers)), shown)
 
     def _checked_batch(
         self,
         positions: ArrayLike,
-        solids: Sequence[Sequence[Solid]] | None,
-        markers: Sequence[Sequence[Marker]] | None,
+        solids: Sequence[Sequence[Drawable]] | None,
+        markers: Sequence[Sequence[Drawable]] | None,
         values: ArrayLike | None = None,
     ) -> tuple[NDArray[np.float32], list[_Things]]:
         x = self._checked_positions(positions, 3)

@@ -1,28 +1,30 @@
-"""Solids to be drawn beside the cloth: named shapes, and the unit meshes that stand for them."""
+"""Solids drawn beside the cloth: a collider with a color, and the mesh of its surface."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from copy import copy
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from clothgym.collisions.solids.shapes import UNTURNED, Quaternion, turned
+from clothgym.collisions import Box, Capsule, Collider, MeshCollider, Sphere
+from clothgym.collisions.solids.shapes import R_AXES, R_HALF
 
-KINDS = {"sphere": ("radius",), "box": ("half_sides",), "capsule": ("radius", "height"), "mesh": ("vertices", "triangles")}
+Shape = Sphere | Capsule | Box | MeshCollider
+Color = tuple[int, int, int]
+Drawable = Collider | tuple[Collider | Sequence[float], Color]
+
+KINDS = {"sphere": Sphere, "capsule": Capsule, "box": Box, "mesh": MeshCollider}
 WARM_GREY = (196, 189, 178)
+MARKER_RADIUS = 0.011  # of the sphere that stands for a position [m]
 SMALL = 0.03  # radius of a round solid, a marker say, that is drawn with the fewer segments [m]
 BOX_EDGE = 0.01  # radius to which the edges of a box are rounded [m]
 # around large solids and small ones, in large pictures and in small ones: 48 chords lie within 0.2 % of the radius, 32 within 0.5 %
 SEGMENTS, FEW_SEGMENTS = (48, 20), (32, 12)
 CREASE = 0.8  # cosine of the angle between a vertex's normal and a triangle's beyond which a mesh is drawn with an edge there
-
-Vector = tuple[float, float, float]
-Color = tuple[int, int, int]
 
 
 class Mesh(NamedTuple):
@@ -33,105 +35,70 @@ class Mesh(NamedTuple):
     triangles: NDArray[np.int32]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Solid:
-    """A thing beside the cloth.
+class Drawn(NamedTuple):
+    """A solid, where its ``center`` is, and its color, sRGB from 0 to 255."""
 
-    Attributes:
-        kind: "sphere" (radius), "box" (half_sides), "capsule" (radius, height; upright) or "mesh" (vertices, triangles).
-        center: its middle [m].
-        radius: of a sphere or a capsule [m].
-        half_sides: half lengths of a box along its own x, y, z [m].
-        height: of a capsule from end to end [m].
-        vertices: of a mesh in its own axes [m], (vertices, 3), and triangles, (triangles, 3), counter-clockwise from outside.
-        yaw: turn about z [rad], before rotation.
-        rotation: a quaternion (w, x, y, z) of any length.
-        color: sRGB, three numbers from 0 to 255.
-
-    Raises:
-        ValueError: an unknown kind, a size that is missing, not positive or of another kind, a color out of range.
-    """
-
-    kind: str
-    center: Vector
-    radius: float | None = None
-    half_sides: Vector | None = None
-    height: float | None = None
-    vertices: NDArray | None = field(default=None, compare=False, repr=False)
-    triangles: NDArray | None = field(default=None, compare=False, repr=False)
-    yaw: float = 0.0
-    rotation: Quaternion = UNTURNED
+    collider: Shape
     color: Color = WARM_GREY
 
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"solid kind={self.kind!r}: must be one of {', '.join(KINDS)}")
-        if np.shape(self.center) != (3,) or not np.all(np.isfinite(self.center)):
-            raise ValueError(f"{self.kind} center={self.center!r}: must be three finite numbers")
-        for name in ("radius", "half_sides", "height"):
-            self._check_size(name, getattr(self, name))
-        for name in ("vertices", "triangles"):
-            self._check_corners(name, getattr(self, name))
-        if self.kind == "capsule" and self.height < 2 * self.radius:  # type: ignore[operator]
-            raise ValueError(f"capsule height={self.height!r}: must be at least twice the radius {self.radius!r}")
-        if not math.isfinite(self.yaw):
-            raise ValueError(f"{self.kind} yaw={self.yaw!r}: must be finite")
-        if self.rotation is not UNTURNED:
-            turned(f"{self.kind} rotation", self.rotation)
-        check_color(f"{self.kind} color", self.color)
-
-    def _check_size(self, name: str, size: float | Vector | None) -> None:
-        if name not in KINDS[self.kind]:
-            if size is not None:
-                raise ValueError(f"{self.kind} {name}={size!r}: a {self.kind} has no {name}, leave it out")
-            return
-        shape = (3,) if name == "half_sides" else ()
-        if size is None or np.shape(size) != shape or not np.all(np.isfinite(size)) or not np.all(np.greater(size, 0)):
-            wanted = "three positive lengths" if shape else "a positive length"
-            raise ValueError(f"{self.kind} {name}={size!r}: must be {wanted} in metres")
-
-    def _check_corners(self, name: str, corners: NDArray | None) -> None:
-        if (corners is None) != (name not in KINDS[self.kind]):
-            raise ValueError(
-                f"{self.kind} {name}: " + ("give them" if corners is None else f"a {self.kind} has none, leave them out")
-            )
-        if corners is not None and (np.ndim(corners) != 2 or np.shape(corners)[1] != 3 or not len(corners)):
-            raise ValueError(f"{self.kind} {name} have shape {np.shape(corners)}: must be ({name}, 3)")
+    @property
+    def kind(self) -> str:
+        """One of ``KINDS``."""
+        return next(name for name, kind in KINDS.items() if isinstance(self.collider, kind))
 
     @property
-    def axes(self) -> NDArray[np.float32]:
-        """The solid's own axes in the world, (3, 3), an axis a row."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        about_z = np.array([(c, s, 0), (-s, c, 0), (0, 0, 1)])
-        return (about_z if self.rotation is UNTURNED else about_z @ turned("rotation", self.rotation)).astype(np.float32)
+    def at_origin(self) -> Drawn:
+        """The same at the origin: equal for two that differ in place alone."""
+        return self.at((0, 0, 0))
 
-    @property
-    def upright(self) -> bool:
-        """Whether it is a rounded box that is turned about z alone."""
-        return self.kind != "mesh" and self.rotation[1] == self.rotation[2] == self.rotation[3] == 0
+    def at(self, center: ArrayLike) -> Drawn:
+        """The same with another center [m]."""
+        there = copy(self.collider)  # a mesh keeps the surface and the grid that it has made
+        object.__setattr__(there, "center", tuple(np.asarray(center, float).tolist()))
+        return Drawn(there, self.color)
 
-    def rounded_box(self) -> tuple[Vector, float]:
-        """The half sides of a box and the radius of a ball [m] that together, the ball swept over the box, make the solid."""
-        if self.kind == "box":
-            return tuple(map(float, self.half_sides)), 0.0  # type: ignore[arg-type, return-value]
-        straight = 0.0 if self.kind == "sphere" else self.height / 2 - self.radius  # type: ignore[operator]
-        return (0.0, 0.0, float(straight)), float(self.radius)  # type: ignore[arg-type]
+    def rounded_box(self) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Axes, (3, 3), an axis a row, half sides of a box [m], (3,), and radius of a ball [m]; the ball, swept over the box, makes
+        the solid.  Of a mesh its axes, and a box around it."""
+        rows = self.collider.rows()
+        axes, half = rows[R_AXES : R_AXES + 9].reshape(3, 3), rows[R_HALF : R_HALF + 3]
+        return axes, half, float(getattr(self.collider, "radius", 0.0))
 
     def mesh(self, coarse: bool = False) -> Mesh:
         """The solid's surface in the world, in fewer triangles for a small picture; a box has its edges rounded a little."""
-        if self.kind == "mesh":
-            corners = np.asarray(self.vertices, np.float32)[np.asarray(self.triangles)] @ self.axes
-            normals = _creased_normals(corners, np.asarray(self.triangles), len(self.vertices))  # type: ignore[arg-type]
-            positions = corners.reshape(-1, 3) + np.asarray(self.center, np.float32)
-            return Mesh(positions, normals, np.arange(len(positions), dtype=np.int32).reshape(-1, 3))
-        half, radius = self.rounded_box()
-        if self.kind == "box":
-            radius = min(BOX_EDGE, 0.25 * min(half))
-            half = (half[0] - radius, half[1] - radius, half[2] - radius)
+        own, half, radius = self.rounded_box()
+        axes, center = own.astype(np.float32), np.asarray(self.collider.center, np.float32)
+        if isinstance(self.collider, MeshCollider):
+            vertices, triangles = self.collider.surface
+            corners = vertices.astype(np.float32)[triangles] @ axes
+            positions = corners.reshape(-1, 3) + center
+            separate = np.arange(len(positions), dtype=np.int32).reshape(-1, 3)
+            return Mesh(positions, _creased_normals(corners, triangles, len(vertices)), separate)
+        if isinstance(self.collider, Box):
+            radius = min(BOX_EDGE, 0.25 * float(half.min()))
+            half = half - radius
         ball = _ball_in_parts((FEW_SEGMENTS if coarse else SEGMENTS)[radius <= SMALL])
-        local = ball.octants * np.asarray(half, np.float32) + np.float32(radius) * ball.normals
-        axes = self.axes
-        return Mesh(local @ axes + np.asarray(self.center, np.float32), ball.normals @ axes, ball.triangles)
+        local = ball.octants * half.astype(np.float32) + np.float32(radius) * ball.normals
+        return Mesh(local @ axes + center, ball.normals @ axes, ball.triangles)
+
+
+def drawn(thing: Drawable) -> Drawn:
+    """What a collider (in grey), a (collider, color), or a (position [m], color), a small sphere, looks like.
+
+    Raises:
+        ValueError: none of these, a plane, or a color out of range.
+    """
+    pair = (thing, WARM_GREY) if isinstance(thing, Collider) else thing
+    if not isinstance(pair, tuple) or len(pair) != 2 or (isinstance(pair[0], Collider) and not isinstance(pair[0], Shape)):
+        raise ValueError(
+            f"{thing!r} cannot be drawn: must be a Sphere, Capsule, Box or MeshCollider, or (collider, color), or (position in "
+            "metres, color); the floor z = 0 is always drawn"
+        )
+    solid, color = pair
+    check_color(f"color of {solid!r}", color)
+    if isinstance(solid, Shape):
+        return Drawn(solid, color)
+    return Drawn(Sphere(center=tuple(np.asarray(solid, float).tolist()), radius=MARKER_RADIUS), color)
 
 
 def check_color(name: str, color: Color) -> None:

@@ -100,6 +100,12 @@ class MeshCollider(Collider):
         """Positions of the vertices as long as the solid has not moved [m], (vertices, 3)."""
         return self.surface[0] @ turned("rotation", self.rotation) + np.asarray(self.center)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MeshCollider) and self.fits(other) and np.array_equal(self.rows(), other.rows())
+
+    def __hash__(self) -> int:
+        return hash(self.rows().tobytes())
+
     def fits(self, other: Collider) -> bool:
         """Whether the other has the same mesh: all environments share one distance grid."""
         return isinstance(other, MeshCollider) and other.grid is self.grid

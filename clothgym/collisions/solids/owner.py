@@ -103,7 +103,7 @@ def _shapes(colliders: Sequence[Collider], dtype: np.dtype) -> Shapes:
             nodes.append(grid.nodes.reshape(-1, 4))
             count += len(nodes[-1])
     return Shapes(
-        np.array([c.kind for c in colliders], np.int64),
+        np.array([c.known_kind() for c in colliders], np.int64),
         np.concatenate(nodes).astype(dtype),
         np.array(first, np.int64),
         np.array(sizes, np.int64).reshape(-1, 3),

@@ -39,16 +39,18 @@ class Collider:
         velocity: of the solid, which carries the cloth along [m/s].  ``Simulation.move_colliders`` changes it.
 
     Raises:
+        TypeError: another class, of a kind that the kernels do not know.
         ValueError: a size that is not positive, a negative friction or thickness, a vector that is not three finite numbers, or a
             direction or rotation of length zero.
     """
 
-    kind: ClassVar[int]
+    kind: ClassVar[int] = -1
     friction: float = 0.3
     thickness: float = 0.001
     velocity: Vector = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        self.known_kind()
         for item in fields(self):
             name, value = f"{type(self).__name__} {item.name}", getattr(self, item.name)
             if value is item.default:
@@ -59,6 +61,13 @@ class Collider:
                 vector(name, value)
             elif number(name, value) < 0 and item.name in ("friction", "thickness"):
                 raise ValueError(f"{name}={value!r}: must be zero or positive")
+
+    def known_kind(self) -> int:
+        """Its kind; a class of somebody else's may have one that no kernel knows, or be a mesh without a grid of distances."""
+        if self.kind not in ((KIND_MESH,) if hasattr(type(self), "grid") else (KIND_PLANE, KIND_ROUNDED_BOX)):
+            name = type(self).__name__
+            raise TypeError(f"{name} kind={self.kind!r}: unknown; derive {name} from Plane, Sphere, Capsule, Box or MeshCollider")
+        return self.kind
 
     def _positive(self, **sizes: float) -> None:
         for name, size in sizes.items():

@@ -47,7 +47,7 @@ LEAST_GRADIENT = 1e-3  # length below which the grid's gradient has no reliable 
 class Shapes(NamedTuple):
     """What kernels read of the colliders besides their rows.
 
-    kinds: of each, (colliders,).
+    kinds: of each, (colliders,): KIND_PLANE, KIND_ROUNDED_BOX or KIND_MESH, see ``Collider.known_kind``.
     nodes: distance [m] and gradient at the nodes of all grids, (nodes, 4); first: index of each grid's first node, (colliders,).
     sizes: nodes of each grid along x, y and z, (colliders, 3); corners: its lowest corner in the solid's axes [m], (colliders, 3).
     cells: its spacing [m], (colliders,).
