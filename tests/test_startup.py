@@ -150,7 +150,7 @@ def test_a_callee_that_stays_apart_is_compiled_once_and_its_callers_anew_when_it
     out, err = start(more, CLOTHGYM_CACHE_DIR=str(cache)).communicate(timeout=300)
     total = outputs[0][0].split()[1]
     assert out.split() == ["0", total], err
-    assert len(list(cache.rglob("simulation.advance_semi*.nbc"))) == 2
+    assert len(list(cache.rglob("main_loop.advance_semi*.nbc"))) == 2
     substep = list(cache.rglob("*.semi_implicit_euler_springs*"))
     assert len([path for path in substep if path.suffix == ".nbc"]) == 1
     for path in substep:
