@@ -21,9 +21,7 @@ A task needs none of them: those that stand in this file read what its methods h
 
 from __future__ import annotations
 
-import hashlib
 from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -108,9 +106,7 @@ IN_NUMPY = Kernels(potential, evaluate, observe, done=done_as_written)
 @cache
 def compiled(name: str, kernels: Kernels) -> tuple[Any, Any]:
     """``apply_actions`` and ``finish_step`` with the kernels of the task of that name."""
-    # where this folder is linked into the package, its files have no part in the name of the cache's folder
-    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    name, parts = f"{name}_{hashlib.sha256(sources).hexdigest()[:12]}", kernels._asdict()
+    parts = kernels._asdict()
     scoring = specialize(score, f"score_{name}", apart=True, **parts)
     one = specialize(finish_one, f"finish_one_{name}", apart=True, score=scoring, **parts)
     return specialize(apply_actions, f"apply_actions_{name}", **parts), specialize(finish_step, f"finish_{name}", finish_one=one)

@@ -105,7 +105,7 @@ def test_no_kernel_uses_fast_math_or_numba_directly():
     for name, path in SOURCES:
         text = path.read_text()
         assert "fastmath=True" not in text
-        if name != "clothgym._jit":
+        if not name.startswith("clothgym._jit"):
             assert "njit" not in text and "prange" not in text, name
 
 

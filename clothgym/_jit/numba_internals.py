@@ -1,0 +1,202 @@
+"""All that touches what is private to numba and llvmlite: a cache with locks, callees that stay apart, the compiler's flags.
+
+``policy`` asks ``check`` first, and does without this module where it raises.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+from collections.abc import Mapping
+from functools import partial
+from operator import attrgetter
+from types import FunctionType
+from typing import Any, cast
+
+import numba
+from llvmlite import binding as llvm
+from numba.core import caching
+from numba.core.codegen import CPUCodegen
+from numba.core.compiler_lock import global_compiler_lock
+from numba.core.runtime import rtsys
+
+from clothgym._jit.cache import cache_folder, name_of
+
+# versions with which the tests pass
+TESTED = ((0, 66), (0, 67), (0, 68))
+# before it loads a function numba fills its tables of typing and lowering, which takes longer than all of our loading; a
+# function that is compiled already needs its runtime only.  Versions with which this was tested:
+LOADS_WITHOUT_TABLES = {(0, 68)}
+
+
+def check(tested_only: bool) -> None:
+    """See that numba is as this module knows it.
+
+    Raises:
+        ImportError: it is of another version, and ``tested_only``.
+        AttributeError, TypeError: something that is used below is no longer there, or no longer the same.
+    """
+    if tested_only and numba.version_info.short not in TESTED:
+        raise ImportError(f"tested are {', '.join(f'{major}.{minor}' for major, minor in TESTED)}")
+    attrgetter("save", "load", "flush", "_load_index", "_save_index", "_load_data", "_save_data")(caching.IndexDataCacheFile)
+    attrgetter("_load_overload", "load_overload", "save_overload")(caching.FunctionCache)
+    attrgetter("reduce", "rebuild", "_locator_classes")(caching.CompileResultCacheImpl)
+    attrgetter("get_source_stamp", "get_disambiguator")(caching._SourceFileBackedLocatorMixin)
+    attrgetter("_create_empty_module")(CPUCodegen)
+    attrgetter("initialize")(rtsys)
+    dispatcher = numba.njit(_nothing)
+    attrgetter("_compiler._customize_flags", "_cache", "compile", "overloads")(dispatcher)
+    with contextlib.suppress(RuntimeError):  # imported from an archive, where nothing can be cached
+        _Cache(cast(FunctionType, _nothing), apart=False)
+
+
+def _nothing() -> None:
+    """What ``check`` tries a cache with; never compiled."""
+
+
+def arrange(dispatcher: Any, function: FunctionType, apart: bool, flags: Mapping[str, bool]) -> None:
+    """Give a new dispatcher the compiler's flags and our cache; see ``policy.kernel``."""
+    dispatcher._compiler._customize_flags = partial(_set_flags, values=flags)
+    try:
+        dispatcher._cache = _Cache(function, apart)
+    except RuntimeError:  # it has been typed in, and lies in no file: it is compiled in memory, and linked into its callers
+        return
+    _dispatchers[dispatcher._cache.name] = dispatcher
+    dispatcher.compile = partial(_compile_locked, dispatcher.compile, dispatcher._cache.lock_name)
+
+
+def _set_flags(flags: Any, values: Mapping[str, bool]) -> Any:
+    for name, value in values.items():
+        setattr(flags, name, value)
+    return flags
+
+
+def _compile_locked(compile_or_load: Any, lock_name: str, signature: Any) -> Any:
+    """Compile or load a kernel, and let go of its lock if it was taken for that."""
+    with global_compiler_lock:  # numba's own, taken before we look whether this thread holds the file's
+        held = lock_name in cache_folder().held
+        try:
+            return compile_or_load(signature)
+        finally:
+            if not held:
+                cache_folder().release(lock_name)
+
+
+class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  # type: ignore[misc]
+    """Tells numba's cache to use our folder; the stamp is the kernel's own file, the folder's name covers its callees."""
+
+    def __init__(self, py_func: FunctionType, py_file: str) -> None:
+        self._py_file = py_file
+        self._lineno = py_func.__code__.co_firstlineno
+
+    def get_cache_path(self) -> str:
+        return str(cache_folder().path)
+
+    def ensure_cache_path(self) -> None:
+        pass
+
+
+_code_of = attrgetter("library")  # the machine code of one of numba's compile results, with what is linked to it
+
+
+class _Outdated(Exception):
+    """Compiled code calls code that is no longer there."""
+
+
+class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    """What is kept of compiled code: also which kernels that stay apart it calls, ``(name, argument types, symbol)`` each."""
+
+    _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
+
+    def reduce(self, result: Any) -> Any:
+        return _calls_of(_code_of(result)), super().reduce(result)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        calls, payload = payload
+        # they must be there before the code is, in which their symbols are looked up
+        called = []
+        for name, types, symbol in calls:
+            if name not in _dispatchers:  # a module has another name in the process that runs it than in one that imports it
+                raise _Outdated
+            _dispatchers[name].compile(types)
+            called.append(_dispatchers[name].overloads[types])
+            if called[-1].fndesc.mangled_name != symbol:
+                raise _Outdated
+        result = super().rebuild(target_context, payload)
+        code = _code_of(result)
+        # what is called lives as long as its caller
+        code.calls, code.called = calls, called
+        return result
+
+
+def _calls_of(library: Any) -> list[tuple[str, Any, str]]:
+    """Kernels that stay apart which a library calls, itself or in what is linked into it."""
+    if not hasattr(library, "calls"):
+        library.calls = list(dict.fromkeys(call for part in library._linking_libraries for call in _asks(part)))
+    return library.calls
+
+
+def _asks(library: Any) -> list[tuple[str, Any, str]]:
+    """What must be there for a call of a library."""
+    return [library.stays_apart] if hasattr(library, "stays_apart") else _calls_of(library)
+
+
+# all kernels by name, for compiled code that calls them
+_dispatchers: dict[str, Any] = {}
+
+
+class _Cache(caching.FunctionCache):  # type: ignore[misc]
+    """numba's disk cache with locks: on a miss it waits for other processes, looks again, and keeps the kernel's lock."""
+
+    _impl_class = _Impl
+
+    def __init__(self, py_func: FunctionType, apart: bool) -> None:
+        super().__init__(py_func)
+        self.name, self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}", name_of(py_func)
+        self.apart = apart
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        folder = cache_folder()
+        found = self._load(sig, target_context)
+        if found is None and folder.writable and self.lock_name not in folder.held:
+            folder.acquire(self.lock_name)
+            found = self._load(sig, target_context)
+        if found is None:
+            target_context.refresh()
+            folder.announce()
+        return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
+        if not cache_folder().path.is_dir():
+            return None
+        if numba.version_info.short in LOADS_WITHOUT_TABLES:
+            rtsys.initialize(target_context)
+        else:
+            target_context.refresh()
+        try:
+            found = self._load_overload(sig, target_context)
+        except (OSError, EOFError, pickle.UnpicklingError, _Outdated):  # a file cut short, by a full disk for instance
+            return None
+        if found is not None:
+            self._set_apart(found)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        folder = cache_folder()
+        if folder.writable:
+            try:
+                try:
+                    super().save_overload(sig, data)
+                except (EOFError, pickle.UnpicklingError):  # the index has been cut short: begin it anew
+                    self.flush()
+                    super().save_overload(sig, data)
+            except OSError as error:
+                folder.give_up(error)
+        self._set_apart(data)
+
+    def _set_apart(self, result: Any) -> None:
+        """Give callers nothing to link but the symbol, if the kernel is to stay apart."""
+        if self.apart:
+            code = _code_of(result)
+            code.stays_apart = self.name, result.signature.args, result.fndesc.mangled_name
+            code._shared_module = llvm.parse_assembly(str(code._codegen._create_empty_module("apart")))

@@ -1,0 +1,129 @@
+"""How kernels are compiled: plainly where numba is not known, and in a folder whose name tells all sources."""
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from clothgym._jit.cache import WITHOUT_KERNELS, source_digest
+
+ROOT = Path(__file__).parent.parent
+
+
+def run(code, **environment):
+    """What a process prints, and what it says beside that."""
+    env = {key: value for key, value in os.environ.items() if not key.startswith(("CLOTHGYM", "NUMBA"))} | environment
+    done = subprocess.run([sys.executable, "-P", "-c", textwrap.dedent(code)], env=env, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip(), done.stderr
+
+
+def copy_package(folder, linked):
+    """The package as it lies in a checkout, where ``clothgym/envs`` is a link, or in a wheel."""
+    skip = shutil.ignore_patterns("envs", "__pycache__")
+    shutil.copytree(ROOT / "clothgym", folder / "clothgym", ignore=skip)
+    shutil.copytree(ROOT / "envs", folder / ("envs" if linked else "clothgym/envs"), ignore=skip)
+    if linked:
+        (folder / "clothgym" / "envs").symlink_to("../envs")
+
+
+@pytest.mark.parametrize("linked", [True, False], ids=["checkout", "wheel"])
+def test_an_edit_of_any_module_with_kernels_names_another_folder(linked, tmp_path):
+    """numba alone would run the old code."""
+    copy_package(tmp_path, linked)
+
+    def name():
+        code = "from clothgym._jit import cache_folder; print(cache_folder().path.name)"
+        return run(code, PYTHONPATH=str(tmp_path), CLOTHGYM_CACHE_DIR=str(tmp_path / "cache"))[0]
+
+    names = [name()]
+    for edited in ("forces.py", "collisions/contact_law.py", "envs/measures.py"):
+        path = tmp_path / "clothgym" / edited
+        path.write_text(path.read_text() + "\nMORE = 1\n")
+        names.append(name())
+    (tmp_path / "clothgym" / "cli.py").write_text("")
+    assert len(set(names)) == 4 and name() == names[-1]
+
+
+def test_two_sources_of_one_name_are_told_apart(tmp_path):
+    for folder, text in (("a", "one"), ("b", "two")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "law.py").write_text(text)
+    before = source_digest({"clothgym": tmp_path})
+    (tmp_path / "a" / "law.py").write_text("two")
+    (tmp_path / "b" / "law.py").write_text("one")
+    assert source_digest({"clothgym": tmp_path}) != before
+
+
+def test_what_the_digest_leaves_out_has_no_kernels():
+    for path in (ROOT / "clothgym").rglob("*.py"):
+        if path.relative_to(ROOT / "clothgym").parts[0].removesuffix(".py") in WITHOUT_KERNELS:
+            assert "_jit" not in path.read_text(), path
+
+
+# --- plain numba ----------------------------------------------------------------------------------------------------------
+
+SPECIALIZED = """
+from clothgym._jit import kernel, specialize
+step = None
+@kernel
+def one(x):
+    return x + 1.0
+@kernel
+def two(x):
+    return x + 2.0
+def twice(x):
+    return step(step(x))
+first, second = specialize(twice, "twice", step=one), specialize(twice, "twice", step=two)
+print(first(1.0), second(1.0), sum((first.stats.cache_hits + second.stats.cache_hits).values()))
+"""
+
+
+@pytest.mark.parametrize("plain", ["0", "1"])
+def test_two_specializations_of_one_function_stay_two_in_a_second_process(plain, tmp_path):
+    """They share a file, a line and a name; numba's own key is file, line and name."""
+    (tmp_path / "mine.py").write_text(SPECIALIZED)
+    place = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "CLOTHGYM_CACHE_DIR": str(tmp_path), "CLOTHGYM_PLAIN_NUMBA": plain}
+    assert run("import mine", **place)[0] == "3.0 5.0 0"
+    assert run("import mine", **place)[0] == "3.0 5.0 2"
+    # a callee that is edited, in a module whose name and lines stay
+    (tmp_path / "mine.py").write_text(SPECIALIZED.replace("x + 2.0", "x + 3.0"))
+    assert run("import mine", **place)[0] == "3.0 7.0 0"
+
+
+SURPRISES = {
+    "another version": "import numba; numba.version_info = numba.version_info._replace(short=(0, 99))",
+    "a class that is gone": "import numba.core.caching as c; del c._SourceFileBackedLocatorMixin",
+    "a method that is gone": "import numba.core.caching as c; del c.IndexDataCacheFile._load_index",
+    "a class of another kind": "import numba.core.caching as c; c.CompileResultCacheImpl = 3",
+}
+
+
+@pytest.mark.parametrize("surprise", SURPRISES)
+def test_a_numba_that_is_not_known_costs_one_sentence(surprise, tmp_path):
+    out, err = run(SURPRISES[surprise] + SPECIALIZED, PYTHONPATH=str(ROOT), CLOTHGYM_CACHE_DIR=str(tmp_path))
+    assert out == "3.0 5.0 0"
+    assert err.count("UserWarning") == 1 and "CLOTHGYM_PLAIN_NUMBA" in err
+
+
+SMOKE = """
+from clothgym import Simulation, grid
+from clothgym.triangles import disc
+for mesh in (grid(4, 4, 0.3, 0.3), disc(0.2, 2)):
+    simulation = Simulation(mesh, num_envs=2, anchors=[0], contact="particles")
+    simulation.step(5)
+    print(simulation.positions.tobytes().hex())
+"""
+
+
+def test_plain_numba_gives_the_same_bits(tmp_path):
+    """A grid, whose particles lie side by side, and a mesh of triangles, whose environments do."""
+    plain, err = run(SMOKE, PYTHONPATH=str(ROOT), CLOTHGYM_CACHE_DIR=str(tmp_path), CLOTHGYM_PLAIN_NUMBA="1")
+    assert err == ""
+    environment = {"CLOTHGYM_CACHE_DIR": os.environ["CLOTHGYM_CACHE_DIR"]} if "CLOTHGYM_CACHE_DIR" in os.environ else {}
+    assert plain == run(SMOKE, PYTHONPATH=str(ROOT), **environment)[0]
+    assert list(tmp_path.rglob("plain/*/*/*.nbc"))
