@@ -1,7 +1,7 @@
 """Floor 3: what resists bending: skip springs, or hinges between triangles.
 
-A model is three kernels on one block of lanes, to which ``_jit.specialize`` binds the names ``add_bend_forces``,
-``add_bend_products`` and ``project_bends`` wherever an integrator uses them:
+A model is three kernels on one block of lanes, to which ``_jit.specialize`` binds the names of the placeholders
+below wherever an integrator uses them:
 
     add_bend_forces(x, v, f, elements, elastic, scratch)
         adds the hinges' and their dampers' forces to ``f`` [N], (3, particles, lanes);
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, inlined, kernel, uncounted
+from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
 from clothgym.checks import known
 from clothgym.elements import ROWS, BendArrays
 from clothgym.mesh import ClothMesh
@@ -36,22 +36,33 @@ ARCTAN = (
     0.11103456908947463, -0.089925529061509115, 0.06974197686595265, -0.037655106012914019,
 )  # fmt: skip
 
+add_bend_forces = placeholder(
+    "add_bend_forces", "of (x, v, f, elements, elastic, scratch): adds the hinges' and their dampers' forces to f [N]"
+)
+add_bend_products = placeholder(
+    "add_bend_products", "of (x, p, y, elements, scale, scratch): adds the hinges' stiffness matrix times p to y"
+)
+project_bends = placeholder(
+    "project_bends",
+    "of (x, start, w, bends, scale, damping, relaxation, multipliers, scratch): moves particles towards the hinges' rest",
+)
+
 
 # --- none: springs bend -------------------------------------------------------------------------------------------------
 
 
 @kernel
-def add_bend_forces(x, v, f, elements, elastic, scratch):
+def add_no_forces(x, v, f, elements, elastic, scratch):
     """Nothing: skip springs are among the springs."""
 
 
 @kernel
-def add_bend_products(x, p, y, elements, scale, scratch):
+def add_no_products(x, p, y, elements, scale, scratch):
     """Nothing."""
 
 
 @kernel
-def project_bends(x, start, w, bends, scale, damping, relaxation, multipliers, scratch):
+def project_nothing(x, start, w, bends, scale, damping, relaxation, multipliers, scratch):
     """Nothing."""
 
 
@@ -361,7 +372,7 @@ def _kernels(forces: Any, products: Any, project: Any) -> dict[str, Any]:
 BENDING: dict[str, Bending] = {
     model.name: model
     for model in (
-        Bending("springs", False, False, _kernels(add_bend_forces, add_bend_products, project_bends)),
+        Bending("springs", False, False, _kernels(add_no_forces, add_no_products, project_nothing)),
         Bending("hinge", True, False, _kernels(add_hinge_forces, add_hinge_products, project_hinges)),
         Bending("quadratic", True, True, _kernels(add_quadratic_forces, add_quadratic_products, project_quadratic)),
     )

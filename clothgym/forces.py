@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import disjoint, kernel, placeholder, uncounted
 from clothgym.bending import Bending
 from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
@@ -19,6 +19,18 @@ from clothgym.state import State
 
 POWER_STEPS = 16
 TINY = 1e-30  # [m^2]: a spring of no length, as in a sheet that is folded on itself, has no direction to pull in
+
+# what integrators, attachments and the main loop call; ``grid_forces.kernels_of`` tells which kernels stand for the names
+add_spring_forces = placeholder(
+    "add_spring_forces", "of (x, v, f, elements, elastic, scratch): adds the springs' and their dampers' forces to f [N]"
+)
+add_spring_products = placeholder(
+    "add_spring_products",
+    "of (x, p, y, elements, along, across, bend, scratch): adds the springs' stiffness matrix times p to y",
+)
+add_air_forces = placeholder(
+    "add_air_forces", "of (x, v, f, surface, resistance, wind, scratch): adds the air's force on each triangle to f [N]"
+)
 
 
 @disjoint
@@ -40,7 +52,7 @@ def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, 
 
 
 @uncounted
-def add_spring_forces(x, v, f, elements, elastic, scratch):
+def add_lane_forces(x, v, f, elements, elastic, scratch):
     """Add Hooke's force and the damper's along each spring to ``f`` [N], (3, particles, lanes).
 
     On the first end, with d the vector to the second, u its velocity, r the rest length and tau the damping time:
@@ -50,7 +62,7 @@ def add_spring_forces(x, v, f, elements, elastic, scratch):
     stiffness, damping_time = elastic.stiffness, elastic.damping_time
     if x.shape[2] == 1:
         rows = (3, x.shape[1])
-        _add_spring_forces_of_one(
+        _add_lane_forces_of_one(
             x.reshape(rows), v.reshape(rows), f.reshape(rows), elements.springs, stiffness[:, 0], damping_time[0]
         )  # fmt: skip
         return
@@ -66,7 +78,7 @@ def add_spring_forces(x, v, f, elements, elastic, scratch):
 
 
 @kernel
-def _add_spring_forces_of_one(x, v, f, springs, stiffness, damping_time):
+def _add_lane_forces_of_one(x, v, f, springs, stiffness, damping_time):
     """The same arithmetic on a single environment, (3, particles), in less than half the time: no loops of one round."""
     ends, rest_length, kind, weight = springs
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
@@ -108,7 +120,7 @@ def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, sha
 
 
 @uncounted
-def add_spring_products(x, p, y, elements, along, across, bend, scratch):
+def add_lane_products(x, p, y, elements, along, across, bend, scratch):
     """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (3, particles, lanes).
 
     With n the direction, ``along n n^T + across max(1 - r/d, 0) (I - n n^T)`` a spring, both proportional to its stiffness: what a
@@ -127,7 +139,7 @@ def add_spring_products(x, p, y, elements, along, across, bend, scratch):
 
 
 @uncounted
-def add_air_forces(x, v, f, surface, resistance, wind, scratch):
+def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
     """Add the air's force on each triangle to ``f`` [N], (3, particles, lanes).
 
     With A the area, n the normal and u the wind relative to the triangle:

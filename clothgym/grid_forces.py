@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from clothgym._jit import disjoint, inlined, uncounted
-from clothgym.bending import Bending, add_bend_forces, add_bend_products, hinge_angles, hinge_rates, hinge_rows
-from clothgym.forces import add_air_forces, add_spring_forces, add_spring_products
+from clothgym.bending import Bending, add_no_forces, add_no_products, hinge_angles, hinge_rates, hinge_rows
+from clothgym.forces import add_lane_air_forces, add_lane_forces, add_lane_products
 
 TINY = 1e-30  # [m^2], see ``forces``
 
@@ -38,7 +38,7 @@ def rows_of(a):
 
 @disjoint
 def _spring_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, tau, fx, fy, fz):
-    """Hooke's force and the damper's of one kind of springs on their first ends [N], see ``forces.add_spring_forces``."""
+    """Hooke's force and the damper's of one kind of springs on their first ends [N], see ``forces.add_lane_forces``."""
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     x1, y1, z1, vx1, vy1, vz1 = x[o:], y[o:], z[o:], vx[o:], vy[o:], vz[o:]
     for p in range(count):
@@ -148,7 +148,7 @@ def add_grid_forces(x, v, f, elements, elastic, scratch):
 
 @disjoint
 def _product_kind(x, y, z, px, py, pz, o, count, weight, along, across, rest_length, bend, curve, fx, fy, fz):
-    """Minus the stiffness of one kind of springs times p, on their first ends; see ``forces.add_spring_products``.
+    """Minus the stiffness of one kind of springs times p, on their first ends; see ``forces.add_lane_products``.
 
     With what bends along the same offset, ``bend curve u``.
     """
@@ -177,7 +177,7 @@ def _curve_product_kind(p, o, count, curve, bend, f):
 def add_grid_products(x, p, y, elements, along, across, bend, scratch):
     """Add the stiffness matrix of springs, and of the quadratic model if there is one, times ``p`` to ``y``, (3, particles, 1).
 
-    along, across: see ``forces.add_spring_products``; bend: of the quadratic model, (1,).
+    along, across: see ``forces.add_lane_products``; bend: of the quadratic model, (1,).
     """
     offset, kind, rest_length, weight, curve, _, _ = elements
     kinds = scratch.kinds
@@ -285,7 +285,7 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
 
 @inlined
 def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
-    """Force on a triangle with sides p and q in a relative wind u [N], see ``forces.add_air_forces``."""
+    """Force on a triangle with sides p and q in a relative wind u [N], see ``forces.add_lane_air_forces``."""
     # normal times twice the area
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
     twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
@@ -342,7 +342,7 @@ def _share_out(fx, fy, fz, own, others, ax, ay, az, bx, by, bz):
 
 @uncounted
 def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
-    """The same forces as ``forces.add_air_forces``, for both triangles of all cells at once, and corner by corner.
+    """The same forces as ``forces.add_lane_air_forces``, for both triangles of all cells at once, and corner by corner.
 
     A cell's corners are a, b, and c, d in the next row; its triangles are abd and adc where it is even, abc and bdc elsewhere.
     """
@@ -374,10 +374,10 @@ def kernels_of(model: Bending, by_particle: bool) -> dict[str, Any]:
     """
     if not by_particle:
         return model.kernels | {
-            "add_spring_forces": add_spring_forces, "add_spring_products": add_spring_products, "add_air_forces": add_air_forces,
+            "add_spring_forces": add_lane_forces, "add_spring_products": add_lane_products, "add_air_forces": add_lane_air_forces,
         }  # fmt: skip
     # what bends linearly is added with the springs
-    hinges = (add_grid_hinge_forces, add_grid_hinge_products) if model.name == "hinge" else (add_bend_forces, add_bend_products)
+    hinges = (add_grid_hinge_forces, add_grid_hinge_products) if model.name == "hinge" else (add_no_forces, add_no_products)
     return {
         "add_spring_forces": add_grid_forces, "add_spring_products": add_grid_products, "add_air_forces": add_grid_air_forces,
         "add_bend_forces": hinges[0], "add_bend_products": hinges[1],

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import apart, kernel, run_spans, specialize
+from clothgym._jit import apart, kernel, run_spans, specialize, used
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.collisions import COLLIDER_ROWS, SCRATCH_ROWS, Solids, keep_out, stop_at_solids
@@ -404,7 +404,7 @@ def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):
 
 @cache
 def _pulls_with(bending: Bending, by_particle: bool) -> Any:
-    return specialize(add_pulls, f"add_pulls_{bending.name}_{by_particle}", **kernels_of(bending, by_particle))
+    return specialize(add_pulls, f"add_pulls_{bending.name}_{by_particle}", **used(add_pulls, kernels_of(bending, by_particle)))
 
 
 @kernel

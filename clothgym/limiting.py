@@ -18,13 +18,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, specialize
+from clothgym._jit import disjoint, kernel, placeholder, specialize
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
 TOLERANCE = 0.005
 SWEEPS = 100
 BEFORE, AFTER, USED = 0, 1, 2
+
+largest_strain = placeholder(
+    "largest_strain", "of (x, weave, largest): writes the largest strain of the threads and diagonals of each lane, (lanes,)"
+)
 
 
 def checked_limit(value: float | None) -> float | None:
@@ -59,7 +63,7 @@ def _limit_strain(x, v, w, weave, limit, report):
     largest = np.empty(lanes, x.dtype)
     enough = x.dtype.type(limit + TOLERANCE)
     for sweep in range(SWEEPS + 1):
-        largest_strain(x, weave, largest)  # noqa: F821
+        largest_strain(x, weave, largest)
         going = False
         for l in range(lanes):
             going |= largest[l] > enough
@@ -76,7 +80,7 @@ def _limit_strain(x, v, w, weave, limit, report):
 
 def _measure_strain(x, weave, report):
     """What is left at the end of a control step, after contact, which knows nothing of the limit."""
-    largest_strain(x, weave, report[AFTER])  # noqa: F821
+    largest_strain(x, weave, report[AFTER])
 
 
 @disjoint

@@ -23,7 +23,7 @@ class Material:
             (``bending="springs"``) have no rigidity in the flat state; they store that where the radius of curvature is two
             grid spacings.
         damping_time: Kelvin-Voigt retardation time [s]: each spring's damper is this time its stiffness.
-        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_air_forces``; 1.2 is a square plate's.
+        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_lane_air_forces``; 1.2 is a square plate's.
         skin_friction: its coefficient edge on to the wind, by the area of one side.
         air_drag: linear drag, force per area and velocity [N s/m^3], whatever the wind is.  Air itself has none; it calms slow
             swings, which the quadratic law hardly does.  0.72 is that law's force at 1 m/s.

@@ -1,22 +1,13 @@
 """A control step of a task without its physics: one kernel before it, ``apply_actions``, and one after it, ``finish_step``.
 
 Both go through a batch one environment after the other.  What is the task's own in them are small kernels about ONE environment,
-``Task.kernels``, with which both are compiled:
-
-    potential(own, rules, sheet) -> float           how far along it is, in [0, 1]; its change is the reward on the way
-    evaluate(own, rules, sheet, info) -> float      at an episode's end: writes the evaluation, returns the normalized performance
-    observe(own, rules, sheet, seen)                what is observed beside the points of the sheet
-    act(own, rules, sheet, move, free)              what an action does beside moving; free: set for anchors that are to let go
-    measure(own, rules, sheet)                      what the task measures itself, at an episode's start and after each step
-    done(own, rules, sheet) -> bool                 whether the agent is done before its time is up
-    account(own, rules, sheet, info, terms, running, failure) -> float    the rest of info; the sum of the task's own reward terms
-    fingers(move, wanted, acting) -> float          how far a gripper's fingers are to open, from 0 to 1
+``Task.kernels``, with which both are compiled; their names are the placeholders below.
 
 ``own``, ``info``, ``terms`` and ``seen`` are the environment's records in ``Task.episode``, ``info``, ``terms`` and ``seen``, with
 the fields that the task names; ``rules`` is the task's record of numbers that all environments share; ``move``: the action, within
 [-1, 1], (attachments, numbers).
 
-A task needs none of them: those that stand in this file read what its methods have written in NumPy, see ``TaskDefinition``.
+A task needs none of them: those of ``IN_NUMPY`` read what its methods have written in NumPy, see ``TaskDefinition``.
 """
 
 from __future__ import annotations
@@ -27,62 +18,81 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, specialize, uncounted
+from clothgym._jit import inlined, placeholder, specialize, uncounted, used
 from clothgym.envs.episode import BEYOND, DIVERGED, EFFORT_PRICE, FAILURE_PENALTY, FINE, OUT_OF_BOUNDS, SUCCESS_BONUS, TORN, TWICE
 from clothgym.envs.measures import CENTROID, FINITE, STRETCH2, SUMMARY, largest_strain, summarize
 from clothgym.mesh import SHEAR, ClothMesh
+
+potential = placeholder("potential", "of (own, rules, sheet): how far along it is, in [0, 1]; its change is the reward on the way")
+evaluate = placeholder(
+    "evaluate", "of (own, rules, sheet, info), at an episode's end: writes the evaluation, returns the normalized performance"
+)
+observe = placeholder("observe", "of (own, rules, sheet, seen): writes what is observed beside the points of the sheet")
+act = placeholder(
+    "act", "of (own, rules, sheet, move, free): does what an action does beside moving; free: set for anchors that are to let go"
+)
+measure = placeholder(
+    "measure", "of (own, rules, sheet): writes what the task measures itself, at an episode's start and after each step"
+)
+done = placeholder("done", "of (own, rules, sheet): whether the agent is done before its time is up")
+account = placeholder(
+    "account",
+    "of (own, rules, sheet, info, terms, running, failure): the rest of info, and the sum of the task's own reward terms",
+)
+fingers = placeholder("fingers", "of (move, wanted, acting): how far a gripper's fingers are to open, from 0 to 1")
+
 
 # --- the kernels of a task that gives none ------------------------------------------------------------------------------------
 
 
 @inlined
-def potential(own, rules, sheet):
+def _performance_written(own, rules, sheet):
     """What ``Task.performance`` has returned."""
     return own.performance
 
 
 @inlined
-def evaluate(own, rules, sheet, info):
+def _evaluation_written(own, rules, sheet, info):
     """What ``Task.success`` and ``Task.performance`` have returned."""
     info.is_success = own.success
     return own.performance
 
 
 @inlined
-def observe(own, rules, sheet, seen):
+def _observed_already(own, rules, sheet, seen):
     """The functions of ``Task.observations`` have written it."""
 
 
 @inlined
-def act(own, rules, sheet, move, free):
+def _only_moves(own, rules, sheet, move, free):
     """An action does nothing beside moving."""
 
 
 @inlined
-def measure(own, rules, sheet):
+def _measure_nothing(own, rules, sheet):
     """No measurements of the task's own."""
 
 
 @inlined
-def done(own, rules, sheet):
+def _never(own, rules, sheet):
     """The agent is done when its time is up."""
     return False
 
 
 @inlined
-def done_as_written(own, rules, sheet):
+def _done_written(own, rules, sheet):
     """What ``Task.done`` has returned."""
     return own.done
 
 
 @inlined
-def account(own, rules, sheet, info, terms, running, failure):
+def _no_more(own, rules, sheet, info, terms, running, failure):
     """Nothing more in info, and no reward terms of the task's own."""
     return 0.0
 
 
 @inlined
-def fingers(move, wanted, acting):
+def _no_fingers(move, wanted, acting):
     """An anchor has none."""
     return wanted
 
@@ -93,23 +103,24 @@ class Kernels(NamedTuple):
     potential: Any
     evaluate: Any
     observe: Any
-    act: Any = act
-    measure: Any = measure
-    done: Any = done
-    account: Any = account
-    fingers: Any = fingers
+    act: Any = _only_moves
+    measure: Any = _measure_nothing
+    done: Any = _never
+    account: Any = _no_more
+    fingers: Any = _no_fingers
 
 
-IN_NUMPY = Kernels(potential, evaluate, observe, done=done_as_written)
+IN_NUMPY = Kernels(_performance_written, _evaluation_written, _observed_already, done=_done_written)
 
 
 @cache
 def compiled(name: str, kernels: Kernels) -> tuple[Any, Any]:
     """``apply_actions`` and ``finish_step`` with the kernels of the task of that name."""
     parts = kernels._asdict()
-    scoring = specialize(score, f"score_{name}", apart=True, **parts)
-    one = specialize(finish_one, f"finish_one_{name}", apart=True, score=scoring, **parts)
-    return specialize(apply_actions, f"apply_actions_{name}", **parts), specialize(finish_step, f"finish_{name}", finish_one=one)
+    scoring = specialize(score, f"score_{name}", apart=True, **used(score, parts))
+    one = specialize(finish_one, f"finish_one_{name}", apart=True, score=scoring, **used(finish_one, parts))
+    applying = specialize(apply_actions, f"apply_actions_{name}", **used(apply_actions, parts))
+    return applying, specialize(finish_step, f"finish_{name}", finish_one=one)
 
 
 # --- what the kernels see -----------------------------------------------------------------------------------------------------

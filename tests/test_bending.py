@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 from clothgym import Material, Simulation, disc, grid, triangle_mesh
 from clothgym.bending import BENDING
 from clothgym.elements import Elastic, element_arrays, room_for_forces
-from clothgym.forces import add_spring_forces
+from clothgym.forces import add_lane_forces
 from clothgym.mesh import BEND_X, NUM_KINDS, STRUCTURAL_X
 
 HINGED = ["hinge", "quadratic"]
@@ -285,7 +285,7 @@ def test_a_pinned_strip_buckles_under_euler_s_load(model, rows, width):
         x, lanes = np.swapaxes(x, 0, 1).copy(), x.shape[2]
         f, zero = np.zeros_like(x), np.zeros_like(x)
         elastic = no_springs(lanes)._replace(stiffness=np.repeat(stiffness[:, None], lanes, axis=1))
-        add_spring_forces(x, zero, f, elements, elastic, room(x))
+        add_lane_forces(x, zero, f, elements, elastic, room(x))
         BENDING[model].kernels["add_bend_forces"](x, zero, f, elements, elastic, room(x))
         return np.swapaxes(f, 0, 1)
 

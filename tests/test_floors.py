@@ -107,6 +107,7 @@ def test_no_kernel_uses_fast_math_or_numba_directly():
         assert "fastmath=True" not in text
         if not name.startswith("clothgym._jit"):
             assert "njit" not in text and "prange" not in text, name
+            assert "F821" not in text, f"{name}: declare what specialize binds with placeholder"
 
 
 def test_main_loop_fits_a_screen():

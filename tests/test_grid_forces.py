@@ -8,7 +8,7 @@ import pytest
 from clothgym import Material, Simulation, disc, grid
 from clothgym.bending import add_hinge_forces, add_hinge_products, add_quadratic_forces, add_quadratic_products
 from clothgym.elements import KINDS, Elastic, element_arrays, grid_of, grid_surface_of, is_regular, room_for_forces, surface_arrays
-from clothgym.forces import TINY, add_air_forces, add_spring_forces, add_spring_products
+from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products
 from clothgym.grid_forces import (
     add_grid_air_forces,
     add_grid_forces,
@@ -76,8 +76,8 @@ def test_forces_and_products_are_those_of_lanes(shape, bending):
         add_grid_hinge_products(x, v, y, elements, bend, scratch)
     single = element_arrays(mesh, np.dtype(real), bending != "springs", any_order=True)
     row, f2, y2 = room_for_forces(x, np.zeros(0, np.int64)), np.zeros_like(f), np.zeros_like(f)
-    add_spring_forces(x, v, f2, single, elastic, row)
-    add_spring_products(x, v, y2, single, along, across, bend, row)
+    add_lane_forces(x, v, f2, single, elastic, row)
+    add_lane_products(x, v, y2, single, along, across, bend, row)
     if bending == "hinge":
         add_hinge_forces(x, v, f2, single, elastic, row)
         add_hinge_products(x, v, y2, single, bend, row)
@@ -95,7 +95,7 @@ def test_the_air_presses_as_it_does_on_lanes(shape):
     resistance, wind = np.array([[0.7], [0.05]]), np.array([[1.0], [-2.0], [0.5]])
     offset, f2 = grid_of(mesh, np.dtype(real), "springs").offset, np.zeros_like(f)
     add_grid_air_forces(x, v, f, grid_surface_of(mesh, np.dtype(real)), resistance, wind, room_for_forces(x, offset))
-    add_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, room_for_forces(x, offset[:0]))
+    add_lane_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, room_for_forces(x, offset[:0]))
     assert np.abs(f2).max() > 1e-3 and np.allclose(f, f2, rtol=0, atol=1e-12)
 
 

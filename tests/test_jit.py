@@ -8,8 +8,13 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from numba.core.errors import TypingError
 
+from clothgym import bending
+from clothgym._jit import inlined, kernel, placeholder, specialize
 from clothgym._jit.cache import WITHOUT_KERNELS, source_digest
+from clothgym.bending import add_bend_forces
+from clothgym.integrators import INTEGRATORS
 
 ROOT = Path(__file__).parent.parent
 
@@ -68,8 +73,8 @@ def test_what_the_digest_leaves_out_has_no_kernels():
 # --- plain numba ----------------------------------------------------------------------------------------------------------
 
 SPECIALIZED = """
-from clothgym._jit import kernel, specialize
-step = None
+from clothgym._jit import kernel, placeholder, specialize
+step = placeholder("step", "of (x): the next")
 @kernel
 def one(x):
     return x + 1.0
@@ -127,3 +132,82 @@ def test_plain_numba_gives_the_same_bits(tmp_path):
     environment = {"CLOTHGYM_CACHE_DIR": os.environ["CLOTHGYM_CACHE_DIR"]} if "CLOTHGYM_CACHE_DIR" in os.environ else {}
     assert plain == run(SMOKE, PYTHONPATH=str(ROOT), **environment)[0]
     assert list(tmp_path.rglob("plain/*/*/*.nbc"))
+
+
+# --- names that are bound -------------------------------------------------------------------------------------------------
+
+next_of = placeholder("next_of", "of (x): the number after x")
+
+
+@kernel
+def after(x):
+    return x + 1.0
+
+
+@kernel
+def before(x):
+    return x - 1.0
+
+
+def one_on(x):
+    return next_of(x)
+
+
+@kernel
+def helper(x):
+    return next_of(x)
+
+
+@inlined
+def part(x):
+    return next_of(x)
+
+
+def by_helper(x):
+    return next_of(x) + helper(x)
+
+
+def by_part(x):
+    return next_of(x) + part(x)
+
+
+@kernel
+def bends(x):
+    add_bend_forces(x, x, x, x, x, x)
+
+
+@kernel
+def bends_by_module(x):
+    bending.add_bend_forces(x, x, x, x, x, x)
+
+
+def test_a_placeholder_is_what_it_is_bound_to():
+    assert specialize(one_on, "one_on", next_of=after)(5.0) == 6.0
+    assert specialize(one_on, "one_on", next_of=before)(5.0) == 4.0
+
+
+@pytest.mark.parametrize("code", [by_helper, by_part])
+def test_a_helper_of_a_bound_function_is_not_bound_with_it(code):
+    with pytest.raises(TypingError, match=r"next_of is a placeholder for a kernel \(of \(x\): the number after x\)"):
+        specialize(code, code.__name__, next_of=after)(5.0)
+
+
+@pytest.mark.parametrize("unbound", [bends, bends_by_module])
+def test_bending_is_not_lost_without_a_word(unbound):
+    with pytest.raises(TypingError, match="add_bend_forces"):
+        unbound(1.0)
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_an_integrator_calls_forces_by_placeholders_alone(name):
+    substep = INTEGRATORS[name].substep.py_func
+    called = [substep.__globals__[n] for n in substep.__code__.co_names if n.startswith(("add_spring", "add_bend", "project_bend"))]
+    assert called
+    for force in called:
+        with pytest.raises(TypeError, match="placeholder"):
+            force()
+
+
+def test_a_name_that_is_not_used_cannot_be_bound():
+    with pytest.raises(ValueError, match="one_on does not use nextof, .* it uses next_of"):
+        specialize(one_on, "one_on", nextof=after)

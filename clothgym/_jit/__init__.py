@@ -3,17 +3,18 @@
 One policy for the whole project, so that the promises made about bits and about start-up are kept in one place:
 
     policy             the sorts of kernels and their compiler's flags; plain numba where the rest does not fit numba
-    binding            one kernel from the code of another with other callees: ``specialize``
+    binding            one kernel from the code of another with other callees: ``specialize``, ``placeholder``
     cache              the folder of compiled kernels: its name, its locks
     numba_internals    all that touches what is private to numba and llvmlite
     threads            spans of blocks on Python threads
 """
 
-from clothgym._jit.binding import specialize
+from clothgym._jit.binding import placeholder, specialize, used
 from clothgym._jit.cache import cache_folder
 from clothgym._jit.policy import apart, disjoint, inlined, kernel, uncounted
 from clothgym._jit.threads import default_threads, run_spans
 
 __all__ = [
-    "apart", "cache_folder", "default_threads", "disjoint", "inlined", "kernel", "run_spans", "specialize", "uncounted",
+    "apart", "cache_folder", "default_threads", "disjoint", "inlined", "kernel", "placeholder", "run_spans", "specialize",
+    "uncounted", "used",
 ]  # fmt: skip

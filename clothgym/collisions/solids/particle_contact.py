@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, inlined, kernel, specialize
+from clothgym._jit import apart, inlined, kernel, placeholder, specialize
 from clothgym.collisions.solids.contact_law import TINY, contact_change
 from clothgym.collisions.solids.grid_contact import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
 from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_POINT, R_VELOCITY
@@ -34,6 +34,12 @@ from clothgym.collisions.solids.signed_distance import (
 )
 from clothgym.collisions.solids.triangle_contact import find_touches, may_touch_sheet, press_touches, room_for_touches
 from clothgym.state import Layout
+
+may_touch = placeholder("may_touch", "of (x, p, collider): whether particle p of any lane may touch the solid")
+measure_solid = placeholder(
+    "measure_solid",
+    "of (scratch, spot, shapes, k, thickness): writes the signed distance and the normal at a spot in the solid's axes to scratch",
+)
 
 
 @inlined
@@ -75,9 +81,9 @@ def _push_particle_out(x, v, w, p, carried, scratch):
 def _resolve_solid(x, v, w, collider, shapes, k, carried, scratch):
     """Resolve the contacts of one block's particles with solid k, whose rows are in the scratch."""
     for p in range(x.shape[1]):
-        if may_touch(x, p, collider):  # noqa: F821
+        if may_touch(x, p, collider):
             to_axes(x, p, scratch, S_SPOT)
-            measure_solid(scratch, S_SPOT, shapes, k, x.dtype.type(0))  # noqa: F821
+            measure_solid(scratch, S_SPOT, shapes, k, x.dtype.type(0))
             normal_to_world(scratch)
             _push_particle_out(x, v, w, p, carried, scratch)
 
