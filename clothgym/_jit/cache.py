@@ -1,9 +1,11 @@
-"""The folder of compiled kernels: its name, and the locks that guard it.
+"""The folder of compiled kernels: its name, the locks that guard it, and whom it trusts.
 
 * Its name is a digest of all sources that a kernel may hold something of: numba's own cache does not notice an edit in a callee
   that lies in another file; this name does.
 * A file lock for each kernel while it is compiled: processes that start together on a cold cache compile each one once, and
   different ones at the same time.
+* What lies in it is unpickled and run.  So it must be the user's own and closed to others, and each entry begins with a checksum
+  that only this user can make: what is damaged or a stranger's is compiled again.
 """
 
 from __future__ import annotations
@@ -11,8 +13,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import hashlib
+import hmac
 import importlib.util
 import os
+import stat
 import sys
 import warnings
 from collections.abc import Mapping
@@ -23,6 +27,8 @@ import numba
 
 # modules and folders without kernels, from which none below them takes a constant: who edits them need not compile
 WITHOUT_KERNELS = {"__main__", "adapters", "cli", "playground"}
+CHECKSUM = 32  # bytes of a checksum, and of its key
+NOWHERE = Path(os.devnull) / "none"
 
 
 @functools.cache
@@ -73,7 +79,10 @@ def _default_root() -> Path:
 
 
 class CacheFolder:
-    """The folder of compiled kernels, found once, with the locks that guard it."""
+    """The folder of compiled kernels, found once, with the locks that guard it and the key of its checksums.
+
+    path: where kernels are, or a place that cannot be.  writable: whether new ones are kept there.
+    """
 
     def __init__(self) -> None:
         # locks of kernels that this process compiles now, a caller before its callees: bare descriptors.  Guarded by numba's own
@@ -81,28 +90,72 @@ class CacheFolder:
         self.held: dict[str, int] = {}
         self._announced = False
         self.writable = True
-        self.path = Path(os.devnull) / "none"
+        self.path = NOWHERE
+        self._key = b""
+        root = NOWHERE
         try:
-            self.path = _default_root() / source_digest(package_folders())
-            self.path.mkdir(parents=True, exist_ok=True)
-            os.close(os.open(self.path / "lock", os.O_RDWR | os.O_CREAT))
+            root = _default_root()
+            path = root / source_digest(package_folders())
+            for folder in (root, path):
+                folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+                _refuse_others(folder, stat.S_IWGRP | stat.S_IWOTH, "chmod go-w")
+            self._key = _key_of(root / "key")
+            self.path = path
+            os.close(os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o600))
         except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
-            self.give_up(error)
+            self.give_up(error, root)
 
-    def give_up(self, error: Exception) -> None:
+    def give_up(self, error: Exception, root: Path | None = None) -> None:
         """Go on without writing to the folder, and say so once."""
         if self.writable:
             self.writable = False
             warnings.warn(
-                f"clothgym cannot write its kernel cache {str(self.path.parent)!r} ({error}): kernels that it lacks are compiled "
-                "anew in each process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder that can be written.",
+                f"clothgym cannot use its kernel cache {str(root or self.path.parent)!r} ({error}): kernels that it lacks are "
+                "compiled anew in each process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
+                "be written.",
                 stacklevel=2,
             )
+
+    def read(self, path: Path) -> memoryview | None:
+        """What ``write`` has written there; None where nothing is, or nothing that this user's processes have written.
+
+        Raises:
+            OSError: something is there that cannot be read.
+        """
+        try:
+            entry = memoryview(path.read_bytes())
+        except FileNotFoundError:
+            return None
+        content = entry[CHECKSUM:]
+        return content if hmac.compare_digest(entry[:CHECKSUM], self._checksum(path, content)) else None
+
+    def write(self, path: Path, content: bytes) -> None:
+        """Write an entry, whole or not at all.
+
+        Raises:
+            OSError: the folder has vanished, cannot be written, or is full.
+        """
+        part = path.with_name(f"{path.name}.{os.urandom(8).hex()}.part")
+        try:
+            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(self._checksum(path, content))
+                file.write(content)
+            part.replace(path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                part.unlink()
+            raise
+
+    def _checksum(self, path: Path, content: bytes | memoryview) -> bytes:
+        """Of an entry and its name, so that none passes for another."""
+        code = hmac.new(self._key, f"{path.parent.name}/{path.name}\0".encode(), "sha256")
+        code.update(content)
+        return code.digest()
 
     def acquire(self, name: str) -> None:
         """Wait until no other process compiles the kernel of that name."""
         try:
-            file = os.open(self.path / f"{name}.lock", os.O_RDWR | os.O_CREAT)
+            file = os.open(self.path / f"{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
             _lock_file(file)
             self.held[name] = file
         except OSError as error:  # the folder has vanished, or its file system has no locks
@@ -121,6 +174,45 @@ class CacheFolder:
             print(
                 f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True
             )
+
+
+def _refuse_others(place: Path | int, rights: int, remedy: str) -> None:
+    """See that a file or folder is the user's own, and that others have none of these rights.
+
+    Raises:
+        PermissionError: it is not; the message tells why.
+    """
+    if sys.platform == "win32":
+        return
+    found = os.stat(place)
+    if found.st_uid != os.geteuid():
+        raise PermissionError(f"it belongs to user {found.st_uid}, who could put code of theirs in it, and not to you")
+    if found.st_mode & rights:
+        raise PermissionError(f"other users could put code of theirs in it; make it yours alone by {remedy}")
+
+
+def _key_of(path: Path) -> bytes:
+    """The key of this user's checksums: random, made by the first process that needs it.
+
+    Raises:
+        OSError: it cannot be read or made, or others can read it.
+    """
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError:  # a folder that can be read only
+        file = os.open(path, os.O_RDONLY)
+    try:
+        _lock_file(file)
+        _refuse_others(file, stat.S_IRWXG | stat.S_IRWXO, f"chmod 600 {path}")
+        key = os.read(file, CHECKSUM + 1)
+        os.lseek(file, 0, os.SEEK_SET)
+        if len(key) != CHECKSUM:  # it is new, or was cut short
+            key = os.urandom(CHECKSUM)
+            os.ftruncate(file, 0)
+            os.write(file, key)
+        return key
+    finally:
+        os.close(file)  # and with it goes the lock
 
 
 if sys.platform == "win32":

@@ -1,4 +1,4 @@
-"""All that touches what is private to numba and llvmlite: a cache with locks, callees that stay apart, the compiler's flags.
+"""All that touches what is private to numba and llvmlite: locks and checksums of its cache, callees that stay apart, flags.
 
 ``policy`` asks ``check`` first, and does without this module where it raises.
 """
@@ -10,6 +10,7 @@ import pickle
 from collections.abc import Mapping
 from functools import partial
 from operator import attrgetter
+from pathlib import Path
 from types import FunctionType
 from typing import Any, cast
 
@@ -38,7 +39,9 @@ def check(tested_only: bool) -> None:
     """
     if tested_only and numba.version_info.short not in TESTED:
         raise ImportError(f"tested are {', '.join(f'{major}.{minor}' for major, minor in TESTED)}")
-    attrgetter("save", "load", "flush", "_load_index", "_save_index", "_load_data", "_save_data")(caching.IndexDataCacheFile)
+    attrgetter("save", "load", "_load_index", "_save_index", "_load_data", "_save_data", "_dump", "_data_path")(
+        caching.IndexDataCacheFile
+    )
     attrgetter("_load_overload", "load_overload", "save_overload")(caching.FunctionCache)
     attrgetter("reduce", "rebuild", "_locator_classes")(caching.CompileResultCacheImpl)
     attrgetter("get_source_stamp", "get_disambiguator")(caching._SourceFileBackedLocatorMixin)
@@ -94,6 +97,30 @@ class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  #
 
     def ensure_cache_path(self) -> None:
         pass
+
+
+class _CheckedFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """A kernel's index of signatures and files of code, each with a checksum that is seen to before anything is unpickled."""
+
+    def _load_index(self) -> dict[Any, str]:
+        found = self._read(self._index_path)
+        return found[1] if found is not None and found[0] == self._source_stamp else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        cache_folder().write(Path(self._index_path), self._dump((self._source_stamp, overloads)))
+
+    def _load_data(self, name: str) -> Any:
+        return self._read(self._data_path(name))
+
+    def _save_data(self, name: str, data: Any) -> None:
+        cache_folder().write(Path(self._data_path(name)), self._dump(data))
+
+    def _read(self, path: str) -> Any:
+        content = cache_folder().read(Path(path))
+        try:
+            return None if content is None else pickle.loads(content)
+        except (AttributeError, ImportError):  # of a module that is gone or has another name here, as one that is run has
+            return None
 
 
 _code_of = attrgetter("library")  # the machine code of one of numba's compile results, with what is linked to it
@@ -152,6 +179,8 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
 
     def __init__(self, py_func: FunctionType, apart: bool) -> None:
         super().__init__(py_func)
+        place, impl = self._cache_path, self._impl
+        self._cache_file = _CheckedFiles(place, impl.filename_base, impl.locator.get_source_stamp())
         self.name, self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}", name_of(py_func)
         self.apart = apart
 
@@ -175,7 +204,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
             target_context.refresh()
         try:
             found = self._load_overload(sig, target_context)
-        except (OSError, EOFError, pickle.UnpicklingError, _Outdated):  # a file cut short, by a full disk for instance
+        except (OSError, _Outdated):
             return None
         if found is not None:
             self._set_apart(found)
@@ -185,11 +214,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         folder = cache_folder()
         if folder.writable:
             try:
-                try:
-                    super().save_overload(sig, data)
-                except (EOFError, pickle.UnpicklingError):  # the index has been cut short: begin it anew
-                    self.flush()
-                    super().save_overload(sig, data)
+                super().save_overload(sig, data)
             except OSError as error:
                 folder.give_up(error)
         self._set_apart(data)

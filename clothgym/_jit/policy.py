@@ -53,9 +53,11 @@ def _plainly(function: FunctionType, apart: bool, flags: Flags) -> Any:
     if not folder.writable:
         return numba.njit(**OPTIONS)(function)
     try:
+        # nothing in it has a checksum: it is closed to others
+        (folder.path / "plain").mkdir(mode=0o700, exist_ok=True)
         numba.config.CACHE_DIR = str(folder.path / "plain" / name_of(function))  # type: ignore[attr-defined]
         return numba.njit(cache=True, **OPTIONS)(function)
-    except RuntimeError:  # no place to cache it, or it has been typed in, and lies in no file
+    except (OSError, RuntimeError):  # no place to cache it, or it has been typed in, and lies in no file
         return numba.njit(**OPTIONS)(function)
     finally:
         numba.config.CACHE_DIR = before  # type: ignore[attr-defined]
