@@ -46,7 +46,7 @@ def test_an_edit_of_any_module_with_kernels_names_another_folder(linked, tmp_pat
         return run(code, PYTHONPATH=str(tmp_path), CLOTHGYM_CACHE_DIR=str(tmp_path / "cache"))[0]
 
     names = [name()]
-    for edited in ("forces.py", "collisions/contact_law.py", "envs/measures.py"):
+    for edited in ("forces.py", "collisions/solids/contact_law.py", "envs/measures.py"):
         path = tmp_path / "clothgym" / edited
         path.write_text(path.read_text() + "\nMORE = 1\n")
         names.append(name())
