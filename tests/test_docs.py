@@ -1,0 +1,63 @@
+"""The pages: links lead somewhere, tables name everything there is, and what the README shows runs."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+import clothgym
+from clothgym.registration import ENVIRONMENTS
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def headings(text):
+    """Anchors as GitHub makes them: lower case, hyphens for spaces, no other punctuation."""
+    lines = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).replace(" ", "-") for line in lines}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_relative_links_resolve(page):
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()) if "://" not in link]
+    for link in links:
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path) if path else page
+        assert target.exists(), link
+        assert target.resolve().is_relative_to(ROOT.resolve()), f"{link} leaves the repository"
+        if anchor:
+            assert anchor in headings(target.read_text()), link
+
+
+def test_readme_is_one_sitting_and_names_everything():
+    assert len(README.splitlines()) <= 150
+    for name in (*ENVIRONMENTS, *clothgym.INTEGRATORS):
+        assert f"`{name}`" in README, name
+    assert [page.name for page in PAGES if f"]({page.relative_to(ROOT).as_posix()})" not in README] == ["README.md"]
+
+
+def test_readme_runs(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in BLOCKS:
+        # the same in fewer steps
+        quick = block.replace("400_000", "2_560").replace("n_eval_episodes=500", "n_eval_episodes=100")
+        exec(compile(quick, "README.md", "exec"), names)
+    assert names["terminated"] and names["info"]["normalized_performance"] > 0.5  # the expert's
+    assert len(names["images"]) == 16 and names["images"][0].shape == (240, 240)
+    assert (tmp_path / "reach.zip").exists()
+    assert "return, mean and deviation" in capsys.readouterr().out
+
+
+def test_version_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0" and citation["license"] == project["license"] == "MIT"
+    assert {"message", "title", "authors"} <= set(citation)
+    assert clothgym.__version__ == project["version"] == str(citation["version"])
+    assert f"## [{project['version']}] - " in (ROOT / "CHANGELOG.md").read_text()
