@@ -54,8 +54,8 @@ def test_wrong_options_are_named(given, match):
         Simulation(SHEET, integrator=given)
 
 
-def test_another_method_s_option_is_left_out_with_a_warning():
-    with pytest.warns(UserWarning, match=r"xpbd has no option 'tolerance' \(implicit_euler has\): it is left out"):
+def test_another_method_s_option_is_ignored_with_a_warning():
+    with pytest.warns(UserWarning, match=r"xpbd has no option 'tolerance' \(implicit_euler has\): it is ignored"):
         method = get({"name": "xpbd", "tolerance": 1e-3, "iterations": 2})
     assert dict(method.options) == {"iterations": 2}
     with pytest.warns(UserWarning, match=r"verlet has no option 'iterations' \(implicit_euler, projective_dynamics, pbd, xpbd has"):

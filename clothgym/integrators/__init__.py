@@ -1,4 +1,4 @@
-"""Floor 4: the table of integrators.  One file each; a name or an ``Integrator`` is accepted wherever one is asked for."""
+"""Floor 4: the table of integrators, one file each.  Wherever an integrator is expected, its name or an ``Integrator`` will do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ INTEGRATORS: dict[str, Integrator] = {
 def get(integrator: str | Mapping[str, Any] | Integrator) -> Integrator:
     """The integrator of that name, with options as ``{"name": "xpbd", "iterations": 4}``, or the object itself.
 
-    An option of another integrator is left out with a warning: it means nothing to this one.
+    An option that only other integrators have is ignored, with a warning.
 
     Raises:
         ValueError: no such name or option; the message lists the right ones.
@@ -38,10 +38,11 @@ def get(integrator: str | Mapping[str, Any] | Integrator) -> Integrator:
         if "name" not in integrator:
             raise ValueError(f"integrator={dict(integrator)!r}: must have a 'name', one of {', '.join(INTEGRATORS)}")
         method = get(integrator["name"])
+        # an option of another integrator is ignored; what no integrator has is an error, raised by with_options
         for name in set(options) - set(method.options):
             others = [other.name for other in INTEGRATORS.values() if name in other.options]
             if others:
-                warnings.warn(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is left out", stacklevel=3)
+                warnings.warn(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is ignored", stacklevel=3)
                 del options[name]
         return method.with_options(**options)
     known("integrator", integrator, INTEGRATORS)

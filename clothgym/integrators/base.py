@@ -1,22 +1,23 @@
 """The contract of an integrator.
 
-To add one: write a file whose last function is its whole substep, a kernel with the signature
+To add one, write a file whose last function is its whole substep, a kernel with the signature
 
     substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work)
 
 on one block of lanes, and describe it by an ``Integrator``.  The substep advances positions ``x`` [m] and velocities ``v``
 [m/s], (3, particles, lanes), by ``h`` [s].
 
-* ``w``: inverse masses [1/kg], (particles, lanes); a particle with ``w = 0`` is held: it keeps its velocity, and moves with it.
-* ``elements``, ``elastic``: an ``elements.Elements`` and a block's part of ``elements.Elastic``.  ``add_spring_forces`` and
-  ``add_spring_products``, imported from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends``, imported
-  from ``bending``, become those of the chosen model, for lanes or for particles that lie side by side (``specialized``).
-* ``drag_rate`` [1/s], (lanes,), and ``gravity`` [m/s^2], (3, lanes).  ``push``: forces from outside [N], (3, particles, lanes), of
-  the air for instance: slow against the springs, and not to be written to.
-* ``options``: the values of ``Integrator.options``, in that order.  ``plan``: what ``Integrator.prepare`` made.
-* ``work``: a ``Work``, whose content does not outlive the substep.
+* ``w``: inverse masses [1/kg], (particles, lanes).  A particle with ``w = 0`` is held: it keeps its velocity, and moves with it.
+* ``elements``, ``elastic``: an ``elements.Elements`` and the block's ``elements.Elastic``.  Import ``add_spring_forces`` and
+  ``add_spring_products`` from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends`` from ``bending``.
+  ``_jit.specialize`` replaces them with those of the chosen bending model and memory layout.
+* ``drag_rate`` [1/s], (lanes,).  ``gravity`` [m/s^2], (3, lanes).
+* ``push``: external forces [N], (3, particles, lanes), such as the air's.  They change slowly compared with the springs' forces.
+  Read only.
+* ``options``: the values of ``Integrator.options``, in that order.  ``plan``: what ``Integrator.prepare`` returned.
+* ``work``: a ``Work``.  Its content is lost when the substep ends.
 
-Contact is resolved after each substep, by the simulation, on the positions and velocities that the substep leaves.
+The simulation resolves contact after each substep, on the positions and velocities that the substep leaves.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ Figures = frozenset[str]
 
 
 class Work(NamedTuple):
-    """What a substep may write to.
+    """Scratch of a substep.
 
-    fields: arrays like positions, (fields, 3, particles, lanes).  of_springs, of_bends: multipliers, (springs, lanes) and (hinges,
-    3, lanes), of methods that keep some.  scratch: for the forces of elements.
+    fields: arrays of the positions' shape, (fields, 3, particles, lanes).  of_springs, of_bends: Lagrange multipliers, (springs,
+    lanes) and (hinges, 3, lanes); empty for methods without them.  scratch: for the forces of elements.
     """
 
     fields: NDArray
@@ -50,8 +51,11 @@ class Work(NamedTuple):
 
 
 class Preparation(NamedTuple):
-    """What a method that factorises in advance is told: one environment's figures, the substep [s], who may be held, and whether
-    one sheet's particles lie side by side."""
+    """What ``Integrator.prepare`` receives.
+
+    oscillators: the properties of one environment.  h: the substep [s].  holdable: particles that may be held, (holdable,).
+    by_particle: whether the particles of one sheet, not the lanes, are adjacent in memory.
+    """
 
     oscillators: Oscillators
     h: float
@@ -61,26 +65,27 @@ class Preparation(NamedTuple):
 
 @dataclass(frozen=True)
 class Integrator:
-    """What an integrator says of itself.
+    """The description of an integrator.
 
     Attributes:
         name: its key in the table.
         order: order of accuracy in the substep; None for a method that does not converge.
-        cost, damping: what a substep costs, and how damping along springs enters it, as clauses.
+        cost, damping: the cost of a substep, and how damping along springs enters it, as clauses of a sentence.
         substep: the kernel, see the module's docstring.
-        largest_substep: the largest substep [s] that the method should be used with, and why, as a clause of a sentence; zero
-            if there is none.
-        surely_allowed: a substep [s] that is certainly no larger than that, found quickly.
-        carried: share of the substep for which what is new in the velocity has already moved the positions, at a substep's end.
-        any_order: whether the result does not depend on the springs' order, so that a grid's particles may lie side by side.
+        largest_substep: the largest substep [s] that the method should be used with, or zero if no substep will do; and the
+            reason, as a clause of a sentence.
+        surely_allowed: a substep [s] that is certainly no larger than that, and quick to compute.
+        carried: share of the substep for which the new velocity has already moved the positions when the substep ends.
+        any_order: whether the result is independent of the order of the springs, so that a grid's particles may be adjacent in
+            memory.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
-        options: numbers that the kernel takes, by name, with the values they have now.
-        fields: arrays of the particles' size that a substep needs as scratch.
-        multipliers: whether it needs room for one multiplier an element when ``options["iterations"]`` exceeds 1.
-        prepare: makes the kernel's ``plan``: arrays that follow from the figures and the substep.
-        shared: figures of the material that must be the same in all environments.
-        ignored: figures of the material that mean nothing to it.
-        limits_strain: whether it bounds the springs' stretch whatever the forces are.
+        options: numbers that the kernel takes, by name, with their current values.
+        fields: arrays of the positions' shape that a substep needs as scratch.
+        multipliers: whether it needs one Lagrange multiplier for each element if ``options["iterations"]`` exceeds 1.
+        prepare: returns the kernel's ``plan``: arrays that follow from the material properties and the substep.
+        shared: material properties that must be the same in all environments.
+        ignored: material properties that have no meaning for the method.
+        limits_strain: whether the method bounds the springs' strain, whatever the forces are.
     """
 
     name: str
@@ -102,11 +107,11 @@ class Integrator:
     limits_strain: bool = False
 
     def automatic_substeps(self, time_step: float, largest: float) -> int:
-        """Substeps of a control step [s] so that each is at most ``safety`` times the largest substep [s]."""
+        """Number of substeps in a control step [s], for each to be at most ``safety`` times the largest substep [s]."""
         return max(1, int(np.ceil(time_step / (self.safety * largest) - 1e-9)))
 
     def room(self, springs: int, bends: int) -> tuple[int, int, int]:
-        """Fields, and multipliers of springs and of bends, that ``Work`` must have room for."""
+        """Sizes of a ``Work``: the number of fields, and of multipliers of springs and of hinges."""
         remembers = self.multipliers and self.options["iterations"] > 1
         return (self.fields, springs, bends) if remembers else (self.fields, 0, 0)
 
@@ -114,12 +119,13 @@ class Integrator:
         """The same method with other options.
 
         Raises:
-            ValueError: an option that it does not have, or a value that makes no sense.
+            ValueError: an option that the method does not have, or a value out of range.
         """
         for name, value in options.items():
             if name not in self.options:
                 known = f"has only {', '.join(self.options)}" if self.options else "has none"
                 raise ValueError(f"{self.name} has no option {name!r}: it {known}")
+            # an option whose default is an integer is a count; the others are shares or tolerances
             whole = isinstance(self.options[name], int)
             numeric = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, (bool, np.bool_))
             if not numeric or not np.isfinite(value):
@@ -134,7 +140,7 @@ class Integrator:
 
 @kernel
 def room_for_work(x, offset, room):
-    """What a substep may write to, for one block; see ``elements.room_for_forces``, and ``Integrator.room``."""
+    """The ``Work`` of one block with positions ``x``; offset: see ``elements.room_for_forces``; room: see ``Integrator.room``."""
     _, particles, lanes = x.shape
     fields, springs, bends = room
     return Work(
@@ -147,19 +153,19 @@ def room_for_work(x, offset, room):
 
 @disjoint
 def _gain(v, w, f, g, keep, h):
-    """``v <- (v + h (f w + g)) keep`` of what is free."""
+    """``v <- (v + h (f w + g)) keep`` for the free particles of one sheet; v, w, f: one component each, (particles,)."""
     zero, one = v.dtype.type(0), v.dtype.type(1)
     for p in range(v.shape[0]):
-        # a choice between new and old would be stored under a mask, which is slow on many processors
+        # choose between factors, not between results: that would be a masked store, which is slow on many processors
         gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
         v[p] = (v[p] + gain) * share
 
 
 @kernel
 def advance_velocities(v, w, f, gravity, drag_rate, h):
-    """Add ``h (f w + gravity)``, then linear drag, implicitly: ``v <- v/(1 + h drag_rate)``.
+    """``v <- (v + h (w f + g)) / (1 + h b)``: forces, gravity g, and linear drag of rate b, which is implicit.
 
-    Held particles keep their velocity.  f [N], (3, particles, lanes).
+    Held particles keep their velocity.  v [m/s] and f [N]: (3, particles, lanes).
     """
     one, zero = v.dtype.type(1), v.dtype.type(0)
     particles, lanes = v.shape[1], v.shape[2]
@@ -176,7 +182,7 @@ def advance_velocities(v, w, f, gravity, drag_rate, h):
 
 @disjoint
 def _fall(v, w, f, g, keep, h):
-    """``v <- v keep + h (f w + g)`` of what is free."""
+    """``v <- v keep + h (f w + g)`` for the free particles of one sheet; v, w, f: one component each, (particles,)."""
     zero, one = v.dtype.type(0), v.dtype.type(1)
     for p in range(v.shape[0]):
         gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
@@ -185,10 +191,10 @@ def _fall(v, w, f, g, keep, h):
 
 @kernel
 def predict_velocities(v, w, push, gravity, drag_rate, h):
-    """What free particles' velocity would be without the elements: ``v <- v/(1 + h drag_rate) + h (push w + gravity)``.
+    """``v <- v/(1 + h b) + h (w push + g)``: the velocities of free particles without springs and bending.
 
-    Only what was there is dragged, so that implicit methods come to rest where forces balance, whatever the substep is.
-    push [N], (3, particles, lanes).
+    The drag of rate b acts on the old velocity only.  So implicit methods come to rest where the forces balance, whatever the
+    substep is.  v [m/s] and push [N]: (3, particles, lanes).
     """
     one, zero = v.dtype.type(1), v.dtype.type(0)
     particles, lanes = v.shape[1], v.shape[2]
@@ -205,62 +211,70 @@ def predict_velocities(v, w, push, gravity, drag_rate, h):
 
 @kernel
 def advance_positions(x, v, h):
-    """``x <- x + h v``, held particles too."""
+    """``x <- x + h v``, for held particles too; (3, particles, lanes)."""
     _advance(x.reshape(x.size), v.reshape(v.size), h)
 
 
 @disjoint
 def _advance(x, v, h):
+    """``advance_positions`` on flat arrays."""
     for e in range(x.shape[0]):
         x[e] += h * v[e]
 
 
 @kernel
 def move_on(x, v, start, h):
-    """``x <- start + h v``, held particles too."""
+    """``x <- start + h v``, for held particles too; (3, particles, lanes)."""
     _move_on(x.reshape(x.size), v.reshape(v.size), start.reshape(start.size), h)
 
 
 @disjoint
 def _move_on(x, v, start, h):
+    """``move_on`` on flat arrays."""
     for e in range(x.shape[0]):
         x[e] = start[e] + h * v[e]
 
 
 @kernel
 def weigh(w, total, r, h):
-    """``r <- h r - M total`` for free particles and zero for held ones: what is left of the backward Euler equations [N s]."""
+    """``r <- h r - M total`` for free particles, and zero for held ones: the residual of the backward Euler equations [N s].
+
+    r: on entry the elements' force [N]; total: the change of velocity so far [m/s]; both (3, particles, lanes).
+    """
     for c in range(3):
         _weigh(w.reshape(w.size), total[c].reshape(w.size), r[c].reshape(w.size), h)
 
 
 @disjoint
 def _weigh(w, total, r, h):
+    """One component of ``weigh``, on flat arrays."""
     zero, one = r.dtype.type(0), r.dtype.type(1)
     for e in range(r.shape[0]):
-        left = h * r[e] - total[e] / (w[e] if w[e] > zero else one)
-        r[e] = left if w[e] > zero else zero
+        residual = h * r[e] - total[e] / (w[e] if w[e] > zero else one)
+        r[e] = residual if w[e] > zero else zero
 
 
 @kernel
 def add_to(a, b):
-    """``a <- a + b``."""
+    """``a <- a + b``, arrays of the same shape."""
     _add_to(a.reshape(a.size), b.reshape(b.size))
 
 
 @disjoint
 def _add_to(a, b):
+    """``add_to`` on flat arrays."""
     for e in range(a.shape[0]):
         a[e] += b[e]
 
 
 @kernel
 def copy_to(a, b):
-    """``a <- b``."""
+    """``a <- b``, arrays of the same shape."""
     _copy_to(a.reshape(a.size), b.reshape(b.size))
 
 
 @disjoint
 def _copy_to(a, b):
+    """``copy_to`` on flat arrays."""
     for e in range(a.shape[0]):
         a[e] = b[e]

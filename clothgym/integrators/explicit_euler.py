@@ -1,9 +1,11 @@
-"""Explicit (forward) Euler: positions with the old velocities, velocities with the old positions' forces.
+"""Explicit (forward) Euler: positions advance with the old velocities, velocities with the forces at the old positions.
 
-Order 1.  Cost: one force pass a substep.  It is here to be seen failing: an undamped oscillator of frequency w grows by
-sqrt(1 + (h w)^2) in every substep, whatever the substep is.  With dampers of retardation time tau along the springs it is
-stable while ``h <= tau`` and ``(h w)^2 - 2 h tau w^2 + 4 >= 0`` (from the eigenvalues of its step matrix; Hairer, Lubich and
-Wanner, Geometric Numerical Integration, 2006, I.1.2 for the undamped case).  Damping along springs enters as an explicit force.
+Hairer, Lubich and Wanner 2006, Geometric Numerical Integration, section I.1.2.
+
+Order 1.  Cost: one force pass per substep.  It is here to show how it fails: in each substep the amplitude of an undamped
+oscillator of angular frequency w grows by sqrt(1 + (h w)^2), however small the substep h is.  With dampers of retardation time tau
+along the springs it is stable if ``h <= tau`` and ``(h w)^2 - 2 h tau w^2 + 4 >= 0``; this follows from the eigenvalues of its
+step matrix.  Damping along springs enters as an explicit force.
 """
 
 from __future__ import annotations
@@ -17,28 +19,34 @@ from clothgym.integrators.base import Integrator, advance_positions, advance_vel
 
 
 def _stable_substep(w: float, damping_time: float) -> float:
-    """The smaller of tau and of the smaller root of ``(h w)^2 - 2 h tau w^2 + 4 = 0``, if it has any."""
+    """tau [s], or the smaller root of ``(h w)^2 - 2 h tau w^2 + 4 = 0`` if that exists and is smaller; w [rad/s]."""
     oscillating = damping_time**2 - 4 / w**2
     return min(damping_time, damping_time - np.sqrt(oscillating)) if oscillating > 0 else damping_time
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
-    """The bound at the sheet's largest frequency."""
+    """The bound [s] at the sheet's largest frequency, and the reason for it."""
     why = "beyond it every mode of the sheet grows without bound" if o.damping_time else "without damping it grows at any substep"
     return float(_stable_substep(largest_frequency(o), o.damping_time)), why
 
 
 def surely_allowed(o: Oscillators) -> float:
-    """The bound at a frequency that is certainly no smaller."""
+    """The bound [s] at a frequency that is certainly no smaller than the largest one."""
     return float(_stable_substep(frequency_bound(o), o.damping_time))
 
 
 @uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    """``x_1 = x_0 + h v_0``, ``v_1 = (v_0 + h (M^-1 f(x_0, v_0) + g)) / (1 + h b)``, with the drag's rate b.
+
+    Arguments, shapes and units are those of ``integrators.base``.
+    """
+    # forces at the old positions and velocities
     f = work.fields[0]
     copy_to(f, push)
     add_spring_forces(x, v, f, elements, elastic, work.scratch)
     add_bend_forces(x, v, f, elements, elastic, work.scratch)
+    # positions first: they must see the old velocities
     advance_positions(x, v, h)
     advance_velocities(v, w, f, gravity, drag_rate, h)
 

@@ -1,9 +1,11 @@
 """The classical Runge-Kutta method of order 4.
 
-Order 4.  Cost: four force passes a substep.  On an oscillator of frequency w it is stable for h w <= 2 sqrt(2) and loses
-amplitude by ``1 - (h w)^6/144`` a substep; damped, where ``|1 + z + z^2/2 + z^3/6 + z^4/24| <= 1`` for z = h lambda (Hairer,
-Norsett and Wanner, Solving Ordinary Differential Equations I, II.1 and II, IV.2).  Damping along springs and linear drag are parts
-of the derivative.
+Hairer, Norsett and Wanner 1993, Solving Ordinary Differential Equations I, section II.1; for stability Hairer and Wanner 1996,
+Solving Ordinary Differential Equations II, section IV.2.
+
+Order 4.  Cost: four force passes per substep.  On an undamped oscillator of angular frequency w it is stable for h w <= 2 sqrt(2),
+and its amplitude is multiplied by about ``1 - (h w)^6/144`` per substep.  A damped mode with eigenvalue lambda is stable where
+``|1 + z + z^2/2 + z^3/6 + z^4/24| <= 1`` with z = h lambda.  Damping along springs and linear drag are part of the derivative.
 """
 
 from __future__ import annotations
@@ -17,17 +19,19 @@ from clothgym.integrators.base import Integrator, copy_to, move_on
 
 
 def _amplification(h: float, w: float, damping_time: float) -> float:
-    """Largest growth of a damped mode of frequency w [rad/s] in a substep."""
+    """Largest growth of a damped mode of frequency w [rad/s] in a substep h [s]: ``|R(h lambda)|`` of both its eigenvalues."""
     rate = damping_time * w * w / 2
     root = np.sqrt(complex(rate * rate - w * w))
     return max(float(abs(np.polyval([1 / 24, 1 / 6, 1 / 2, 1, 1], h * (-rate + sign * root)))) for sign in (1, -1))
 
 
 def _stable_substep(w: float, damping_time: float) -> float:
-    """Where the amplification of the mode passes 1, by bisection below what the undamped mode allows."""
+    """The substep [s] at which the amplification of the mode passes 1, by bisection below the bound of the undamped mode."""
+    # up to the undamped bound, if damping does not lower it
     low, high = 0.0, 2 * np.sqrt(2) / w
     if _amplification(high, w, damping_time) <= 1 + 1e-9:
         return float(high)
+    # bisection: stable at low, unstable at high
     while high - low > 1e-9 * high:
         middle = (low + high) / 2
         low, high = (middle, high) if _amplification(middle, w, damping_time) <= 1 else (low, middle)
@@ -35,18 +39,18 @@ def _stable_substep(w: float, damping_time: float) -> float:
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
-    """The bound at the sheet's largest frequency."""
+    """The bound [s] at the sheet's largest frequency, and the reason for it."""
     return _stable_substep(largest_frequency(o), o.damping_time), "beyond it the stiffest mode of the sheet grows without bound"
 
 
 def surely_allowed(o: Oscillators) -> float:
-    """The bound at a frequency that is certainly no smaller."""
+    """The bound [s] at a frequency that is certainly no smaller than the largest one."""
     return _stable_substep(frequency_bound(o), o.damping_time)
 
 
 @disjoint
 def _stage_of(x, v, w, f, g, drag, start_x, start_v, sum_x, sum_v, share, reach):
-    """One component of ``_stage``, of one sheet: gravity g [m/s^2] and drag [1/s] are numbers."""
+    """One component of ``_stage`` for one sheet: arrays (particles,); gravity g [m/s^2] and drag [1/s] are numbers."""
     zero = x.dtype.type(0)
     for p in range(x.shape[0]):
         a = f[p] * w[p] + g - drag * v[p]
@@ -59,7 +63,11 @@ def _stage_of(x, v, w, f, g, drag, start_x, start_v, sum_x, sum_v, share, reach)
 
 @kernel
 def _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share, reach):
-    """Add ``share`` of the derivative at (x, v) to the sums, and go ``reach`` [s] along it from the start."""
+    """One stage: ``sum <- sum + share k`` and ``(x, v) <- start + reach k``, with the derivative ``k = (v, M^-1 f + g - b v)``.
+
+    The acceleration of a held particle is zero.  x, v, f, the starts and the sums: (3, particles, lanes).  share: weight of the
+    stage.  reach: to the next stage [s].
+    """
     zero = x.dtype.type(0)
     particles, lanes = x.shape[1], x.shape[2]
     for c in range(3):
@@ -84,19 +92,28 @@ def _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share
 
 @uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    """``y_1 = y_0 + h/6 (k_1 + 2 k_2 + 2 k_3 + k_4)`` with y = (x, v) and its derivative ``k = (v, M^-1 f(x, v) + g - b v)``.
+
+    k_1 is taken at y_0, k_2 at ``y_0 + h/2 k_1``, k_3 at ``y_0 + h/2 k_2`` and k_4 at ``y_0 + h k_3``; b is the drag's rate.
+    Arguments, shapes and units are those of ``integrators.base``.
+    """
     t = x.dtype.type
     start_x, start_v, sum_x, sum_v, f = work.fields[0], work.fields[1], work.fields[2], work.fields[3], work.fields[4]
+    # y_0, and the weighted sum of the derivatives
     copy_to(start_x, x)
     copy_to(start_v, v)
     sum_x[:] = 0
     sum_v[:] = 0
     for stage in range(4):
+        # the forces at this stage
         copy_to(f, push)
         add_spring_forces(x, v, f, elements, elastic, work.scratch)
         add_bend_forces(x, v, f, elements, elastic, work.scratch)
+        # add the derivative with its weight, and go on to the next stage; where the last one goes is overwritten below
         share = t(1) if stage == 0 or stage == 3 else t(2)
         reach = h if stage == 2 else t(0.5) * h
         _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share, reach)
+    # y_1 from y_0 and the sum
     move_on(x, sum_x, start_x, h / t(6))
     move_on(v, sum_v, start_v, h / t(6))
 

@@ -1,9 +1,12 @@
-"""Position Verlet (leapfrog): half a drift, a kick with the forces in the middle, half a drift.
+"""Position Verlet (leapfrog): half a drift, a kick with the forces at the midpoint, half a drift.
 
-Order 2, and 1 in what damps along springs, whose velocities are those of the substep's start.  Cost: one force pass a substep.
-Symplectic and symmetric without damping: amplitude 1, phase 2 asin(h w/2) a substep.  Stable as semi-implicit Euler is, whose
-step matrix has the same eigenvalues: h w <= 2, damped ``(h w)^2 + 2 h gamma <= 4`` (Hairer, Lubich and Wanner 2003, Geometric
-numerical integration illustrated by the Stoermer-Verlet method, 1.1 and 1.5).  Linear drag enters by the trapezoidal rule.
+Hairer, Lubich and Wanner 2003, Geometric numerical integration illustrated by the Stoermer-Verlet method, sections 1.1 and 1.5.
+
+Order 2; order 1 in the damping along springs, which uses the velocities at the start of the substep.  Cost: one force pass per
+substep.  Symplectic and symmetric without damping: an oscillator of angular frequency w keeps its amplitude, and its phase
+advances by 2 asin(h w/2) per substep.  Its step matrix has the eigenvalues of semi-implicit Euler's, so it is stable under the
+same conditions: h w <= 2, and with a damper of rate gamma ``(h w)^2 + 2 h gamma <= 4``.  Linear drag enters by the trapezoidal
+rule.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from clothgym.integrators.semi_implicit_euler import largest_substep, surely_all
 
 @disjoint
 def _kick_one(v, w, f, g, slow, h):
-    """One component of one sheet, of whose velocity drag takes the share ``slow`` in half a substep."""
+    """One component of ``_kick`` for one sheet: v, w, f (particles,).  slow: ``h b/2``, the drag in half a substep."""
     one, zero = v.dtype.type(1), v.dtype.type(0)
     for p in range(v.shape[0]):
         gain, share = (h * (f[p] * w[p] + g), slow) if w[p] > zero else (zero, zero)
@@ -26,7 +29,10 @@ def _kick_one(v, w, f, g, slow, h):
 
 @kernel
 def _kick(v, w, f, gravity, drag_rate, h):
-    """``v <- (v (1 - h b/2) + h (f w + g)) / (1 + h b/2)`` for free particles, with b the drag's rate."""
+    """``v <- (v (1 - h b/2) + h (w f + g)) / (1 + h b/2)`` for free particles, with the drag's rate b [1/s].
+
+    v [m/s] and f [N]: (3, particles, lanes).
+    """
     one, zero, half = v.dtype.type(1), v.dtype.type(0), v.dtype.type(0.5)
     particles, lanes = v.shape[1], v.shape[2]
     for c in range(3):
@@ -43,13 +49,20 @@ def _kick(v, w, f, gravity, drag_rate, h):
 
 @uncounted
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    """``x_1/2 = x_0 + h/2 v_0``, ``v_1 = v_0 + h (M^-1 f(x_1/2, v_0) + g - b (v_0 + v_1)/2)``, ``x_1 = x_1/2 + h/2 v_1``.
+
+    b is the drag's rate.  Arguments, shapes and units are those of ``integrators.base``.
+    """
     f = work.fields[0]
     half = x.dtype.type(0.5) * h
+    # drift: half a substep with the old velocities
     advance_positions(x, v, half)
+    # kick: a whole substep with the forces at the midpoint
     copy_to(f, push)
     add_spring_forces(x, v, f, elements, elastic, work.scratch)
     add_bend_forces(x, v, f, elements, elastic, work.scratch)
     _kick(v, w, f, gravity, drag_rate, h)
+    # drift: half a substep with the new velocities
     advance_positions(x, v, half)
 
 
