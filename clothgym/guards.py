@@ -117,7 +117,7 @@ def refusal(integrator: Integrator, name: str) -> str:
     if name in integrator.ignored:
         return f"{integrator.name} knows no {name}: its stiffness is a matter of its options ({', '.join(integrator.options)})"
     return (
-        f"{integrator.name} factorises one matrix for all environments: {name} cannot differ between them; set it for all, or take "
+        f"{integrator.name} factorizes one matrix for all environments: {name} cannot differ between them; set it for all, or take "
         "another integrator"
     )
 

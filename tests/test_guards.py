@@ -203,7 +203,7 @@ def test_a_state_of_another_sheet_is_refused(state, told):
 def test_a_matrix_for_all_refuses_a_state_of_many_fabrics():
     many = Simulation(MESH, num_envs=2)
     many.set_parameters(stretch_stiffness=[100.0, 200.0])
-    with pytest.raises(ValueError, match="factorises one matrix"):
+    with pytest.raises(ValueError, match="factorizes one matrix"):
         Simulation(MESH, num_envs=2, integrator="projective_dynamics").set_state(many.get_state())
 
 

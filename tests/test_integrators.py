@@ -71,7 +71,7 @@ def test_projective_dynamics_refuses_figures_that_differ(figure):
     simulation = Simulation(SHEET, num_envs=3, integrator="projective_dynamics", anchors=[0], substeps=40, dtype="float64")
     simulation.step()
     before, figures = simulation.positions, simulation.parameters
-    with pytest.raises(ValueError, match=f"factorises one matrix for all environments: {figure} cannot differ between them"):
+    with pytest.raises(ValueError, match=f"factorizes one matrix for all environments: {figure} cannot differ between them"):
         simulation.set_parameters(envs=[1], **{figure: 1.5 * getattr(simulation.material, figure)})
     assert np.array_equal(simulation.parameters, figures)
     changed = {figure: 1.5 * getattr(simulation.material, figure)}

@@ -1,19 +1,22 @@
-"""Backward Euler, linearised once a substep and solved by conjugate gradients.
+"""Backward Euler, linearized once per substep and solved by conjugate gradients.
 
 Baraff and Witkin 1998, Large Steps in Cloth Simulation.
 
-With v* the velocity that gravity, drag and the air would leave, f the elements' force, K its stiffness and D its damping matrix,
-a substep solves ``(M + h D + h^2 K) d = h f(x, v*) - h^2 K v*`` and takes ``v = v* + d``, ``x <- x + h v`` (their eq. 16, about v*
-in place of v).  ``newton_iterations`` beyond 1 linearise again where the substep would end, ``M d = h f(x + h v, v) - M (v - v*)``:
-that is Newton's method for the full backward Euler equations, with K without what would make it indefinite.
+Let v* be the velocity after gravity, drag and the air, f the elements' force, K its stiffness matrix and D its damping matrix.  A
+substep solves ``(M + h D + h^2 K) d = h f(x, v*) - h^2 K v*`` for d and sets ``v = v* + d``, ``x <- x + h v``.  This is their eq.
+16, with d for their delta v, expanded about v* in place of v_0.
 
-Conjugate gradients take the inverse masses as preconditioner.  A held particle's is zero, and that is the filter of their
-section 5.3: its residual never enters, and its velocity stays exact after any number of iterations.  The residuals of a free sheet
-sum to zero in every iteration, so that its momentum stays exact too.  Each lane has its own step lengths, and stops where its
-residual is ``tolerance`` times the first: what the others do does not change its bits.
+With ``newton_iterations`` above 1 the equations are linearized again at the end of the substep found so far, with the residual
+``h f(x + h v, v) - M (v - v*)`` on the right.  This is Newton's method for the full backward Euler equations, except that K lacks
+the part that could make it indefinite.
 
-Order 1.  Cost: a force pass, and a product with the stiffness matrix for each iteration and one more.  Never unstable; a mode of
-frequency w keeps 1/sqrt(1 + (h w)^2) of its amplitude a substep.  Damping along springs enters implicitly, in D.
+The preconditioner of the conjugate gradients is M^-1.  It is zero for a held particle, which is the filter of their section 5.3:
+its residual never enters, and its velocity is exact after any number of iterations.  The residuals of a free sheet sum to zero in
+every iteration, so its momentum is exact too.  Each lane has its own step lengths, and stops when its residual is ``tolerance``
+times the first.  So no lane affects the bits of another.
+
+Order 1.  Cost: a force pass, one product with the stiffness matrix, and one more for each iteration.  Never unstable; a mode of
+angular frequency w keeps 1/sqrt(1 + (h w)^2) of its amplitude in a substep.  Damping along springs enters implicitly, in D.
 """
 
 from __future__ import annotations
@@ -27,28 +30,29 @@ from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
 from clothgym.integrators.base import Integrator, add_to, copy_to, move_on, predict_velocities, weigh
 
-GRAVITY = 9.81
-LOST = 0.02
-PARTS = 16  # sums that one sheet's products are added up in, side by side
+GRAVITY = 9.81  # [m/s^2]
+LOST = 0.02  # share of its amplitude that a swing may lose in a period
+PARTS = 16  # partial sums of a scalar product, which one vector instruction can add to
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
-    """Where a swing loses a fiftieth of its amplitude in a period.
+    """The substep [s] at which a swing loses a fiftieth of its amplitude in a period, and the reason for it.
 
-    ``(1 + (h w)^2)^(-1/2)`` a substep is ``exp(-pi h w)`` a period; w is that of a pendulum as long as the sheet's longest side.
+    ``(1 + (h w)^2)^(-1/2)`` per substep is about ``exp(-pi h w)`` per period.  w is the frequency of a pendulum as long as the
+    sheet's longest side.
     """
     length = float(np.ptp(o.positions, axis=0).max())
     return LOST / (np.pi * np.sqrt(GRAVITY / length)), "beyond it a swing loses more than 2 % a period (it is never unstable)"
 
 
 def surely_allowed(o: Oscillators) -> float:
-    """Any: it is taken for its large steps, and nobody need be warned of them."""
+    """Any substep: the method is chosen for its large steps, so they need no warning."""
     return float("inf")
 
 
 @disjoint
 def _turn_all(w, r, p, q, share):
-    """One component of ``_turn``, of one sheet."""
+    """One component of ``_turn`` for one sheet: arrays (particles,)."""
     one, zero = p.dtype.type(1), p.dtype.type(0)
     for i in range(p.shape[0]):
         p[i] = w[i] * r[i] + share * p[i]
@@ -57,9 +61,9 @@ def _turn_all(w, r, p, q, share):
 
 @kernel
 def _turn(w, r, p, q, share):
-    """The next search direction, ``p = M^-1 r + share p``, and its product with the masses, ``q = M p``, in one pass.
+    """The next search direction, ``p <- M^-1 r + share p``, and the masses' part of the product with it, ``q <- M p``, in one pass.
 
-    A held particle has neither.  share: (lanes,).
+    For a held particle both are zero.  r, p, q: (3, particles, lanes).  share: (lanes,).
     """
     one, zero = p.dtype.type(1), p.dtype.type(0)
     particles, lanes = w.shape
@@ -76,19 +80,23 @@ def _turn(w, r, p, q, share):
 
 @kernel
 def _sum_of_products(a, b, out):
-    """``a . b`` of each lane, (lanes,); a, b: (3, particles, lanes).
+    """``out <- a . b`` for each lane, (lanes,); a, b: (3, particles, lanes).
 
-    A sum goes by ``PARTS`` sums of what lies that many places apart, and then over these, however many lanes there are.
+    Partial sum k adds the products at places k, k + PARTS, k + 2 PARTS, ...; then the partial sums are added up.  The order is the
+    same for any number of lanes.
     """
+    # places from the last multiple of PARTS on are added one by one
     lanes = out.shape[0]
     size = a.size // lanes
     whole = size - size % PARTS
     one, other, parts = a.reshape((size, lanes)), b.reshape((size, lanes)), np.zeros((PARTS, lanes), a.dtype)
+    # the partial sums: of one sheet as vectors, else lane by lane
     if lanes == 1:
         _add_in_parts(one[:whole].reshape(whole), other[:whole].reshape(whole), parts.reshape(PARTS))
     for e in range(whole if lanes == 1 else 0, size):
         for l in range(lanes):
             parts[e % PARTS, l] += one[e, l] * other[e, l]
+    # the sum of the partial sums
     out[:] = 0
     for k in range(PARTS):
         for l in range(lanes):
@@ -97,6 +105,7 @@ def _sum_of_products(a, b, out):
 
 @disjoint
 def _add_in_parts(a, b, parts):
+    """``_sum_of_products`` of one sheet, up to the partial sums; the length of a and b is a multiple of PARTS."""
     for begin in range(0, a.shape[0], PARTS):
         for k in range(PARTS):
             parts[k] += a[begin + k] * b[begin + k]
@@ -104,7 +113,7 @@ def _add_in_parts(a, b, parts):
 
 @kernel
 def _square(w, r, scaled, out):
-    """``r . M^-1 r`` of each lane, (lanes,); scaled: becomes ``M^-1 r``."""
+    """``out <- r . M^-1 r`` for each lane, (lanes,), and ``scaled <- M^-1 r``; r, scaled: (3, particles, lanes)."""
     for c in range(3):
         _scale(w.reshape(w.size), r[c].reshape(w.size), scaled[c].reshape(w.size))
     _sum_of_products(scaled, r, out)
@@ -112,12 +121,14 @@ def _square(w, r, scaled, out):
 
 @disjoint
 def _scale(w, r, out):
+    """``out <- M^-1 r``, one component, on flat arrays."""
     for e in range(r.shape[0]):
         out[e] = w[e] * r[e]
 
 
 @disjoint
 def _go(d, p, r, q, step):
+    """``_advance`` for one sheet, on flat arrays."""
     for e in range(d.shape[0]):
         d[e] += step * p[e]
         r[e] -= step * q[e]
@@ -125,7 +136,7 @@ def _go(d, p, r, q, step):
 
 @kernel
 def _advance(d, p, q, r, step):
-    """``d += step p``, ``r -= step q``; step: (lanes,)."""
+    """``d <- d + step p`` and ``r <- r - step q``; d, p, q, r: (3, particles, lanes); step: (lanes,)."""
     lanes = step.shape[0]
     if lanes == 1:
         _go(d.reshape(d.size), p.reshape(d.size), r.reshape(d.size), q.reshape(d.size), step[0])
@@ -141,6 +152,13 @@ def _advance(d, p, q, r, step):
 
 @kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    """``(M + h D + h^2 K) d = h f(x, v*) - h^2 K v*``, then ``v = v* + d`` and ``x <- x + h v``; see the module's docstring.
+
+    ``total = v - v*`` is the sum of d over the Newton iterations.  In each iteration r is the residual, p the search direction,
+    q the matrix times p, ``rho = r . M^-1 r``, and step the step length along p.  Arguments, shapes and units are those of
+    ``integrators.base``.
+    """
+    # names for options and scratch
     stiffness, rigidity, damping_time = elastic
     t = x.dtype.type
     zero = t(0)
@@ -149,20 +167,25 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     start, total, d = work.fields[0], work.fields[1], work.fields[2]
     r, p, q, scaled = work.fields[3], work.fields[4], work.fields[5], work.fields[6]
     goal, rho, step, after, bend = np.empty((5, lanes), x.dtype)
+    # the springs' coefficients along and across them, by kind: first those of -h^2 K, for the right side
     along, across = np.empty_like(stiffness), np.empty_like(stiffness)
     for kind in range(stiffness.shape[0]):
         for l in range(lanes):
             across[kind, l] = -stiffness[kind, l] * h * h
+    # v*
     predict_velocities(v, w, push, gravity, drag_rate, h)
     copy_to(start, x)
     total[:] = 0
     for newton in range(newton_iterations):
+        # linearize at the start of the substep, and later at its end as found so far
         if newton > 0:
             move_on(x, v, start, h)
+        # the right side: h f - M (v - v*)
         r[:] = 0
         add_spring_forces(x, v, r, elements, elastic, scratch)
         add_bend_forces(x, v, r, elements, elastic, scratch)
         weigh(w, total, r, h)
+        # the first time also - h^2 K v*, as f is taken at the start; then the coefficients become those of h D + h^2 K
         if newton == 0:
             for l in range(lanes):
                 bend[l] = -rigidity[l] * h * h
@@ -172,6 +195,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
                 for l in range(lanes):
                     across[kind, l] = stiffness[kind, l] * h * h
                     along[kind, l] = stiffness[kind, l] * (h * h + h * damping_time[l])
+        # begin with d = 0: the first search direction is M^-1 r
         _square(w, r, scaled, rho)
         for l in range(lanes):
             bend[l] = rigidity[l] * (h * h + h * damping_time[l])
@@ -179,36 +203,43 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
             step[l] = zero
         d[:] = 0
         p[:] = 0
+        # forces that are not finite must show in the result: the loop below would take such a lane for solved
         for l in range(lanes):
             if not rho[l] < np.inf:
-                d[0, 0, l] = rho[l]  # forces that are not finite must be seen: the loop below would take them for solved
+                d[0, 0, l] = rho[l]
         for _ in range(iterations):
+            # stop when all lanes have reached their tolerance
             going = False
             for l in range(lanes):
                 going |= rho[l] > goal[l]
             if not going:
                 break
+            # the search direction p, and q = (M + h D + h^2 K) p
             _turn(w, r, p, q, step)
             add_spring_products(x, p, q, elements, along, across, bend, scratch)
             add_bend_products(x, p, q, elements, bend, scratch)
+            # the step length rho / (p . q), zero for lanes that are done
             _sum_of_products(p, q, step)
             for l in range(lanes):
                 step[l] = rho[l] / step[l] if rho[l] > goal[l] and step[l] > zero else zero
+            # take the step; the next direction keeps the share (new rho) / (old rho) of this one
             _advance(d, p, q, r, step)
             _square(w, r, scaled, after)
             for l in range(lanes):
                 share = after[l] / rho[l] if rho[l] > zero else zero
                 rho[l] = after[l] if step[l] > zero else zero
                 step[l] = share
+        # v = v* + total
         add_to(v, d)
         add_to(total, d)
+    # positions with the new velocities
     move_on(x, v, start, h)
 
 
 IMPLICIT_EULER = Integrator(
     "implicit_euler",
     order=1,
-    cost="a force pass, and a matrix product for each iteration and one more",
+    cost="a force pass, a matrix product, and one more for each iteration",
     damping="implicitly, in the matrix",
     substep=substep,
     largest_substep=largest_substep,

@@ -1,15 +1,18 @@
-"""Position-based dynamics: Mueller, Heidelberger, Hennix and Ratcliff 2007.
+"""Position-based dynamics.
 
-Particles fall freely for a substep, then ``iterations`` Gauss-Seidel passes move the ends of each spring towards its rest length,
-and velocities are what was moved.  A pass takes the share ``k' = 1 - (1 - k)^(1/iterations)`` of each constraint (their section
-3.3), so that a lone one is left with 1 - k of its error whatever the number of passes.
+Mueller, Heidelberger, Hennix and Ratcliff 2007, Position based dynamics.
 
-It is here because it is everywhere.  It does not converge, and no material figure but the density means anything to it: the
-stiffness k is a number from 0 to 1 a substep, ``stretch`` for threads and diagonals and ``bend`` for what bends, and twice the
-substeps make another fabric.  A lone oscillator loses amplitude by sqrt(1 - k) a substep and turns by acos(sqrt(1 - k)), for any h.
+Particles fall freely for a substep.  Then ``iterations`` Gauss-Seidel passes move the ends of each spring towards its rest length,
+and the velocities follow from the displacements.  A pass removes the share ``k' = 1 - (1 - k)^(1/iterations)`` of each constraint's
+error (their section 3.3), so that a lone constraint is left with 1 - k of its error, whatever the number of passes.
 
-Order: none.  Cost: one projection pass an iteration.  Never unstable.  Damping along springs does not enter: the projections
-damp far more.
+It is here because it is widely used.  It does not converge, and density is the only material property that it uses.  Its stiffness
+k is a number from 0 to 1: ``stretch`` for structural and shear springs, ``bend`` for bending springs and hinges.  It applies per
+substep, so twice the substeps make another fabric.  In each substep a lone oscillator's amplitude is multiplied by sqrt(1 - k) and
+its phase advances by acos(sqrt(1 - k)), for any h.
+
+Order: none.  Cost: one projection pass per iteration.  Never unstable.  Damping along springs does not enter: the projections damp
+far more.
 """
 
 from __future__ import annotations
@@ -25,39 +28,47 @@ from clothgym.integrators.base import Integrator
 from clothgym.integrators.xpbd import TINY, predict, take_velocities
 from clothgym.mesh import SHEAR
 
-USUAL = 1 / 300  # [s]
-RIGID = 1e12  # a scale at which projecting a bend solves it whole
+USUAL = 1 / 300  # a usual substep [s]
+RIGID = 1e12  # 1/alpha_tilde of a bend [kg m^2]: so large that its projection solves the constraint entirely
 
 
 def largest_substep(o: Oscillators) -> tuple[float, str]:
-    """What is usual, for want of anything to hold it against."""
+    """A usual substep [s], as no bound exists, and the reason."""
     return USUAL, "no substep is right for it: its stiffness depends on the substep and the iterations"
 
 
 def surely_allowed(o: Oscillators) -> float:
-    """Any: there is nothing to warn of that is not always so."""
+    """Any substep: what there is to warn of holds for every substep."""
     return float("inf")
 
 
 @disjoint
 def _project_rigid(xi, yi, zi, xj, yj, zj, mi, mj, share, r):
-    """Move both ends of one spring, in lanes."""
+    """Project one spring, in lanes: ``dp_i = k' w_i/(w_i + w_j) (|d| - r) d/|d|``, ``dp_j = -w_j/w_i dp_i`` (their section 3.3).
+
+    d: the vector from i to j.  xi ... zj: components of both ends [m]; mi, mj: inverse masses [1/kg]; all (lanes,).  share: k'.
+    r: rest length [m].
+    """
     tiny = xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
         dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
         d2 = dx * dx + dy * dy + dz * dz + tiny
-        lam = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + tiny))
-        xi[l] += mi[l] * lam * dx
-        yi[l] += mi[l] * lam * dy
-        zi[l] += mi[l] * lam * dz
-        xj[l] -= mj[l] * lam * dx
-        yj[l] -= mj[l] * lam * dy
-        zj[l] -= mj[l] * lam * dz
+        # the displacement of a unit of inverse mass, over d
+        s = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + tiny))
+        xi[l] += mi[l] * s * dx
+        yi[l] += mi[l] * s * dy
+        zi[l] += mi[l] * s * dz
+        xj[l] -= mj[l] * s * dx
+        yj[l] -= mj[l] * s * dy
+        zj[l] -= mj[l] * s * dz
 
 
 @kernel
 def project_rigid_springs(x, w, springs, stretch, bend):
-    """Move both ends of each spring by the share ``stretch``, or ``bend`` for what bends, of its error, in place."""
+    """One pass over the springs: remove the share ``stretch``, or ``bend`` for springs that bend, of each one's error, in place.
+
+    x [m]: (3, particles, lanes).  w [1/kg]: (particles, lanes).
+    """
     ends, rest_length, kind, _ = springs
     x0, x1, x2 = x[0], x[1], x[2]
     for s in range(ends.shape[0]):
@@ -69,10 +80,15 @@ def project_rigid_springs(x, w, springs, stretch, bend):
 
 @kernel
 def share_of_a_pass(k, iterations):
-    """``1 - (1 - k)^(1/iterations)``, by Newton's method on ``y^iterations = 1 - k`` from above: no power function in a kernel."""
+    """``k' = 1 - (1 - k)^(1/iterations)``, the share of a constraint's error that one pass removes (their section 3.3).
+
+    By Newton's method on ``y^iterations = 1 - k`` from above, as kernels call no power function.
+    """
+    # k = 1: each pass removes all of the error
     left = 1.0 - k
     if left <= 0.0:
         return 1.0
+    # Newton's steps are positive until rounding ends them
     y = 1.0
     for _ in range(60 * iterations):
         power = 1.0
@@ -87,18 +103,26 @@ def share_of_a_pass(k, iterations):
 
 @kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
+    """``p = x + h v*``, then ``dp_i = -k' w_i grad_i C C / sum_j w_j |grad_j C|^2`` for each constraint C in turn, then
+    ``v = (p - x)/h`` and ``x <- p`` (their sections 3.2 and 3.3).
+
+    v* is the velocity after gravity, drag and the air.  Arguments, shapes and units are those of ``integrators.base``.
+    """
     _, rigidity, damping_time = elastic
     t = x.dtype.type
     iterations, stretch, bend = options
     start = work.fields[0]
-    scale, damping = np.empty_like(rigidity), np.empty_like(rigidity)
-    scale[:] = RIGID
-    damping[:] = 0
-    along, across = t(share_of_a_pass(stretch, iterations)), t(share_of_a_pass(bend, iterations))
+    # bends are projected as in xpbd: rigid, without damping, and by the share k'
+    inverse_alpha_tilde, gamma = np.empty_like(rigidity), np.empty_like(rigidity)
+    inverse_alpha_tilde[:] = RIGID
+    gamma[:] = 0
+    # k' of stretch and of bend
+    share_stretch, share_bend = t(share_of_a_pass(stretch, iterations)), t(share_of_a_pass(bend, iterations))
+    # predict positions, project the constraints, and derive the velocities
     predict(x, v, w, start, gravity, push, drag_rate, h)
     for _ in range(iterations):
-        project_rigid_springs(x, w, elements.springs, along, across)
-        project_bends(x, start, w, elements.bends, scale, damping, across, work.of_bends, work.scratch)
+        project_rigid_springs(x, w, elements.springs, share_stretch, share_bend)
+        project_bends(x, start, w, elements.bends, inverse_alpha_tilde, gamma, share_bend, work.of_bends, work.scratch)
     take_velocities(x, v, w, start, h)
 
 
