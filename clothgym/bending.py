@@ -1,20 +1,22 @@
-"""Floor 3: what resists bending: skip springs, or hinges between triangles.
+"""Floor 3: models of bending: skip springs, the quadratic model, and hinges between triangles.
 
-A model is three kernels on one block of lanes, to which ``_jit.specialize`` binds the names of the placeholders
-below wherever an integrator uses them:
+A model is three kernels on one block of lanes.  Where an integrator calls the placeholders below, ``_jit.specialize`` binds those
+of the chosen model:
 
     add_bend_forces(x, v, f, elements, elastic, scratch)
-        adds the hinges' and their dampers' forces to ``f`` [N], (3, particles, lanes);
+        adds the forces of hinges and of their dampers to ``f`` [N], (3, particles, lanes).
     add_bend_products(x, p, y, elements, scale, scratch)
-        adds their stiffness matrix, without what could make it indefinite, times ``p``: ``y += scale K p``, with scale, (lanes,),
-        the rigidity times whatever the caller needs;
-    project_bends(x, start, w, bends, scale, damping, relaxation, multipliers, scratch)
-        moves particles in place towards the hinges' rest, one after the other, as extended position-based dynamics does (see
-        ``integrators.xpbd``), with scale ``B h^2``, (lanes,), damping ``tau/h``, (lanes,), and the share ``relaxation`` of each
-        move.  multipliers: (hinges, 3, lanes), updated; or (0, 3, lanes), where they need no memory.
+        ``y <- y + scale K p``, with K their stiffness matrix for a rigidity of 1, without the part that could make it indefinite.
+        scale: the rigidity times a factor of the caller's, (lanes,).  p, y: (3, particles, lanes).
+    project_bends(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch)
+        one Gauss-Seidel pass of extended position-based dynamics over the hinges, in place; the equations are in
+        ``integrators.xpbd``.  start: positions at the start of the substep.  inverse_alpha_tilde: ``1/alpha~ = B h^2``, (lanes,).
+        gamma: ``tau/h``, (lanes,).  relaxation: share of each correction that is applied.  lam: the multipliers, (hinges, 3,
+        lanes), updated; or (0, 3, lanes) for a single pass, which needs none.
 
-``elements``, ``elastic``, ``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles lie side by side, the
-same forces are in ``grid_forces``.
+In all of them x [m] and v [m/s] are (3, particles, lanes), and w [1/kg] is (particles, lanes).  ``elements``, ``elastic``,
+``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles are adjacent in memory the same forces are in
+``grid_forces``.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from clothgym.checks import known
 from clothgym.elements import ROWS, BendArrays
 from clothgym.mesh import ClothMesh
 
-# arctan(z)/z by powers of z^2 for z^2 up to tan(pi/8)^2, interpolated at Chebyshev's points: error at most 8e-13
+# arctan(z)/z in powers of z^2, for z^2 up to tan(pi/8)^2, interpolated at Chebyshev points: error at most 8e-13
 ARCTAN = (
     0.99999999999924476, -0.33333333276922492, 0.19999993053555814, -0.14285386553752139,
     0.11103456908947463, -0.089925529061509115, 0.06974197686595265, -0.037655106012914019,
@@ -44,26 +46,26 @@ add_bend_products = placeholder(
 )
 project_bends = placeholder(
     "project_bends",
-    "of (x, start, w, bends, scale, damping, relaxation, multipliers, scratch): moves particles towards the hinges' rest",
+    "of (x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch): moves particles towards the hinges' rest",
 )
 
 
-# --- none: springs bend -------------------------------------------------------------------------------------------------
+# --- springs: skip springs resist bending, and are among the springs --------------------------------------------------------
 
 
 @kernel
 def add_no_forces(x, v, f, elements, elastic, scratch):
-    """Nothing: skip springs are among the springs."""
+    """Adds nothing: skip springs are among the springs."""
 
 
 @kernel
 def add_no_products(x, p, y, elements, scale, scratch):
-    """Nothing."""
+    """Adds nothing."""
 
 
 @kernel
-def project_nothing(x, start, w, bends, scale, damping, relaxation, multipliers, scratch):
-    """Nothing."""
+def project_nothing(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+    """Moves nothing."""
 
 
 # --- quadratic: isometric bending, Bergou et al. 2006 -------------------------------------------------------------------
@@ -71,7 +73,7 @@ def project_nothing(x, start, w, bends, scale, damping, relaxation, multipliers,
 
 @disjoint
 def _combine(a, b, c, d, q, out):
-    """One component of ``sum_i q_i x_i`` of one hinge, (lanes,)."""
+    """``out <- sum_i q_i x_i`` for one hinge: one component a, b, c, d of its four particles, (lanes,); q: (4,)."""
     qa, qb, qc, qd = q[0], q[1], q[2], q[3]
     for l in range(out.shape[0]):
         out[l] = qa * a[l] + qb * b[l] + qc * c[l] + qd * d[l]
@@ -79,18 +81,24 @@ def _combine(a, b, c, d, q, out):
 
 @uncounted
 def add_quadratic_forces(x, v, f, elements, elastic, scratch):
-    """Of the energy ``B/2 |sum_i q_i x_i|^2``: constant curvature matrix, exact for a sheet that bends and does not stretch."""
+    """``f_i <- f_i - B q_i sum_j q_j (x_j + tau v_j)`` for each hinge.
+
+    It is minus the gradient of ``B/2 |sum_i q_i x_i|^2``, and a damper of the same form.  The matrix ``B q q^T`` is constant.  The
+    model is exact for a sheet that bends without stretching.
+    """
     members, curves = elements.bends.particles, elements.bends.curves
     rigidity, damping_time, rows = elastic.rigidity, elastic.damping_time, scratch.rows
     curve, rate = rows[0], rows[1]
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         for c in range(3):
+            # the hinge's curvature vector and its rate, one component
             xc, vc, fc = x[c], v[c], f[c]
             _combine(xc[i], xc[j], xc[k], xc[m], curves[s], curve)
             _combine(vc[i], vc[j], vc[k], vc[m], curves[s], rate)
             for l in range(x.shape[2]):
                 curve[l] = rigidity[l] * (curve[l] + damping_time[l] * rate[l])
+            # the force on each of its particles
             for a in range(4):
                 own, q = fc[members[s, a]], curves[s, a]
                 for l in range(x.shape[2]):
@@ -99,7 +107,7 @@ def add_quadratic_forces(x, v, f, elements, elastic, scratch):
 
 @uncounted
 def add_quadratic_products(x, p, y, elements, scale, scratch):
-    """The matrix of the energy itself, which is constant."""
+    """``y_i <- y_i + scale q_i sum_j q_j p_j`` for each hinge: the energy's matrix is constant, and never indefinite."""
     members, curves = elements.bends.particles, elements.bends.curves
     curve = scratch.rows[0]
     for s in range(members.shape[0]):
@@ -114,33 +122,40 @@ def add_quadratic_products(x, p, y, elements, scale, scratch):
 
 
 @kernel
-def project_quadratic(x, start, w, bends, scale, damping, relaxation, multipliers, scratch):
-    """One vector of constraints an element, ``sum_i q_i x_i = 0``: linear, so a projection solves it exactly."""
+def project_quadratic(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+    """One pass over the hinges with the constraint ``C = sum_i q_i x_i``, a vector: ``grad_i C = q_i`` in each component.
+
+    C is linear, so one projection solves it exactly.  Equations as in ``integrators.xpbd``, over alpha~, with its signs.
+    """
     members, _, _, curves = bends
     one = x.dtype.type(1)
-    curve, before, weigh = scratch.rows[0], scratch.rows[1], scratch.rows[2]
-    keeps = multipliers.shape[0] > 0
+    curve, before, inverse = scratch.rows[0], scratch.rows[1], scratch.rows[2]
+    keeps = lam.shape[0] > 0
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         q = curves[s]
         a, b, c, d = w[i], w[j], w[k], w[m]
+        # one over the denominator, the same for all components; mobility: sum_i w_i |grad_i C|^2
         for l in range(x.shape[2]):
             mobility = q[0] * q[0] * a[l] + q[1] * q[1] * b[l] + q[2] * q[2] * c[l] + q[3] * q[3] * d[l]
-            weigh[l] = one / (scale[l] * (one + damping[l]) * mobility + one)
+            inverse[l] = one / (inverse_alpha_tilde[l] * (one + gamma[l]) * mobility + one)
         for e in range(3):
+            # C now, and at the start of the substep
             xe, se = x[e], start[e]
             _combine(xe[i], xe[j], xe[k], xe[m], q, curve)
             _combine(se[i], se[j], se[k], se[m], q, before)
+            # delta lambda, in place of C
             if keeps:
-                known = multipliers[s, e]
+                own_lam = lam[s, e]
                 for l in range(x.shape[2]):
-                    pull = scale[l] * (curve[l] + damping[l] * (curve[l] - before[l]))
-                    curve[l] = (pull - known[l]) * weigh[l]
-                    known[l] += curve[l]
+                    error = inverse_alpha_tilde[l] * (curve[l] + gamma[l] * (curve[l] - before[l]))
+                    curve[l] = (error - own_lam[l]) * inverse[l]
+                    own_lam[l] += curve[l]
             else:
                 for l in range(x.shape[2]):
-                    pull = scale[l] * (curve[l] + damping[l] * (curve[l] - before[l]))
-                    curve[l] = pull * weigh[l]
+                    error = inverse_alpha_tilde[l] * (curve[l] + gamma[l] * (curve[l] - before[l]))
+                    curve[l] = error * inverse[l]
+            # x_i <- x_i + w_i grad_i C delta lambda
             for n in range(4):
                 xn, wn = xe[members[s, n]], w[members[s, n]]
                 for l in range(x.shape[2]):
@@ -152,8 +167,10 @@ def project_quadratic(x, start, w, bends, scale, damping, relaxation, multiplier
 
 @disjoint
 def _first_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, length, inverse, foot):
-    """The normal ``N = e x a`` of the triangle over edge e with the corner a, ``|e|``, ``1/|e|^2``, and where a's foot is on the
-    edge."""
+    """Geometry of the first triangle (i, j, k), with the edge ``e = x_j - x_i`` and ``a = x_k - x_i``; all arrays (lanes,).
+
+    nx, ny, nz: the normal ``N = e x a``.  length: ``|e|``.  inverse: ``1/|e|^2``.  foot: ``a . e/|e|^2``, the foot of k's height.
+    """
     one, tiny = inverse.dtype.type(1), inverse.dtype.type(1e-30)
     for l in range(inverse.shape[0]):
         ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
@@ -166,7 +183,10 @@ def _first_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, length, invers
 
 @disjoint
 def _second_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, inverse, mx, my, mz, foot, lift):
-    """The same of the other triangle, ``M = b x e``, and how far its corner b rises over the first one, ``N . b``."""
+    """Geometry of the second triangle (j, i, k), whose corner is ``b = x_k - x_i``; all arrays (lanes,).
+
+    mx, my, mz: the normal ``M = b x e``.  foot: ``b . e/|e|^2``.  lift: ``N . b``, positive if b is above the first triangle.
+    """
     for l in range(foot.shape[0]):
         ex, ey, ez = jx[l] - ix[l], jy[l] - iy[l], jz[l] - iz[l]
         bx, by, bz = kx[l] - ix[l], ky[l] - iy[l], kz[l] - iz[l]
@@ -177,9 +197,9 @@ def _second_normal(ix, iy, iz, jx, jy, jz, kx, ky, kz, nx, ny, nz, inverse, mx, 
 
 @disjoint
 def _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l):
-    """Turn ``N . b`` into the angle, and find what a corner's rise tilts its triangle by, over the normal.
+    """The angle [rad] from ``N . b``, and the factors ``-|e|/|N|^2`` and ``-|e|/|M|^2`` of its derivatives; all arrays (lanes,).
 
-    tilt_k: comes with the edge's length [m].
+    angle: on entry ``N . b``.  tilt_k: on entry ``|e|``, then the first factor.  tilt_l: the second factor.
     """
     t = angle.dtype.type
     one, tiny, least = t(1), t(1e-30), t(1e-9)
@@ -189,9 +209,11 @@ def _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l):
         nn = nx[l] * nx[l] + ny[l] * ny[l] + nz[l] * nz[l] + tiny
         mm = mx[l] * mx[l] + my[l] * my[l] + mz[l] * mz[l] + tiny
         length = tilt_k[l]
+        # tan(angle/2); the denominator is bounded from below for sheets that are folded flat
         product = np.sqrt(nn) * np.sqrt(mm)
         below, lowest = product + (nx[l] * mx[l] + ny[l] * my[l] + nz[l] * mz[l]), least * product
         half = -length * angle[l] / (below if below > lowest else lowest)
+        # tan(angle/4) and tan(angle/8), and the polynomial for the arctangent
         quarter = half / (one + np.sqrt(one + half * half))
         z = quarter / (one + np.sqrt(one + quarter * quarter))
         u = z * z
@@ -202,7 +224,10 @@ def _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l):
 
 @disjoint
 def _slopes(n, m, foot_k, foot_l, tilt_k, tilt_l, near, far, of_k, of_l):
-    """One component of the angle's derivatives with respect to both ends of the edge and to both corners."""
+    """One component of the angle's derivatives [1/m] with respect to the ends of the edge and to both corners; all (lanes,).
+
+    n, m: of N and M.  near, far: with respect to i and j.  of_k, of_l: with respect to the first and the second corner.
+    """
     one = near.dtype.type(1)
     for l in range(near.shape[0]):
         k, o = tilt_k[l] * n[l], tilt_l[l] * m[l]
@@ -215,17 +240,22 @@ def _slopes(n, m, foot_k, foot_l, tilt_k, tilt_l, near, far, of_k, of_l):
 def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
     """The angle between two triangles [rad] into ``angle``, (lanes,), and its derivatives [1/m] into ``slopes``, (12, lanes).
 
-    With e the edge, a and b the opposite corners seen from its first end, and the normals ``N = e x a`` and ``M = b x e``:
-    ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  Two more halvings bring it where a short polynomial is the arctangent.
-    The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.  Corners: three components each, (lanes,), or
-    (hinges,) where these lie side by side.  rows: scratch, (11, lanes).
+    Let e be the edge, a and b the vectors from its first end to the opposite corners, ``N = e x a`` and ``M = b x e`` the normals.
+    Then ``tan(angle/2) = -|e| (N . b)/(|N| |M| + N . M)``.  The angle is halved twice more; there a short polynomial replaces
+    the arctangent.  The derivatives are those of Bridson, Marino and Fedkiw 2003, section 4.
+
+    xi, xj: ends of the edge; xk, xm: opposite corners; three components each, (lanes,), or (hinges,) where hinges are adjacent in
+    memory.  rows: scratch, (11, lanes).
     """
+    # names for the scratch
     nx, ny, nz, mx, my, mz = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
     inverse, foot_k, foot_l, tilt_k, tilt_l = rows[6], rows[7], rows[8], rows[9], rows[10]
+    # both triangles; tilt_k carries |e|, and angle carries N . b, into ``_angles``
     _first_normal(xi[0], xi[1], xi[2], xj[0], xj[1], xj[2], xk[0], xk[1], xk[2], nx, ny, nz, tilt_k, inverse, foot_k)
     _second_normal(
         xi[0], xi[1], xi[2], xj[0], xj[1], xj[2], xm[0], xm[1], xm[2], nx, ny, nz, inverse, mx, my, mz, foot_l, angle
     )  # fmt: skip
+    # the angle, and its derivatives component by component
     _angles(nx, ny, nz, mx, my, mz, angle, tilt_k, tilt_l)
     for c in range(3):
         _slopes(rows[c], rows[3 + c], foot_k, foot_l, tilt_k, tilt_l, slopes[c], slopes[3 + c], slopes[6 + c], slopes[9 + c])
@@ -233,6 +263,7 @@ def hinge_angles(xi, xj, xk, xm, angle, slopes, rows):
 
 @disjoint
 def _rates(ix, iy, iz, jx, jy, jz, kx, ky, kz, mx, my, mz, s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, out):
+    """``hinge_rates`` on components, (lanes,) each."""
     for l in range(out.shape[0]):
         ends = (s0[l] * ix[l] + s1[l] * iy[l] + s2[l] * iz[l]) + (s3[l] * jx[l] + s4[l] * jy[l] + s5[l] * jz[l])
         out[l] = (ends + (s6[l] * kx[l] + s7[l] * ky[l] + s8[l] * kz[l])) + (s9[l] * mx[l] + s10[l] * my[l] + s11[l] * mz[l])
@@ -240,7 +271,7 @@ def _rates(ix, iy, iz, jx, jy, jz, kx, ky, kz, mx, my, mz, s0, s1, s2, s3, s4, s
 
 @inlined
 def hinge_rates(pi, pj, pk, pm, s, out):
-    """Derivative of the angle along ``p``, (lanes,), with the slopes s; corners as for ``hinge_angles``."""
+    """``out <- sum_i (d angle/d x_i) . p_i``, (lanes,), with the slopes s, (12, lanes); pi ... pm as in ``hinge_angles``."""
     _rates(
         pi[0], pi[1], pi[2], pj[0], pj[1], pj[2], pk[0], pk[1], pk[2], pm[0], pm[1], pm[2], s[0], s[1], s[2], s[3], s[4], s[5],
         s[6], s[7], s[8], s[9], s[10], s[11], out,
@@ -249,20 +280,23 @@ def hinge_rates(pi, pj, pk, pm, s, out):
 
 @inlined
 def hinge_rows(scratch, lanes):
-    """Rows that a hinge's kernels use, of ``Scratch.rows``: angle, rate, derivatives, geometry and two more, (., lanes)."""
+    """The parts of ``Scratch.rows`` that hinges use: angle, rate, slopes (12, lanes), geometry (11, lanes), and two more rows."""
     rows = scratch.reshape(scratch.size)[: ROWS * lanes].reshape((ROWS, lanes))
     return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
 
 
 @inlined
 def _at(x, p):
-    """Components of one particle's vectors, (lanes,) each."""
+    """The three components of particle p, (lanes,) each; x: (3, particles, lanes)."""
     return x[0, p], x[1, p], x[2, p]
 
 
 @uncounted
 def add_hinge_forces(x, v, f, elements, elastic, scratch):
-    """Of the energy ``B/2 weight (angle - rest angle)^2``."""
+    """``f_i <- f_i - B s (theta - theta_0 + tau dtheta/dt) grad_i theta`` for each hinge of angle theta and weight s.
+
+    It is minus the gradient of ``B/2 s (theta - theta_0)^2`` (Grinspun et al. 2003), and a damper of the same form.
+    """
     members, weight, rest_angle, _ = elements.bends
     rigidity, damping_time = elastic.rigidity, elastic.damping_time
     angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, x.shape[2])
@@ -270,9 +304,11 @@ def add_hinge_forces(x, v, f, elements, elastic, scratch):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
         hinge_rates(_at(v, i), _at(v, j), _at(v, k), _at(v, m), slopes, rate)
+        # the moment [N m], in place of the angle
         share, rest = weight[s], rest_angle[s]
         for l in range(x.shape[2]):
             angle[l] = share * rigidity[l] * (angle[l] - rest + damping_time[l] * rate[l])
+        # the force on each corner
         for corner in range(4):
             for e in range(3):
                 fe, slope = f[e, members[s, corner]], slopes[3 * corner + e]
@@ -282,13 +318,17 @@ def add_hinge_forces(x, v, f, elements, elastic, scratch):
 
 @uncounted
 def add_hinge_products(x, p, y, elements, scale, scratch):
-    """The part of the energy's matrix that is never negative: the derivatives' outer product (Gauss and Newton)."""
+    """``y_i <- y_i + scale s grad_i theta (sum_j grad_j theta . p_j)`` for each hinge of angle theta and weight s.
+
+    This is the Gauss-Newton part of the energy's Hessian, the outer product of the gradients.  It is never indefinite.
+    """
     members, weight, _, _ = elements.bends
     angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, x.shape[2])
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
         hinge_rates(_at(p, i), _at(p, j), _at(p, k), _at(p, m), slopes, rate)
+        # the scaled rate along p, and its product with the gradient at each corner
         share = weight[s]
         for l in range(x.shape[2]):
             rate[l] *= share * scale[l]
@@ -300,17 +340,22 @@ def add_hinge_products(x, p, y, elements, scale, scratch):
 
 
 @kernel
-def project_hinges(x, start, w, bends, scale, damping, relaxation, multipliers, scratch):
-    """The constraint ``angle = rest angle``; the damper sees what has been done along its derivative in the substep."""
+def project_hinges(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+    """One pass over the hinges with the constraint ``C = theta - theta_0``; equations as in ``integrators.xpbd``, over alpha~.
+
+    A hinge of weight s has ``1/alpha~ = s B h^2``.  Signs as in the code there.
+    """
     members, weight, rest_angle, _ = bends
     one = x.dtype.type(1)
     angle, rate, slopes, geometry, before, mobility = hinge_rows(scratch.rows, x.shape[2])
-    keeps = multipliers.shape[0] > 0
+    keeps = lam.shape[0] > 0
     for s in range(members.shape[0]):
+        # theta and grad theta, and grad C . x now and at the start of the substep
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
         hinge_rates(_at(x, i), _at(x, j), _at(x, k), _at(x, m), slopes, rate)
         hinge_rates(_at(start, i), _at(start, j), _at(start, k), _at(start, m), slopes, before)
+        # sum_i w_i |grad_i C|^2
         mobility[:] = 0
         for corner in range(4):
             wm = w[members[s, corner]]
@@ -318,15 +363,17 @@ def project_hinges(x, start, w, bends, scale, damping, relaxation, multipliers, 
                 slope = slopes[3 * corner + e]
                 for l in range(x.shape[2]):
                     mobility[l] += wm[l] * slope[l] * slope[l]
+        # delta lambda, in place of the angle
         share, rest = weight[s], rest_angle[s]
         for l in range(x.shape[2]):
-            stiff = share * scale[l]
-            pull = stiff * (angle[l] - rest + damping[l] * (rate[l] - before[l]))
-            known = multipliers[s, 0, l] if keeps else x.dtype.type(0)
-            angle[l] = (pull - known) / (stiff * (one + damping[l]) * mobility[l] + one)
+            stiff = share * inverse_alpha_tilde[l]
+            error = stiff * (angle[l] - rest + gamma[l] * (rate[l] - before[l]))
+            own_lam = lam[s, 0, l] if keeps else x.dtype.type(0)
+            angle[l] = (error - own_lam) / (stiff * (one + gamma[l]) * mobility[l] + one)
         if keeps:
             for l in range(x.shape[2]):
-                multipliers[s, 0, l] += angle[l]
+                lam[s, 0, l] += angle[l]
+        # x_i <- x_i + w_i grad_i C delta lambda
         for corner in range(4):
             wm = w[members[s, corner]]
             for e in range(3):
@@ -344,9 +391,9 @@ class Bending:
 
     Attributes:
         name: its key in the table.
-        hinged: whether hinges resist bending; else skip springs do.
-        isotropic: whether they resist displacements along the sheet as they do those across it, as they know no normal.
-        kernels: by the names that integrators call them by.
+        hinged: whether hinges resist bending; otherwise skip springs do.
+        isotropic: whether hinges resist displacements in the plane of the sheet as much as those across it, for want of a normal.
+        kernels: by the names under which integrators call them.
     """
 
     name: str
@@ -356,9 +403,11 @@ class Bending:
 
     def energy(self, bends: BendArrays, x: NDArray, rigidity: NDArray) -> NDArray:
         """Energy of the hinges [J], (num_envs,); x [m], (num_envs, particles, 3); rigidity [N m], (num_envs,)."""
+        # quadratic: B/2 |sum_i q_i x_i|^2
         corners = x[:, bends.particles]
         if self.name == "quadratic":
             return rigidity / 2 * np.sum(np.einsum("sm,esmc->esc", bends.curves, corners) ** 2, axis=(1, 2))
+        # hinges: B/2 s (theta - theta_0)^2
         e, a, b = (corners[:, :, m] - corners[:, :, 0] for m in (1, 2, 3))
         one, two = np.cross(e, a), np.cross(b, e)
         angle = np.arctan2(-np.linalg.norm(e, axis=2) * np.sum(one * b, axis=2), np.sum(one * two, axis=2))
@@ -366,6 +415,7 @@ class Bending:
 
 
 def _kernels(forces: Any, products: Any, project: Any) -> dict[str, Any]:
+    """A model's kernels by the names under which integrators call them."""
     return {"add_bend_forces": forces, "add_bend_products": products, "project_bends": project}
 
 
@@ -383,13 +433,13 @@ def model_of(name: str, mesh: ClothMesh) -> Bending:
     """The model of that name, for a mesh.
 
     Raises:
-        ValueError: no such name; the message lists the right ones.  Or a model that cannot hold this mesh.
+        ValueError: no such name (the message lists the right ones), or a model that does not fit this mesh.
     """
     known("bending model", name, BENDING)
     if name == "quadratic" and mesh.hinges.rest_angle.any():
         steepest = float(np.abs(mesh.hinges.rest_angle).max())
         raise ValueError(
-            f"bending='quadratic' needs a sheet that is flat at rest, this one has angles up to {steepest:.3g} rad: take "
+            f"bending='quadratic' needs a sheet that is flat at rest, and this one has angles up to {steepest:.3g} rad: use "
             "bending='hinge'"
         )
     return BENDING[name]

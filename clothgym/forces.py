@@ -1,7 +1,7 @@
-"""Floor 3: forces on one block of lanes, and what they say about the largest stable step.
+"""Floor 3: forces on one block of lanes, and the largest frequency that follows from them.
 
-In all kernels ``x``: positions [m] and ``v``: velocities [m/s] are (3, particles, lanes); loops over lanes are innermost.  For a
-grid whose particles lie side by side the same forces are in ``grid_forces``.
+In all kernels ``x`` stands for positions [m] and ``v`` for velocities [m/s], (3, particles, lanes).  Loops over lanes are
+innermost.  For a grid whose particles are adjacent in memory the same forces are in ``grid_forces``.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.state import State
 
-POWER_STEPS = 16
-TINY = 1e-30  # [m^2]: a spring of no length, as in a sheet that is folded on itself, has no direction to pull in
+POWER_STEPS = 16  # of the power method in ``frequency_bound``
+TINY = 1e-30  # added to a spring's squared length [m^2]: a spring of length zero, as in a folded sheet, exerts no force
 
 # what integrators, attachments and the main loop call; ``grid_forces.kernels_of`` tells which kernels stand for the names
 add_spring_forces = placeholder(
@@ -35,11 +35,16 @@ add_air_forces = placeholder(
 
 @disjoint
 def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, gi, hi, fj, gj, hj):
-    """One spring's force on both its ends, in lanes: components of positions, velocities and forces, (lanes,)."""
+    """Add one spring's force to both its ends, in lanes; all arrays (lanes,).
+
+    xi ... zj: components of positions [m]; ui ... wj: of velocities [m/s]; fi ... hj: of forces [N].  k: stiffness of the kind
+    [N/m]; share: the spring's weight; r: rest length [m]; tau: damping time [s].
+    """
     one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
         dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
         ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        # f = g d, with q = 1/|d|
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         g = share * k[l] * ((one - r * q) + tau[l] * (ux * dx + uy * dy + uz * dz) * q * q)
         fx, fy, fz = g * dx, g * dy, g * dz
@@ -53,12 +58,13 @@ def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, 
 
 @uncounted
 def add_lane_forces(x, v, f, elements, elastic, scratch):
-    """Add Hooke's force and the damper's along each spring to ``f`` [N], (3, particles, lanes).
+    """Add the force of each spring and of its damper to ``f`` [N], (3, particles, lanes).
 
-    On the first end, with d the vector to the second, u its velocity, r the rest length and tau the damping time:
-    ``f = k ((1 - r/|d|) + tau (u . d)/|d|^2) d``.  The stiffness k [N/m] is a row of ``elastic.stiffness``, (kinds, lanes), times
-    the spring's weight.
+    ``f_i = k ((1 - r/|d|) + tau (u . d)/|d|^2) d`` and ``f_j = -f_i``: Hooke's law, and a Kelvin-Voigt damper along the spring.  d
+    is the vector from the first end i to the second end j, u its rate of change, r the rest length, and tau the damping time.
+    The stiffness k [N/m] is the spring's weight times the row of its kind in ``elastic.stiffness``, (kinds, lanes).
     """
+    # a single environment has its own loop: loops over one lane are slow
     stiffness, damping_time = elastic.stiffness, elastic.damping_time
     if x.shape[2] == 1:
         rows = (3, x.shape[1])
@@ -66,6 +72,7 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
             x.reshape(rows), v.reshape(rows), f.reshape(rows), elements.springs, stiffness[:, 0], damping_time[0]
         )  # fmt: skip
         return
+    # spring by spring, each in all lanes
     ends, rest_length, kind, weight = elements.springs
     x0, x1, x2, v0, v1, v2, f0, f1, f2 = x[0], x[1], x[2], v[0], v[1], v[2], f[0], f[1], f[2]
     for s in range(ends.shape[0]):
@@ -79,7 +86,7 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
 
 @kernel
 def _add_lane_forces_of_one(x, v, f, springs, stiffness, damping_time):
-    """The same arithmetic on a single environment, (3, particles), in less than half the time: no loops of one round."""
+    """``add_spring_forces`` for one environment, in less than half the time: x, v, f (3, particles), stiffness (kinds,)."""
     ends, rest_length, kind, weight = springs
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     for s in range(ends.shape[0]):
@@ -101,14 +108,19 @@ def _add_lane_forces_of_one(x, v, f, springs, stiffness, damping_time):
 
 @disjoint
 def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, share, r, fi, gi, hi, fj, gj, hj):
-    """One spring's part of ``add_spring_products``, in lanes; arguments as of ``_pull``."""
+    """One spring's part of ``add_spring_products``, in lanes; all arrays (lanes,).
+
+    xi ... zj: components of positions [m]; ui ... wj: of the vector p; fi ... hj: of the result.  share: the spring's weight.
+    """
     one, zero, tiny = xi.dtype.type(1), xi.dtype.type(0), xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
         dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
         ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        # across the spring: nothing where it is compressed
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         stretched = one - r * q
         aside = share * across[l] * (stretched if stretched > zero else zero)
+        # (along - aside) n n^T u + aside u
         g = (share * along[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
         fx, fy, fz = g * dx + aside * ux, g * dy + aside * uy, g * dz + aside * uz
         fi[l] -= fx
@@ -121,11 +133,12 @@ def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, sha
 
 @uncounted
 def add_lane_products(x, p, y, elements, along, across, bend, scratch):
-    """Add the springs' stiffness matrix, scaled apart along and across each spring, times ``p`` to ``y``, (3, particles, lanes).
+    """``y <- y + K p`` with the springs' stiffness matrix K, scaled separately along and across each spring; (3, particles, lanes).
 
-    With n the direction, ``along n n^T + across max(1 - r/d, 0) (I - n n^T)`` a spring, both proportional to its stiffness: what a
-    compressed one would push aside is left out, so that the matrix has no negative eigenvalue (Choi and Ko 2002).
-    along, across: by kind, (kinds, lanes).  bend: of what bends linearly along with springs, which here nothing does.
+    A spring's block of K is ``along n n^T + across max(1 - r/|d|, 0) (I - n n^T)``, with d the vector between its ends, r the rest
+    length, and ``n = d/|d|``.  The second term is left out for compressed springs, so that K has no negative eigenvalue (Choi and
+    Ko 2002).  along, across: coefficients by kind, which the spring's weight multiplies, (kinds, lanes).  bend: not used here; see
+    ``grid_forces.add_grid_products``.
     """
     ends, rest_length, kind, weight = elements.springs
     x0, x1, x2, p0, p1, p2, y0, y1, y2 = x[0], x[1], x[2], p[0], p[1], p[2], y[0], y[1], y[2]
@@ -142,10 +155,12 @@ def add_lane_products(x, p, y, elements, along, across, bend, scratch):
 def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
     """Add the air's force on each triangle to ``f`` [N], (3, particles, lanes).
 
-    With A the area, n the normal and u the wind relative to the triangle:
-    ``rho/2 A |u| (C_D (u . n) n + C_F (u - (u . n) n))``.  Face on that is the drag ``rho/2 C_D A u^2``; at an angle the part
-    across the wind is lift, of coefficient ``(C_D - C_F) sin cos`` as of a flat plate that has stalled (Hoerner, Fluid-Dynamic
-    Drag, 1965, 3-15).  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes); wind [m/s], (3, lanes).
+    ``F = rho/2 A |u| (C_D (u . n) n + C_F (u - (u . n) n))``, with the area A, the unit normal n, and the wind u relative to the
+    triangle.  Face on to the wind this is the drag ``rho/2 C_D A u^2``.  At an angle the component across the wind is lift, with
+    the coefficient ``(C_D - C_F) sin cos`` of a stalled flat plate (Hoerner 1965, Fluid-Dynamic Drag, 3-15).
+
+    surface: see ``elements.SurfaceArrays``.  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes).  wind: [m/s],
+    (3, lanes).
     """
     triangles, shares = surface
     half = x.dtype.type(0.5)
@@ -157,14 +172,17 @@ def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         a, b, c = shares[t, 0], shares[t, 1], shares[t, 2]
+        # the force on the triangle
         for l in range(lanes):
+            # sides from the first corner, and the normal times twice the area
             px, py, pz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
             qx, qy, qz = x[0, k, l] - x[0, i, l], x[1, k, l] - x[1, i, l], x[2, k, l] - x[2, i, l]
-            # normal times twice the area
             nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+            # the wind relative to the triangle
             ux = wind[0, l] - (a * v[0, i, l] + b * v[0, j, l] + c * v[0, k, l])
             uy = wind[1, l] - (a * v[1, i, l] + b * v[1, j, l] + c * v[1, k, l])
             uz = wind[2, l] - (a * v[2, i, l] + b * v[2, j, l] + c * v[2, k, l])
+            # the terms along n and along u: A = twice/2, and (C_D - C_F) (u . n) n + C_F u is the bracket above
             n2 = nx * nx + ny * ny + nz * nz + tiny
             speed = np.sqrt(ux * ux + uy * uy + uz * uz)
             twice = np.sqrt(n2)
@@ -173,6 +191,7 @@ def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
             row[0, l] = face * nx + skin * ux
             row[1, l] = face * ny + skin * uy
             row[2, l] = face * nz + skin * uz
+        # its corners take their shares
         for corner in range(3):
             share = shares[t, corner]
             for e in range(3):
@@ -182,11 +201,11 @@ def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
 
 
 class Oscillators(NamedTuple):
-    """What decides on one environment's largest substep, in float64.
+    """The properties of one environment that determine its largest substep, in float64.
 
     positions: at rest [m], (particles, 3).  stiffness: of springs by kind [N/m], (kinds,).  rigidity: of hinges [N m].
-    isotropic: whether hinges resist displacements along the sheet as they do those across it, see ``bending.Bending``.
-    damping_time [s].  inverse_mass [1/kg], (particles,).
+    isotropic: whether hinges resist displacements in the plane of the sheet as well, see ``bending.Bending``.  damping_time [s].
+    inverse_mass [1/kg], (particles,).
     """
 
     positions: NDArray
@@ -199,7 +218,11 @@ class Oscillators(NamedTuple):
 
 
 def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
-    """Particles, (rows, m), and vectors V, (rows, m, 3): a small displacement u stores ``sum (sum_m V_m . u_m)^2 / 2``."""
+    """The elements' energy for small displacements u about rest, ``sum_rows (sum_m V_m . u_m)^2 / 2``.
+
+    Returns, for each sort of element, particles (rows, m) and vectors V [(N/m)^(1/2)], (rows, m, 3).
+    """
+    # springs: k/2 (n . (u_j - u_i))^2
     springs, bends = o.elements
     i, j = springs.particles.T
     n = (o.positions[j] - o.positions[i]) / springs.rest_length[:, None]
@@ -207,11 +230,12 @@ def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
     rows = [(springs.particles, np.stack([-pull, pull], axis=1))]
     if not len(bends.particles):
         return rows
+    # the quadratic model: B/2 |sum_i q_i u_i|^2, one row for each component
     curves = np.sqrt(o.rigidity) * bends.curves
     if o.isotropic:
         rows += [(bends.particles, curves[:, :, None] * axis) for axis in np.eye(3)]
         return rows
-    # a hinge's corners move along their triangles' normals, the ends share both
+    # hinges: the angle changes with the opposite corners along their triangles' normals, and with the ends along both
     xi, xj, xk, xl = (o.positions[bends.particles[:, m]] for m in range(4))
     e = xj - xi
     normals = [np.cross(e, xk - xi), np.cross(xl - xi, e)]
@@ -224,14 +248,14 @@ def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
 
 
 def largest_frequency(o: Oscillators) -> float:
-    """Largest angular frequency of the sheet at rest [rad/s]: the root of the largest eigenvalue of M^-1 K.
+    """Largest angular frequency of the sheet at rest [rad/s]: the square root of the largest eigenvalue of M^-1 K.
 
-    K is assembled from all elements.  One spring's ``sqrt(k/m)`` is not enough: the neighbours add up.
+    K is the stiffness matrix of all elements.  ``sqrt(k/m)`` of one spring is too low, as the springs of a particle add up.
     """
-    from scipy.sparse import coo_matrix, csr_matrix, vstack  # imported here: it would double the time of a warm start
+    from scipy.sparse import coo_matrix, csr_matrix, vstack  # imported here: scipy doubles the time of a warm start
     from scipy.sparse.linalg import eigsh
 
-    # M^-1/2 K M^-1/2 = B^T B
+    # M^-1/2 K M^-1/2 = B^T B, with the rows V M^-1/2 in B
     scale, parts = np.sqrt(o.inverse_mass), []
     for particles, vectors in _energy_rows(o):
         values = vectors * scale[particles][:, :, None]
@@ -247,17 +271,19 @@ def largest_frequency(o: Oscillators) -> float:
 
 
 def frequency_bound(o: Oscillators) -> float:
-    """An upper bound on ``largest_frequency`` [rad/s], some tenth above it, in a fraction of the time and without scipy.
+    """An upper bound on ``largest_frequency`` [rad/s], about a tenth above it, in a fraction of the time and without scipy.
 
-    With A the magnitudes of M^-1 K, no eigenvalue exceeds the largest ``(A y)/y`` for any positive y (Collatz and Wielandt);
-    a few steps of the power method make y a good one.
+    Let A hold the magnitudes of the entries of M^-1 K.  For any positive vector y no eigenvalue exceeds the largest entry of
+    ``(A y)/y`` (Collatz and Wielandt).  A few steps of the power method make y a good choice.
     """
+    # the diagonal blocks of A, where the elements' contributions are added up before their magnitudes are taken
     families = _energy_rows(o)
     own = np.zeros((len(o.positions), 3, 3))
     for particles, vectors in families:
         for m in range(particles.shape[1]):
             np.add.at(own, particles[:, m], vectors[:, m, :, None] * vectors[:, m, None, :])
     own = np.abs(own)
+    # power method: z = A y, with the other blocks element by element
     y = np.ones((len(o.positions), 3))
     bound = np.inf
     for _ in range(POWER_STEPS):
@@ -268,14 +294,14 @@ def frequency_bound(o: Oscillators) -> float:
             others = parts.sum(axis=1, keepdims=True) - parts
             for m in range(particles.shape[1]):
                 np.add.at(z, particles[:, m], sizes[:, m] * others[:, m, None])
-        z = z * o.inverse_mass[:, None] + 1e-9 * y  # stays positive in directions that nothing resists
+        z = z * o.inverse_mass[:, None] + 1e-9 * y  # stays positive in directions without any stiffness
         bound = min(bound, float(np.max(z / y)))
         y = z / z.max()
     return float(np.sqrt(bound))
 
 
 def structural_strain(mesh: ClothMesh, x: NDArray) -> NDArray:
-    """Length over rest length, minus one, of threads or edges, (num_envs, those); x [m], (num_envs, particles, 3)."""
+    """Strain ``|d|/r - 1`` of the structural springs, or edges, (num_envs, those springs); x [m], (num_envs, particles, 3)."""
     springs = mesh.springs
     structural = springs.kind < SHEAR
     ends = x[:, springs.particles[structural]]
@@ -283,7 +309,7 @@ def structural_strain(mesh: ClothMesh, x: NDArray) -> NDArray:
 
 
 class Energy(NamedTuple):
-    """Energies [J], (num_envs,) each; gravity's is zero at the origin."""
+    """Energies [J], (num_envs,) each; that of gravity is zero at the origin."""
 
     kinetic: NDArray
     elastic: NDArray
@@ -291,6 +317,7 @@ class Energy(NamedTuple):
 
     @property
     def total(self) -> NDArray:
+        """Their sum [J], (num_envs,)."""
         return self.kinetic + self.elastic + self.gravity
 
 

@@ -1,17 +1,17 @@
-"""Floor 3: forces on one sheet that is a grid, with its particles side by side.
+"""Floor 3: forces on one sheet that is a grid, with its particles adjacent in memory.
 
-The springs of one kind join particles p and p + o, with the same o for all of them: their forces are one loop over p without an
-index array.  What a particle gets is one sum over the kinds, in a fixed order,
+The springs of one kind join particles p and p + o, with the same offset o for all of them.  So their forces F are one loop over p
+without an index array.  The force on a particle is one sum over the kinds, in a fixed order,
 
     f[p] <- ((f[p] - F_0[p - o_0] + F_0[p]) - F_1[p - o_1] + F_1[p]) - ...,
 
 which is the order in which a plain loop over the springs, by kind and then by particle, would add them.  Springs that would wrap
-around the end of a row have no weight.
+around the end of a row have weight zero.
 
-The quadratic bending model is a constant matrix K.  Its rows sum to zero, so the force on p is ``B sum_q -K_pq (x_q - x_p)``:
-springs without rest length along the same six offsets, for a grid's hinges reach no farther.
+The quadratic bending model is a constant matrix K, whose rows sum to zero.  So the force on p is ``B sum_q -K_pq (x_q - x_p)``,
+that of springs of rest length zero.  They have the same six offsets, as the hinges of a grid reach no farther.
 
-Arrays are as in ``forces``, with one lane: positions x [m] and velocities v [m/s] are (3, particles, 1).
+Arrays are those of ``forces`` with one lane: positions x [m] and velocities v [m/s] are (3, particles, 1).
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ TINY = 1e-30  # [m^2], see ``forces``
 
 @inlined
 def rows_of(a):
-    """Components of one lane's vectors, (3, particles), of (3, particles, 1)."""
+    """The vectors of a single lane as (3, particles); a: (3, particles, 1)."""
     return a.reshape((a.shape[0], a.shape[1]))
 
 
-# --- springs, and what bends linearly -----------------------------------------------------------------------------------
+# --- springs, and the quadratic bending model ------------------------------------------------------------------------------
 
 
 @disjoint
 def _spring_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, tau, fx, fy, fz):
-    """Hooke's force and the damper's of one kind of springs on their first ends [N], see ``forces.add_lane_forces``."""
+    """Forces of one kind of springs on their first ends [N]: ``g d``, with g from ``forces.add_lane_forces``.
+
+    x ... vz: components of positions and velocities, (particles,); o: the kind's offset; weight, fx, fy, fz: (count,).
+    """
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     x1, y1, z1, vx1, vy1, vz1 = x[o:], y[o:], z[o:], vx[o:], vy[o:], vz[o:]
     for p in range(count):
@@ -51,7 +54,7 @@ def _spring_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, 
 
 @disjoint
 def _spring_and_curve_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, rest_length, curve, rigidity, tau, fx, fy, fz):
-    """The same with what bends along the same offset: ``rigidity curve (d + tau u)``."""
+    """``_spring_kind``, plus the quadratic model's force along the same offset, ``B curve (d + tau u)``."""
     one, tiny = x.dtype.type(1), x.dtype.type(TINY)
     x1, y1, z1, vx1, vy1, vz1 = x[o:], y[o:], z[o:], vx[o:], vy[o:], vz[o:]
     for p in range(count):
@@ -65,7 +68,7 @@ def _spring_and_curve_kind(x, y, z, vx, vy, vz, o, count, weight, stiffness, res
 
 @disjoint
 def _curve_kind(x, v, o, count, curve, rigidity, tau, f):
-    """One component of what bends where there are no springs: no root, no quotient."""
+    """The quadratic model's force ``B curve (d + tau u)`` alone, one component, along an offset without springs."""
     x1, v1 = x[o:], v[o:]
     for p in range(count):
         f[p] = curve[p] * rigidity * ((x1[p] - x[p]) + tau * (v1[p] - v[p]))
@@ -73,10 +76,11 @@ def _curve_kind(x, v, o, count, curve, rigidity, tau, f):
 
 @disjoint
 def _gather(f, before, g0, g1, g2, g3, g4, g5, o0, o1, o2, o3, o4, o5):
-    """One component of what each particle gets from six kinds, in their order; see the module.
+    """Add one component of the forces of six kinds to ``f``, (particles,), in the order of the module's docstring.
 
-    g: forces of a kind on first ends from ``before`` on, (before + particles,).
+    g0 ... g5: forces of a kind on the first ends, (before + particles,), the first ``before`` of them zero.  o0 ... o5: offsets.
     """
+    # a: forces on p as a first end, F[p]; b: as a second end, F[p - o]
     a0, a1, a2, a3, a4, a5 = g0[before:], g1[before:], g2[before:], g3[before:], g4[before:], g5[before:]
     b0, b1, b2, b3, b4, b5 = (
         g0[before - o0 :], g1[before - o1 :], g2[before - o2 :], g3[before - o3 :], g4[before - o4 :], g5[before - o5 :]
@@ -89,7 +93,7 @@ def _gather(f, before, g0, g1, g2, g3, g4, g5, o0, o1, o2, o3, o4, o5):
 
 @inlined
 def _gather_kinds(f, offset, kinds):
-    """Add what the kinds' forces, (3, kinds, before + particles), come to at each particle to ``f``, (3, particles)."""
+    """Add the forces of all kinds, (3, kinds, before + particles), to ``f``, (3, particles); see ``_gather``."""
     before = kinds.shape[2] - f.shape[1]
     for c in range(3):
         g = kinds[c]
@@ -99,12 +103,13 @@ def _gather_kinds(f, offset, kinds):
         )  # fmt: skip
 
 
-# drivers take plain arrays and have no branches: else the references to each row are counted, for as long as a row of forces takes
+# the loops over kinds take plain arrays and have no branches.  Otherwise references to each row are counted, which takes as long
+# as a row of forces
 
 
 @inlined
 def _spring_kinds(x, v, offset, weight, kind, stiffness, rest_length, tau, out, before):
-    """Forces of all kinds that are springs; out: (3, kinds, before + particles)."""
+    """Forces of all kinds of springs on their first ends [N]; x, v: (3, particles); out: (3, kinds, before + particles)."""
     for a in range(weight.shape[0]):
         _spring_kind(
             x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
@@ -114,7 +119,7 @@ def _spring_kinds(x, v, offset, weight, kind, stiffness, rest_length, tau, out, 
 
 @inlined
 def _spring_and_curve_kinds(x, v, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, out, before):
-    """The same with what bends."""
+    """``_spring_kinds``, plus the quadratic model's forces along the same offsets."""
     for a in range(weight.shape[0]):
         _spring_and_curve_kind(
             x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
@@ -124,7 +129,7 @@ def _spring_and_curve_kinds(x, v, offset, weight, kind, stiffness, rest_length, 
 
 @inlined
 def _curve_kinds(x, v, offset, begin, curve, rigidity, tau, out, before):
-    """What bends along the kinds from ``begin`` on, which are no springs."""
+    """The quadratic model's forces along the offsets from ``begin`` on, where there are no springs."""
     for a in range(begin, curve.shape[0]):
         for c in range(3):
             _curve_kind(x[c], v[c], offset[a], x.shape[1] - offset[a], curve[a], rigidity, tau, out[c, a, before:])
@@ -132,12 +137,17 @@ def _curve_kinds(x, v, offset, begin, curve, rigidity, tau, out, before):
 
 @uncounted
 def add_grid_forces(x, v, f, elements, elastic, scratch):
-    """Add the springs' forces, and those of the quadratic bending model if there is one, to ``f`` [N]."""
+    """Add the springs' forces, and those of the quadratic bending model if it is used, to ``f`` [N], (3, particles, 1).
+
+    The formulas are those of ``forces.add_lane_forces`` and ``bending.add_quadratic_forces``.  elements: an ``elements.Grid``.
+    """
+    # names for one lane's arrays
     offset, kind, rest_length, weight, curve, _, _ = elements
     kinds, stiffness = scratch.kinds, elastic.stiffness
     tau, rigidity = elastic.damping_time[0], elastic.rigidity[0]
     r, s, total = rows_of(x), rows_of(v), rows_of(f)
     before = kinds.shape[2] - r.shape[1]
+    # the forces of each kind on the first ends, and then what they add up to
     if curve.shape[0] > 0:
         _spring_and_curve_kinds(r, s, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, kinds, before)
         _curve_kinds(r, s, offset, weight.shape[0], curve, rigidity, tau, kinds, before)
@@ -148,9 +158,10 @@ def add_grid_forces(x, v, f, elements, elastic, scratch):
 
 @disjoint
 def _product_kind(x, y, z, px, py, pz, o, count, weight, along, across, rest_length, bend, curve, fx, fy, fz):
-    """Minus the stiffness of one kind of springs times p, on their first ends; see ``forces.add_lane_products``.
+    """One kind's part of ``forces.add_lane_products`` on the first ends, plus ``bend curve u``; u is the difference of p.
 
-    With what bends along the same offset, ``bend curve u``.
+    x ... pz: components of positions and of the vector p, (particles,); fx, fy, fz: (count,).  The caller gives along, across and
+    bend the sign of a force.
     """
     one, zero, tiny = x.dtype.type(1), x.dtype.type(0), x.dtype.type(TINY)
     x1, y1, z1, px1, py1, pz1 = x[o:], y[o:], z[o:], px[o:], py[o:], pz[o:]
@@ -167,7 +178,7 @@ def _product_kind(x, y, z, px, py, pz, o, count, weight, along, across, rest_len
 
 @disjoint
 def _curve_product_kind(p, o, count, curve, bend, f):
-    """One component of the same where there are no springs."""
+    """``bend curve u`` alone, one component, along an offset without springs."""
     p1 = p[o:]
     for i in range(count):
         f[i] = bend * curve[i] * (p1[i] - p[i])
@@ -175,15 +186,17 @@ def _curve_product_kind(p, o, count, curve, bend, f):
 
 @uncounted
 def add_grid_products(x, p, y, elements, along, across, bend, scratch):
-    """Add the stiffness matrix of springs, and of the quadratic model if there is one, times ``p`` to ``y``, (3, particles, 1).
+    """``y <- y + K p``, with K the stiffness matrix of springs and of the quadratic model if it is used; (3, particles, 1).
 
-    along, across: see ``forces.add_lane_products``; bend: of the quadratic model, (1,).
+    along, across: see ``forces.add_lane_products``, (kinds, 1).  bend: coefficient of the quadratic model, (1,).
     """
+    # names for one lane's arrays
     offset, kind, rest_length, weight, curve, _, _ = elements
     kinds = scratch.kinds
     r, s, total = rows_of(x), rows_of(p), rows_of(y)
     zero = x.dtype.type(0)
     before = kinds.shape[2] - r.shape[1]
+    # kind by kind; the first are springs, with or without bending, and the others bend only
     for a in range(offset.shape[0]):
         o = offset[a]
         count = r.shape[1] - o
@@ -206,14 +219,14 @@ def add_grid_products(x, p, y, elements, along, across, bend, scratch):
 
 @disjoint
 def _moments(angle, rate, weight, rigidity, tau):
-    """Turn angles [rad] into moments [N m]: ``weight rigidity (angle + tau rate)``; a grid is flat at rest."""
+    """``angle <- s B (angle + tau rate)``: moments [N m] of hinges of weight s, (count,); a grid is flat at rest."""
     for p in range(angle.shape[0]):
         angle[p] = weight[p] * rigidity * (angle[p] + tau * rate[p])
 
 
 @disjoint
 def _turn(fx, fy, fz, sx, sy, sz, moment):
-    """What a moment does to one of its corners, with slopes s."""
+    """Subtract ``moment s`` from the forces on one corner of each hinge, with the slopes s of the angle there, (count,)."""
     for p in range(moment.shape[0]):
         fx[p] -= sx[p] * moment[p]
         fy[p] -= sy[p] * moment[p]
@@ -222,22 +235,26 @@ def _turn(fx, fy, fz, sx, sy, sz, moment):
 
 @inlined
 def _slices(rows, begin, count):
-    """Components of vectors, (3, particles), of ``count`` particles from ``begin`` on, one by one."""
+    """The three components of ``count`` particles from ``begin`` on, (count,) each; rows: (3, particles)."""
     return rows[0, begin : begin + count], rows[1, begin : begin + count], rows[2, begin : begin + count]
 
 
 @uncounted
 def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
-    """The same forces as ``bending.add_hinge_forces``, family by family, and corner by corner within it."""
+    """The forces of ``bending.add_hinge_forces``: family by family, and within each corner by corner.
+
+    A family is the hinges whose corners have the same offsets.  elements: an ``elements.Grid``.
+    """
     grid, tau, rigidity = elements, elastic.damping_time[0], elastic.rigidity[0]
     r, s, total = rows_of(x), rows_of(v), rows_of(f)
     for family in range(grid.hinge.shape[0]):
+        # a range of first ends whose hinges have all corners in the sheet; those that wrap around a row's end have weight zero
         j, k, l = grid.hinge[family, 0], grid.hinge[family, 1], grid.hinge[family, 2]
-        # hinges whose corners are all there, and some that wrap around the end of a row, which have no weight
         low = max(0, -min(j, min(k, l)))
         count = r.shape[1] - max(0, max(j, max(k, l))) - low
         if count <= 0:
             continue
+        # angles, their rates, and moments
         angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, count)
         hinge_angles(
             _slices(r, low, count), _slices(r, low + j, count), _slices(r, low + k, count), _slices(r, low + l, count), angle,
@@ -248,6 +265,7 @@ def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
             rate,
         )  # fmt: skip
         _moments(angle, rate, grid.hinge_weight[family, low : low + count], rigidity, tau)
+        # the forces on each corner
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
             fx, fy, fz = _slices(total, at, count)
             _turn(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
@@ -255,15 +273,17 @@ def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
 
 @uncounted
 def add_grid_hinge_products(x, p, y, elements, bend, scratch):
-    """The same products as ``bending.add_hinge_products``."""
+    """The products of ``bending.add_hinge_products``, in the order of ``add_grid_hinge_forces``."""
     grid, zero = elements, x.dtype.type(0)
     r, s, total = rows_of(x), rows_of(p), rows_of(y)
     for family in range(grid.hinge.shape[0]):
+        # the hinges of this family, as for the forces
         j, k, l = grid.hinge[family, 0], grid.hinge[family, 1], grid.hinge[family, 2]
         low = max(0, -min(j, min(k, l)))
         count = r.shape[1] - max(0, max(j, max(k, l))) - low
         if count <= 0:
             continue
+        # slopes, and the rate of the angle along p, which takes the angle's place
         angle, rate, slopes, geometry, _, _ = hinge_rows(scratch.rows, count)
         hinge_angles(
             _slices(r, low, count), _slices(r, low + j, count), _slices(r, low + k, count), _slices(r, low + l, count), angle,
@@ -273,6 +293,7 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
             _slices(s, low, count), _slices(s, low + j, count), _slices(s, low + k, count), _slices(s, low + l, count), slopes,
             angle,
         )  # fmt: skip
+        # scaled, with the opposite sign of a force, and added at each corner
         rate[:] = zero
         _moments(angle, rate, grid.hinge_weight[family, low : low + count], -bend[0], zero)
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
@@ -285,7 +306,7 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
 
 @inlined
 def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
-    """Force on a triangle with sides p and q in a relative wind u [N], see ``forces.add_lane_air_forces``."""
+    """Force on a triangle with sides p and q [m] in a relative wind u [m/s], in N; the formula is ``forces.add_lane_air_forces``'s."""
     # normal times twice the area
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
     twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
@@ -297,12 +318,18 @@ def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
 
 @disjoint
 def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
-    """Forces on the first triangles of cells: a, b, and d where they are even, else c.  s: shares; w: the wind [m/s]."""
+    """Forces on the first triangle of each cell, fx, fy, fz [N], (cells,): a, b, d in even cells, a, b, c in others.
+
+    x ... vz: components of positions and velocities, (particles,).  c: particles in a row.  sa ... sd: the corners' shares of the
+    triangle.  wx, wy, wz: the wind [m/s].
+    """
+    # the corners b, c and d of the cell whose first corner is a = p
     half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
     xb, yb, zb, ub, vb, wb = x[1:], y[1:], z[1:], vx[1:], vy[1:], vz[1:]
     xc, yc, zc, uc, vc, wc = x[c:], y[c:], z[c:], vx[c:], vy[c:], vz[c:]
     xd, yd, zd, ud, vd, wd = x[c + 1 :], y[c + 1 :], z[c + 1 :], vx[c + 1 :], vy[c + 1 :], vz[c + 1 :]
     for p in range(fx.shape[0]):
+        # the side that depends on the diagonal, and the wind relative to the triangle
         whole = even[p] > zero
         qx, qy, qz = (xd[p] if whole else xc[p]) - x[p], (yd[p] if whole else yc[p]) - y[p], (zd[p] if whole else zc[p]) - z[p]
         ux = wx - (sa[p] * vx[p] + sb[p] * ub[p] + sc[p] * uc[p] + sd[p] * ud[p])
@@ -315,7 +342,7 @@ def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, a
 
 @disjoint
 def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
-    """The same for their second triangles: d, c, and a where they are even, else b."""
+    """Forces on the second triangle of each cell: d, c, a in even cells, d, c, b in others; see ``_first_triangles``."""
     half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
     xb, yb, zb, ub, vb, wb = x[1:], y[1:], z[1:], vx[1:], vy[1:], vz[1:]
     xc, yc, zc, uc, vc, wc = x[c:], y[c:], z[c:], vx[c:], vy[c:], vz[c:]
@@ -333,7 +360,7 @@ def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, 
 
 @disjoint
 def _share_out(fx, fy, fz, own, others, ax, ay, az, bx, by, bz):
-    """Add the forces of both triangles of cells, a and b, to one of their corners."""
+    """Add a corner's shares of the forces on both triangles of its cell, a and b, to the forces on it; all (cells,)."""
     for p in range(ax.shape[0]):
         fx[p] += own[p] * ax[p] + others[p] * bx[p]
         fy[p] += own[p] * ay[p] + others[p] * by[p]
@@ -342,10 +369,12 @@ def _share_out(fx, fy, fz, own, others, ax, ay, az, bx, by, bz):
 
 @uncounted
 def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
-    """The same forces as ``forces.add_lane_air_forces``, for both triangles of all cells at once, and corner by corner.
+    """The forces of ``forces.add_lane_air_forces``, for all cells at once, and then corner by corner.
 
-    A cell's corners are a, b, and c, d in the next row; its triangles are abd and adc where it is even, abc and bdc elsewhere.
+    The corners of a cell are a, b in one row and c, d in the next.  Its triangles are abd and adc if it is even, else abc and bdc.
+    surface: an ``elements.GridSurface``.
     """
+    # names for one lane's arrays; a and b: forces on the first and on the second triangles
     cell, even, s = surface
     across, along = resistance[0, 0], resistance[1, 0]
     r, u, total, columns = rows_of(x), rows_of(v), rows_of(f), cell[2]
@@ -353,12 +382,14 @@ def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
     ax, ay, az = scratch.rows[0, :count], scratch.rows[1, :count], scratch.rows[2, :count]
     bx, by, bz = scratch.rows[3, :count], scratch.rows[4, :count], scratch.rows[5, :count]
     wx, wy, wz = wind[0, 0], wind[1, 0], wind[2, 0]
+    # the forces on both triangles of each cell
     _first_triangles(
         r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[0], s[1], s[2], s[3], wx, wy, wz, across, along, ax, ay, az
     )  # fmt: skip
     _second_triangles(
         r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[4], s[5], s[6], s[7], wx, wy, wz, across, along, bx, by, bz
     )  # fmt: skip
+    # the corners take their shares
     for corner in range(4):
         fx, fy, fz = _slices(total, cell[corner], count)
         _share_out(fx, fy, fz, s[corner], s[4 + corner], ax, ay, az, bx, by, bz)
@@ -368,15 +399,15 @@ def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
 
 
 def kernels_of(model: Bending, by_particle: bool) -> dict[str, Any]:
-    """Forces by the names that integrators and the main loop call them by, for a model of bending.
+    """The force kernels for a bending model, by the names under which integrators and the main loop call them.
 
-    by_particle: whether one sheet's particles lie side by side; else lanes do.
+    by_particle: whether the particles of one sheet are adjacent in memory; otherwise the lanes are.
     """
     if not by_particle:
         return model.kernels | {
             "add_spring_forces": add_lane_forces, "add_spring_products": add_lane_products, "add_air_forces": add_lane_air_forces,
         }  # fmt: skip
-    # what bends linearly is added with the springs
+    # the quadratic model is added together with the springs
     hinges = (add_grid_hinge_forces, add_grid_hinge_products) if model.name == "hinge" else (add_no_forces, add_no_products)
     return {
         "add_spring_forces": add_grid_forces, "add_spring_products": add_grid_products, "add_air_forces": add_grid_air_forces,

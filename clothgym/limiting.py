@@ -1,13 +1,15 @@
-"""Floor 4: strain limiting, Provot 1995: threads and diagonals beyond a threshold are drawn back to it after each substep.
+"""Floor 4: strain limiting: structural and shear springs beyond a threshold are shortened to it after each substep.
 
-A sweep goes over the springs: of one that is too long, two free ends move equally, one free end moves alone, and two held ones
-stay.  One sweep is not enough, for each correction stretches the neighbours: sweeps go on until no spring is ``TOLERANCE`` beyond
-the threshold, or ``SWEEPS`` are done; what is left at the end of the control step, after contact has had its say, is reported.  In
-the same visit, the ends of a spring at its limit lose the velocity with which they part, by an impulse between their masses: that
-takes kinetic energy and can never add any.
+Provot 1995, Deformation constraints in a mass-spring model to describe rigid cloth behavior.
 
-Equal moves of unequal masses, as a sheet's border has, shift the centre of mass and take spin from a free sheet: that is Provot's
-rule, not a law of mechanics.
+A sweep visits the springs.  If one is too long, two free ends move by equal amounts, a single free end moves alone, and two held
+ends stay.  One sweep is not enough, as each correction stretches the neighbors.  Sweeps go on until no spring is ``TOLERANCE``
+beyond the threshold, or ``SWEEPS`` are done.  The strain that is left at the end of the control step, after contact, is reported.
+In the same visit the ends of a spring at its limit lose their relative velocity apart, by an impulse between their masses.  This
+removes kinetic energy and never adds any.
+
+Equal displacements of unequal masses, which the border of a sheet has, shift the center of mass and slow the rotation of a free
+sheet.  That is Provot's rule, and not a law of mechanics.
 """
 
 from __future__ import annotations
@@ -22,8 +24,9 @@ from clothgym._jit import disjoint, kernel, placeholder, specialize
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
-TOLERANCE = 0.005
-SWEEPS = 100
+TOLERANCE = 0.005  # strain beyond the threshold that ends the sweeps
+SWEEPS = 100  # at most, in a substep
+# rows of a report
 BEFORE, AFTER, USED = 0, 1, 2
 
 largest_strain = placeholder(
@@ -35,18 +38,20 @@ def checked_limit(value: float | None) -> float | None:
     """A limit on strain, or None.
 
     Raises:
-        ValueError: a value that is not positive, or so large that per cent were meant.
+        ValueError: a value that is not positive, or above 1, as if in percent.
     """
     if value is None:
         return None
     if isinstance(value, (bool, np.bool_)) or positive("strain_limit", value) > 1:
-        raise ValueError(f"strain_limit={value!r}: must be above 0 and at most 1; a tenth is 0.1")
+        raise ValueError(f"strain_limit={value!r}: must be above 0 and at most 1; 10 % is 0.1")
     return float(value)
 
 
 class Limiting(NamedTuple):
-    """What strain limiting did in the last control step, (num_envs,) each: the largest strain that it met, the largest that it left
-    at the end, and the most sweeps that a substep took."""
+    """What strain limiting did in the last control step, (num_envs,) each.
+
+    before: largest strain that it met.  after: largest strain at the end of the control step.  sweeps: most sweeps of a substep.
+    """
 
     before: NDArray
     after: NDArray
@@ -54,16 +59,17 @@ class Limiting(NamedTuple):
 
 
 def _limit_strain(x, v, w, weave, limit, report):
-    """Draw springs that are longer than ``1 + limit`` rest lengths back to that, in place.
+    """Shorten springs that are longer than ``1 + limit`` rest lengths to that length, in place.
 
-    x [m], v [m/s]: (3, particles, lanes); w [1/kg]: (particles, lanes); weave: see ``elements.Weave``.  report: rows BEFORE, AFTER
-    and USED, (3, lanes): the first and the last keep the largest of the control step.
+    x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  weave: see ``elements.Weave``.  report: rows BEFORE,
+    AFTER and USED, (3, lanes); BEFORE and USED keep the largest values of the control step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
     enough = x.dtype.type(limit + TOLERANCE)
     for sweep in range(SWEEPS + 1):
         largest_strain(x, weave, largest)
+        # stop when all lanes are within the tolerance, or no sweep is left
         going = False
         for l in range(lanes):
             going |= largest[l] > enough
@@ -72,6 +78,7 @@ def _limit_strain(x, v, w, weave, limit, report):
                 report[BEFORE, l] = max(report[BEFORE, l], largest[l])
         if not going or sweep == SWEEPS:
             return
+        # one more sweep, over the lanes that need it
         for l in range(lanes):
             if largest[l] > enough:
                 report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
@@ -79,14 +86,16 @@ def _limit_strain(x, v, w, weave, limit, report):
 
 
 def _measure_strain(x, weave, report):
-    """What is left at the end of a control step, after contact, which knows nothing of the limit."""
+    """Report the largest strain at the end of a control step, after contact, which does not respect the limit."""
     largest_strain(x, weave, report[AFTER])
 
 
 @disjoint
 def _raise_to_stretch(x, y, z, o, weight, inverse, out):
-    """Raise ``out``, (particles,), to the squared stretch of a grid's springs of one kind; inverse: one over their length's
-    square."""
+    """``out <- max(out, |d|^2/r^2)`` for the springs of one kind on a grid, by their first ends, (particles,).
+
+    x, y, z: components of positions, (particles,).  o: the kind's offset.  inverse: ``1/r^2`` [1/m^2].
+    """
     x1, y1, z1, zero = x[o:], y[o:], z[o:], x.dtype.type(0)
     for p in range(x1.shape[0]):
         dx, dy, dz = x1[p] - x[p], y1[p] - y[p], z1[p] - z[p]
@@ -96,13 +105,15 @@ def _raise_to_stretch(x, y, z, o, weight, inverse, out):
 
 @kernel
 def _largest_on_grid(x, weave, largest):
-    """Of a grid's springs that do not bend, (1,)."""
+    """The largest strain of a grid's structural and shear springs, (1,); x: (3, particles, 1)."""
     offset, kind, rest_length, weight, _, _, _ = weave.elements
+    # the largest squared stretch at each particle, kind by kind
     one, n = x.dtype.type(1), x.shape[1]
     r, out = x.reshape((3, n)), np.zeros(n, x.dtype)
     for a in range(weight.shape[0]):
         if kind[a] <= SHEAR:
             _raise_to_stretch(r[0], r[1], r[2], offset[a], weight[a], one / (rest_length[a] * rest_length[a]), out)
+    # the largest of all, as a strain
     largest[0] = 0
     for p in range(n):
         largest[0] = max(largest[0], out[p])
@@ -111,7 +122,8 @@ def _largest_on_grid(x, weave, largest):
 
 @kernel
 def _largest_in_lanes(x, weave, largest):
-    """Of the springs that do not bend, (lanes,)."""
+    """The largest strain of the structural and shear springs, (lanes,); x: (3, particles, lanes)."""
+    # the largest squared stretch
     ends, rest_length, kind, _ = weave.springs
     one = x.dtype.type(1)
     largest[:] = 0
@@ -123,13 +135,18 @@ def _largest_in_lanes(x, weave, largest):
         for l in range(x.shape[2]):
             dx, dy, dz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
             largest[l] = max(largest[l], (dx * dx + dy * dy + dz * dz) * inverse)
+    # as a strain
     for l in range(x.shape[2]):
         largest[l] = np.sqrt(largest[l]) - one
 
 
 @kernel
 def _sweep(x, v, w, springs, limit, enough, largest):
-    """Visit each spring of the lanes whose largest strain is beyond ``enough``."""
+    """Visit each structural and shear spring, in the lanes whose largest strain is beyond ``enough``.
+
+    With n the direction from i to j and L the limit, ``x_i <- x_i + s (|d| - L) n``, ``x_j <- x_j - (1 - s) (|d| - L) n``.
+    If both ends are free s is 1/2 (Provot 1995).  Then the impulse ``max(n . (v_j - v_i), 0)/(w_i + w_j)`` along n on both ends.
+    """
     ends, rest_length, kind, _ = springs
     one, zero, half = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0.5)
     for s in range(ends.shape[0]):
@@ -143,6 +160,7 @@ def _sweep(x, v, w, springs, limit, enough, largest):
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
             mobile = wi[l] + wj[l]
             if largest[l] > enough and length >= longest and mobile > zero:
+                # positions: back to the greatest length
                 nx, ny, nz = dx / length, dy / length, dz / length
                 excess = length - longest
                 own = half if wi[l] > zero and wj[l] > zero else (one if wi[l] > zero else zero)
@@ -153,6 +171,7 @@ def _sweep(x, v, w, springs, limit, enough, largest):
                 x[0, j, l] -= second * nx
                 x[1, j, l] -= second * ny
                 x[2, j, l] -= second * nz
+                # velocities: the ends do not move apart
                 parting = (v[0, j, l] - v[0, i, l]) * nx + (v[1, j, l] - v[1, i, l]) * ny + (v[2, j, l] - v[2, i, l]) * nz
                 impulse = max(parting, zero) / mobile
                 v[0, i, l] += wi[l] * impulse * nx
@@ -165,18 +184,18 @@ def _sweep(x, v, w, springs, limit, enough, largest):
 
 @kernel
 def no_limit(x, v, w, weave, limit, report):
-    """Leave the springs as they are."""
+    """No limit: the springs stay as they are."""
 
 
 @kernel
 def no_measure(x, weave, report):
-    """Nothing to measure."""
+    """No limit: nothing is measured."""
 
 
 @cache
 def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
-    """The names that the main loop calls, without a limit or with one; by_particle: whether one grid's particles lie side by
-    side."""
+    """The limiter by the names under which the main loop calls it; limits: whether there is a limit; by_particle: whether the
+    particles of one grid are adjacent in memory."""
     if not limits:
         return {"restrain": no_limit, "remeasure": no_measure}
     largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")

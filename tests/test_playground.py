@@ -111,7 +111,7 @@ def test_a_fabric_brings_its_figures_and_a_slider_is_a_figure():
         ({"bend_rigidity": 2e-3}, "lower the shear stiffness or the rigidity"),
         ({"integrator": "xpdb"}, "did you mean 'xpbd'"),
         ({"substeps": 0}, "substeps=0"),
-        ({"strain_limit": 12.0}, "a tenth is 0.1"),
+        ({"strain_limit": 12.0}, "10 % is 0.1"),
         ({"fabric": "linen"}, "no material preset 'linen'"),
         ({"gravty": 1.0}, "did you mean 'gravity'"),
     ],
