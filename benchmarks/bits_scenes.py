@@ -66,13 +66,13 @@ def in_the_wind(mesh: ClothMesh, held: tuple[int, int], integrator: str, options
         anchors=held, threads=1, on_divergence="ignore", **world,
     )  # fmt: skip
     even = np.linspace(0, 1, 4)
-    figures = {
+    properties = {
         "density": 0.12 + 0.1 * even, "stretch_stiffness": 180 + 80 * even, "shear_stiffness": 60 + 40 * even,
         "bend_rigidity": 2e-6 + 2e-5 * even, "damping_time": 1e-4 * even, "drag_coefficient": 1 + even, "air_drag": 0.3 * even,
     }  # fmt: skip
     method = INTEGRATORS[integrator]
-    no_figures = method.shared | method.ignored | ({"shear_stiffness"} if mesh.shape is None else set())
-    allowed = {name: values for name, values in figures.items() if name not in no_figures}
+    no_properties = method.shared | method.ignored | ({"shear_stiffness"} if mesh.shape is None else set())
+    allowed = {name: values for name, values in properties.items() if name not in no_properties}
     wind = np.outer(1 + even, (1.0, 2.0, 0.5))
     simulation.set_parameters(warn=False, wind=wind, gravity=np.outer(8 + 2 * even, (0.1, 0, -1)), **allowed)
 

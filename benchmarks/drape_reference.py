@@ -1,4 +1,4 @@
-"""The ideal of ClothDrape-v0: the coverage that a fine sheet, laid flat and centred on a target, reaches.
+"""The ideal of ClothDrape-v0: the coverage that a fine sheet, laid flat and centered on a target, reaches.
 
     python benchmarks/drape_reference.py            # writes envs/drape_reference.json, about two minutes
 

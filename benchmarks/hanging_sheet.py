@@ -6,14 +6,14 @@
     python benchmarks/hanging_sheet.py --again            # times once more and keeps the faster time, on a machine that is shared
     python benchmarks/hanging_sheet.py --fresh            # measures anew, about six minutes
 
-A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighbouring corners are held; there is
+A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighboring corners are held; there is
 neither contact nor air.  The error is the rms distance over particles, at the end, from the same simulator's converged run, so
-that none is measured by another's discretisation.  Frames of 1/60 s are timed on one thread, and the median counts; those of a
+that none is measured by another's discretization.  Frames of 1/60 s are timed on one thread, and the median counts; those of a
 batch are summed over its environments.  Sections of ``results/hanging_sheet.json``:
 
 * ours, mujoco: error [mm] and frames/s; claim: beside each setting of MuJoCo, our fastest setting that errs no more;
 * static: stretch under its own weight of a sheet held along one edge, over that of the converged run, minus one;
-* drape: error of ClothDrape-v0's sheet and control step, by substeps; it should not exceed 5 mm per metre of sheet.
+* drape: error of ClothDrape-v0's sheet and control step, by substeps; it should not exceed 5 mm per meter of sheet.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ MUJOCO_CONVERGED = 160
 DRAPE_SUBSTEPS = (46, 50, 57, 70, 115)
 ABOUT = {
     "scene": "25 x 25 particles, 1 m x 1 m, cotton (E t = 261 N/m, nu 0.243, 0.1503 kg/m^2, plate rigidity 2.34e-6 N m), flat "
-    "and at rest at t = 0, two neighbouring corners held, no contact, no air; error after 0.5 s",
+    "and at rest at t = 0, two neighboring corners held, no contact, no air; error after 0.5 s",
     "clothgym": "spring grid, float32 (converged: float64, 2560 substeps a frame); damping along springs, damping_time as stated",
     "mujoco": "2D flex, float64: Saint Venant-Kirchhoff triangles with the same moduli, thickness and masses and, where 'bending', "
     "the same rigidity; Rayleigh damping 1e-4 s; Newton solver; contact off; converged: the same integrator at dt = 1/9600 s",
@@ -237,13 +237,13 @@ def print_table(title: str, rows: list[Row]) -> None:
 
 
 def draw(results: Row, path: Path) -> None:
-    colours = {EULER: "#d1495b", XPBD: "#edae49", DISCRETE: "#2b2d42", MUJOCO_EULER: "#8d99ae"}
+    colors = {EULER: "#d1495b", XPBD: "#edae49", DISCRETE: "#2b2d42", MUJOCO_EULER: "#8d99ae"}
     figure, axes = plt.subplots(figsize=(8.4, 4.4), layout="constrained")
 
     def line(rows: list[Row], label: str, **style: Any) -> None:
         seconds = [1 / (FRAME * row["frames/s"]) for row in rows]
         style = {"marker": "o", "ms": 3.5, "lw": 1.4} | style
-        axes.plot(seconds, [row["error_mm"] for row in rows], color=colours[rows[0]["method"]], label=label, **style)
+        axes.plot(seconds, [row["error_mm"] for row in rows], color=colors[rows[0]["method"]], label=label, **style)
 
     for method in (EULER, XPBD):
         for lanes, style in ((LANES[-1], {}), (1, {"ls": "--", "lw": 1.0, "mfc": "white"})):

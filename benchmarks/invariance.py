@@ -39,7 +39,7 @@ ENV = "ClothDrape-v0"
 RESULT = Path(__file__).parent / "results" / "invariance.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "transfer.png"
 MULTIPLES = (1, 2, 4)
-# what each integrator is tested with: the task's own substeps where they are stable, what is accurate to 5 mm a metre elsewhere
+# what each integrator is tested with: the task's own substeps where they are stable, what is accurate to 5 mm a meter elsewhere
 TESTED: dict[str, dict[str, Any]] = {
     "semi_implicit_euler": {},
     "verlet": {"integrator": "verlet", "substeps": 50},

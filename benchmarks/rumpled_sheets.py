@@ -4,7 +4,7 @@
 
 Sheets that lie flat are picked up at a random particle, carried some way and dropped, twice, and settle.  Kept are the most
 rumpled ones, by mean height, of those whose two corners at the target can be taken: they lie half a side apart, and no cloth
-from elsewhere is within a gripper's reach of them.  What is written is in tenths of a millimetre, relative to the middle of the
+from elsewhere is within a gripper's reach of them.  What is written is in tenths of a millimeter, relative to the middle of the
 sheet on the floor.
 """
 

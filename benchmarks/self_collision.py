@@ -6,7 +6,7 @@
 
 Sections of ``results/self_collision.json``:
 
-* maneuvers: those of ``clothgym.starts`` on sheets of a metre, five seeds each: frames (control steps of 1/60 s) with an
+* maneuvers: those of ``clothgym.starts`` on sheets of a meter, five seeds each: frames (control steps of 1/60 s) with an
   intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation told.  Modes:
   "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.

@@ -11,7 +11,7 @@ unless said:
 * cost: milliseconds of a control step of 1/60 s per environment on 25 x 25, and ratios to none.  The modes take turns frame by
   frame in one process.  Of a state the median frame counts, of an episode the sum of all frames, the faster of two runs of each.
 * growth: the same from 13 x 13 to 100 x 100 at the same spacing, of one environment; ``docs/self_collision.png`` shows it.
-* mujoco: frames/s of a sheet of half a metre that falls on its edge, for two seconds, by MuJoCo's ``ipc`` mode, by its ordinary
+* mujoco: frames/s of a sheet of half a meter that falls on its edge, for two seconds, by MuJoCo's ``ipc`` mode, by its ordinary
   contacts, and by ours; and in how many frames something intersected, counted in all by the same exact method.
 """
 
@@ -258,10 +258,10 @@ def print_ratio(rows: list[Row]) -> None:
 
 def draw(rows: list[Row], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    colours = {"none": "#8d99ae", "fast": "#edae49", "strict": "#d1495b"}
+    colors = {"none": "#8d99ae", "fast": "#edae49", "strict": "#d1495b"}
     for scene, style in (("folded", {}), ("flat", {"ls": "--", "mfc": "white"})):
         chosen = sorted((row for row in rows if row["scene"] == scene), key=lambda row: row["particles"])
-        for mode, colour in colours.items():
+        for mode, color in colors.items():
             figures = [row[f"{mode}_ms"] for row in chosen]
             axes.plot(
                 [r["particles"] for r in chosen],
@@ -269,7 +269,7 @@ def draw(rows: list[Row], path: Path) -> None:
                 marker="o",
                 ms=3.5,
                 lw=1.4,
-                color=colour,
+                color=color,
                 label=f"{mode}, {scene}",
                 **style,
             )

@@ -8,7 +8,7 @@
 * static: stretch under its own weight of the sheet held along one edge, over that of the converged run, minus one.
 * cost: median time of a control step of 128 sheets on one thread, divided by 128.
 
-A task takes the cheapest setting that errs by 5 mm per metre or less, is stiff to 5 %, and has a substep of at most 0.9 of its
+A task takes the cheapest setting that errs by 5 mm per meter or less, is stiff to 5 %, and has a substep of at most 0.9 of its
 stability bound, if it has one.  Iterative methods are swept with the iterations that are named beside them.
 """
 
@@ -57,7 +57,7 @@ METHODS: tuple[tuple[str, dict[str, float], tuple[float, ...]], ...] = (
 )
 LANES, FRAMES = 128, 12
 CONVERGED = 8  # times the task's substeps, of rk4
-MOST_ERROR, MOST_SOFTNESS, MOST_OF_BOUND = 5.0, 0.05, 0.9  # the first in mm per metre
+MOST_ERROR, MOST_SOFTNESS, MOST_OF_BOUND = 5.0, 0.05, 0.9  # the first in mm per meter
 BOUNDED = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")
 
 
@@ -143,7 +143,7 @@ def print_table(task: str, rows: list[Row]) -> None:
 def draw(rows: list[Row]) -> None:
     """Error over cost, a panel a task."""
     figure, panels = plt.subplots(1, len(TASKS), figsize=(12.6, 4.2), layout="constrained", sharey=True)
-    colours = dict(zip(INTEGRATORS, plt.get_cmap("tab10").colors))  # type: ignore[attr-defined]
+    colors = dict(zip(INTEGRATORS, plt.get_cmap("tab10").colors))  # type: ignore[attr-defined]
     for axes, task in zip(panels, TASKS):
         for name, options, _ in METHODS:
             line = [r for r in rows if (r["environment"], r["integrator"], r["options"]) == (task, name, options)]
@@ -152,14 +152,14 @@ def draw(rows: list[Row]) -> None:
             style = "-" if not options or options.get("iterations") == 10 else "--"
             axes.plot(
                 [r["us_per_step"] for r in line], [r["error_mm_per_m"] for r in line], style, marker="o", ms=3.5, lw=1.3,
-                color=colours[name], label=label,
+                color=colors[name], label=label,
             )  # fmt: skip
         axes.axhline(MOST_ERROR, color="#8d99ae", lw=0.8)
         axes.set(xscale="log", yscale="log", xlabel="µs of one core a control step", title=task)
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("rms error after 0.5 s [mm per metre of sheet]")
-    panels[-1].annotate("5 mm per metre", (0.72, MOST_ERROR), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
+    panels[0].set_ylabel("rms error after 0.5 s [mm per meter of sheet]")
+    panels[-1].annotate("5 mm per meter", (0.72, MOST_ERROR), xycoords=("axes fraction", "data"), va="bottom", fontsize=8)
     panels[-1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(PICTURE, dpi=130)
     plt.close(figure)

@@ -247,7 +247,7 @@ def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
     """The mesh's triangles as a kernel of this dtype wants them.
 
     A corner's share of a triangle follows from the area that the particle stands for: on a grid, whose diagonals alternate,
-    thirds would give every second particle twice its neighbours' force.
+    thirds would give every second particle twice its neighbors' force.
     """
     triangles = mesh.triangles
     around = np.bincount(triangles.ravel(), minlength=mesh.num_particles)

@@ -14,10 +14,10 @@ from clothgym.elements import Elements
 from clothgym.forces import Oscillators
 from clothgym.integrators import Integrator
 from clothgym.mesh import ClothMesh
-from clothgym.parameters import FIGURES
+from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
 
-FASTEST = 1e3  # no cloth moves at a kilometre a second [m/s]
+FASTEST = 1e3  # no cloth moves at a kilometer a second [m/s]
 
 
 @apart
@@ -93,19 +93,19 @@ def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_ste
             return
 
 
-def refuse_figures(integrator: Integrator, mesh: ClothMesh, before: NDArray, after: NDArray) -> None:
-    """Refuse material figures that an integrator or a mesh cannot have; before, after: (num_envs, figures).
+def refuse_properties(integrator: Integrator, mesh: ClothMesh, before: NDArray, after: NDArray) -> None:
+    """Refuse material properties that an integrator or a mesh cannot have; before, after: (num_envs, properties).
 
     Raises:
-        ValueError: a figure that means nothing to them has changed, or one that enters a matrix differs between environments.
+        ValueError: a property that means nothing to them has changed, or one that enters a matrix differs between environments.
     """
-    shear = FIGURES.index("shear_stiffness")
+    shear = PROPERTIES.index("shear_stiffness")
     if mesh.shape is None and not np.array_equal(after[:, shear], before[:, shear]):
         raise ValueError(
             "shear_stiffness means nothing on a triangle mesh: its edges have one stiffness, and its shear modulus follows from "
             "stretch_stiffness and Poisson's ratio 1/3; change that, or take a grid"
         )
-    for column, name in enumerate(FIGURES):
+    for column, name in enumerate(PROPERTIES):
         if name in integrator.ignored and not np.array_equal(after[:, column], before[:, column]):
             raise ValueError(refusal(integrator, name))
         if name in integrator.shared and np.ptp(after[:, column]) > 0:
@@ -113,7 +113,7 @@ def refuse_figures(integrator: Integrator, mesh: ClothMesh, before: NDArray, aft
 
 
 def refusal(integrator: Integrator, name: str) -> str:
-    """Why an integrator refuses a figure."""
+    """Why an integrator refuses a property."""
     if name in integrator.ignored:
         return f"{integrator.name} knows no {name}: its stiffness is a matter of its options ({', '.join(integrator.options)})"
     return (

@@ -43,7 +43,7 @@ class Gripper:
         slip_force: pull of the cloth beyond which it slips out of the fingers [N]; None for a firm hold.
 
     Raises:
-        ValueError: a figure that is not positive, or a position that is not three finite numbers.
+        ValueError: a property that is not positive, or a position that is not three finite numbers.
     """
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.5)

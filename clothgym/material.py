@@ -27,10 +27,10 @@ class Material:
         skin_friction: its coefficient edge on to the wind, by the area of one side.
         air_drag: linear drag, force per area and velocity [N s/m^3], whatever the wind is.  Air itself has none; it calms slow
             swings, which the quadratic law hardly does.  0.72 is that law's force at 1 m/s.
-        source: where the figures come from.
+        source: where the properties come from.
 
     Raises:
-        ValueError: a figure that is negative (or zero, where zero makes no fabric) or not finite.
+        ValueError: a property that is negative (or zero, where zero makes no fabric) or not finite.
     """
 
     density: float = 0.150
@@ -55,10 +55,10 @@ class Material:
 
     @staticmethod
     def preset(name: str, **changes: float) -> Material:
-        """A measured fabric by name, with some figures changed if wanted: ``Material.preset("cotton", density=0.2)``."""
+        """A measured fabric by name, with some properties changed if wanted: ``Material.preset("cotton", density=0.2)``."""
         known("material preset", name, PRESETS)
-        for figure in changes:
-            known("material figure", figure, [field.name for field in fields(Material)])
+        for name in changes:
+            known("material property", name, [field.name for field in fields(Material)])
         return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
 
 

@@ -20,7 +20,7 @@ NUM_KINDS = 7
 
 
 class Springs(NamedTuple):
-    """Springs sorted by colour: no two of one colour share a particle.
+    """Springs sorted by color: no two of one color share a particle.
 
     particles: ends, (springs, 2).  rest_length: [m], (springs,).  kind: index of the stiffness, (springs,).
     weight: share of that stiffness, (springs,): half for a spring on a grid's border, which stands for half a strip of cloth;
@@ -34,7 +34,7 @@ class Springs(NamedTuple):
 
 
 class Hinges(NamedTuple):
-    """The inner edges, across which two triangles bend, sorted by colour; on a grid those of both ways to cut its cells.
+    """The inner edges, across which two triangles bend, sorted by color; on a grid those of both ways to cut its cells.
 
     particles: both ends of the edge, then the opposite corners of its triangles, (hinges, 4).
     weight: bending moment of a hinge over rigidity times angle, (hinges,): e/h, with e the edge's length and h the spacing of
@@ -51,7 +51,7 @@ class Hinges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ClothMesh:
-    """A sheet at rest: a grid in the plane z = 0 centred on the origin, or any mesh of triangles.
+    """A sheet at rest: a grid in the plane z = 0 centered on the origin, or any mesh of triangles.
 
     Attributes:
         size: width along x and height along y [m].
@@ -88,7 +88,7 @@ class ClothMesh:
 
     @property
     def spacing(self) -> tuple[float, float]:
-        """Rest distance of a grid's neighbours along x and y [m]."""
+        """Rest distance of a grid's neighbors along x and y [m]."""
         rows, columns = self.grid_shape
         return self.size[0] / (columns - 1), self.size[1] / (rows - 1)
 
@@ -100,9 +100,9 @@ class ClothMesh:
 
 
 def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
-    """A rectangular sheet of ``rows`` x ``cols`` particles, ``width`` (along x) by ``height`` (along y) metres.
+    """A rectangular sheet of ``rows`` x ``cols`` particles, ``width`` (along x) by ``height`` (along y) meters.
 
-    Springs as in Provot 1995: structural to the four neighbours, shear along both diagonals, bend to the next but one.
+    Springs as in Provot 1995: structural to the four neighbors, shear along both diagonals, bend to the next but one.
 
     Raises:
         ValueError: fewer than two rows or columns, or a side that is not positive and finite.
@@ -133,7 +133,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     ends = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for _, a, b, _ in families])
     kind = np.concatenate([np.full(a.size, k) for k, a, _, _ in families])
     weight = np.concatenate([w.ravel() for *_, w in families])
-    springs = coloured_springs(positions, ends, kind, weight)
+    springs = colored_springs(positions, ends, kind, weight)
 
     # the diagonal alternates from cell to cell, so that the surface has no preferred direction
     a, b, c, d = (q.ravel() for q in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
@@ -144,10 +144,10 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     area = (dx * dy * np.outer(across_y, across_x)).ravel()
 
     # hinges of these triangles and of those with the other diagonal in each cell, each counting half: with the former alone every
-    # second particle differs from its neighbours, gives way to a bend, and leaves a strip two thirds of its rigidity
+    # second particle differs from its neighbors, gives way to a bend, and leaves a strip two thirds of its rigidity
     third = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     fourth = np.where(even, np.stack([b, d, c], 1), np.stack([a, d, c], 1))
-    both = [coloured_hinges(positions, t) for t in (triangles, np.stack([third, fourth], axis=1).reshape(-1, 3))]
+    both = [colored_hinges(positions, t) for t in (triangles, np.stack([third, fourth], axis=1).reshape(-1, 3))]
     hinges = Hinges(*(np.concatenate(fields) for fields in zip(*both)))
     # e/h is right for the lines of the grid.  The diagonals alone resist the twist of a cell, whose energy per area
     # B (d2u/dxdy)^2 asks for half of what e/h gives on square cells: then a bend costs the same in any direction
@@ -159,9 +159,9 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     )
 
 
-def coloured_springs(positions: Real, ends: NDArray, kind: NDArray, weight: NDArray) -> Springs:
-    """Springs between those ends, sorted by colour, as long as they are."""
-    order = np.argsort(_greedy_colours(ends, len(positions)), kind="stable")
+def colored_springs(positions: Real, ends: NDArray, kind: NDArray, weight: NDArray) -> Springs:
+    """Springs between those ends, sorted by color, as long as they are."""
+    order = np.argsort(_greedy_colors(ends, len(positions)), kind="stable")
     ends = ends[order]
     return Springs(
         particles=frozen(ends.astype(np.int32)),
@@ -185,8 +185,8 @@ def inner_edges(triangles: NDArray) -> NDArray[np.int64]:
     return np.concatenate([directed[both], directed[partner[both], 2:]], axis=1)
 
 
-def coloured_hinges(positions: Real, triangles: NDArray) -> Hinges:
-    """The inner edges of triangles, sorted by colour.
+def colored_hinges(positions: Real, triangles: NDArray) -> Hinges:
+    """The inner edges of triangles, sorted by color.
 
     The weight is ``e/h`` with h the mean height of both triangles over the edge, ``e^2/(A_0 + A_1)``: exact for a cylinder on
     equilateral triangles (Seung and Nelson 1988, eq. 13, ``kappa = sqrt(3)/2 kappa~``).
@@ -195,7 +195,7 @@ def coloured_hinges(positions: Real, triangles: NDArray) -> Hinges:
         none = np.zeros(0)
         return Hinges(np.zeros((0, 4), np.int32), none, none, np.zeros((0, 4)))
     particles = inner_edges(triangles)
-    particles = particles[np.argsort(_greedy_colours(particles, len(positions)), kind="stable")]
+    particles = particles[np.argsort(_greedy_colors(particles, len(positions)), kind="stable")]
     xi, xj, xk, xl = (positions[particles[:, c]] for c in range(4))
     e, a, b = xj - xi, xk - xi, xl - xi
     length = np.linalg.norm(e, axis=1)
@@ -214,18 +214,18 @@ def coloured_hinges(positions: Real, triangles: NDArray) -> Hinges:
     )
 
 
-def _greedy_colours(members: NDArray[np.int64], particles: int) -> NDArray[np.int64]:
-    """Smallest colour that no particle of an element has yet, element by element; members: (elements, particles of each)."""
+def _greedy_colors(members: NDArray[np.int64], particles: int) -> NDArray[np.int64]:
+    """Smallest color that no particle of an element has yet, element by element; members: (elements, particles of each)."""
     taken: list[set[int]] = [set() for _ in range(particles)]
-    colours = np.empty(len(members), np.int64)
+    colors = np.empty(len(members), np.int64)
     for element, own in enumerate(members.tolist()):
-        colour = 0
-        while any(colour in taken[p] for p in own):
-            colour += 1
+        color = 0
+        while any(color in taken[p] for p in own):
+            color += 1
         for p in own:
-            taken[p].add(colour)
-        colours[element] = colour
-    return colours
+            taken[p].add(color)
+        colors[element] = color
+    return colors
 
 
 def frozen(array: NDArray) -> NDArray:

@@ -67,7 +67,7 @@ class Observed:
 
     @property
     def parameters(self) -> NDArray:
-        """Material figures of each environment, in the order of ``parameters.FIGURES``, (num_envs, figures); a fresh copy."""
+        """Material properties of each environment, in the order of ``parameters.PROPERTIES``, (num_envs, properties)."""
         return self._parameters.copy()
 
     @property
@@ -120,7 +120,7 @@ class Observed:
 
     @property
     def collider_positions(self) -> NDArray:
-        """Where the centre of each collider is, or a plane's point [m], (num_envs, colliders, 3); a fresh copy."""
+        """Where the center of each collider is, or a plane's point [m], (num_envs, colliders, 3); a fresh copy."""
         return self._solids.positions()
 
     def penetration(self) -> NDArray:

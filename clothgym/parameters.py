@@ -1,4 +1,4 @@
-"""Floor 2: the material figures of each environment, and the rows that kernels read in their place."""
+"""Floor 2: the material properties of each environment, and the rows that kernels read in their place."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from clothgym.material import Material, spring_stiffness
 from clothgym.mesh import ClothMesh
 
 AIR_DENSITY = 1.2  # [kg/m^3]
-FIGURES = (
+PROPERTIES = (
     "density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time",
     "drag_coefficient", "skin_friction", "air_drag",
 )  # fmt: skip
@@ -22,14 +22,14 @@ FIELDS = ("gravity", "wind")
 
 
 def of_material(material: Material) -> NDArray[np.float64]:
-    """A fabric's figures, in the order of ``FIGURES``."""
-    return np.array([getattr(material, name) for name in FIGURES])
+    """A fabric's properties, in the order of ``PROPERTIES``."""
+    return np.array([getattr(material, name) for name in PROPERTIES])
 
 
 def changed(
     material: Material, parameters: NDArray, changes: Mapping[str, Any]
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Environments' figures, (envs, figures), with some changed, and the fields among the changes, (envs, 3) each.
+    """Environments' properties, (envs, properties), with some changed, and the fields among the changes, (envs, 3) each.
 
     Raises:
         ValueError: an unknown name, or a value that ``Material`` would not take.
@@ -37,19 +37,19 @@ def changed(
     parameters = parameters.copy()
     fields: dict[str, NDArray[np.float64]] = {}
     for name, value in changes.items():
-        known("parameter", name, (*FIGURES, *FIELDS))
-        if name in FIGURES:
+        known("parameter", name, (*PROPERTIES, *FIELDS))
+        if name in PROPERTIES:
             values = spread(name, finite(name, value), (len(parameters),))
             for one in np.unique(values):
                 replace(material, **{name: float(one)})  # type: ignore[arg-type]
-            parameters[:, FIGURES.index(name)] = values
+            parameters[:, PROPERTIES.index(name)] = values
         else:
             fields[name] = spread(name, finite(name, value), (len(parameters), 3))
     return parameters, fields
 
 
 def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density: float) -> dict[str, NDArray[np.float64]]:
-    """What becomes of figures, (envs, figures), on a mesh: rows of ``state.Fabric`` without the fields, (envs, ...).
+    """What becomes of properties, (envs, properties), on a mesh: rows of ``state.Fabric`` without the fields, (envs, ...).
 
     hinged: whether hinges resist bending, and no springs.
 
@@ -68,4 +68,4 @@ def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density:
 
 def inverse_masses(mesh: ClothMesh, parameters: NDArray) -> NDArray[np.float64]:
     """Of the particles, if nothing holds them [1/kg], (envs, particles)."""
-    return 1 / (parameters[:, FIGURES.index("density"), None] * mesh.area)
+    return 1 / (parameters[:, PROPERTIES.index("density"), None] * mesh.area)

@@ -192,7 +192,7 @@ class Simulation(Observed):
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
 
     def _prepare(self) -> None:
-        """Make the integrator's plan, and what else the main loop is told, anew if the figures or the substeps have changed."""
+        """Make the integrator's plan, and what else the main loop is told, anew if the properties or the substeps have changed."""
         if self._planned_substeps == self.substeps:
             return
         self._planned_substeps = self.substeps
@@ -290,10 +290,10 @@ class Simulation(Observed):
         self._apply_masses(block, lane)
         self._contact.begin(block, lane, self._x)
 
-    def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **figures: ArrayLike) -> None:
-        """Change material figures (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
+    def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **properties: ArrayLike) -> None:
+        """Change material properties (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
 
-        With ``warn``, figures that need more substeps than there are warn with the number that would do.
+        With ``warn``, properties that need more substeps than there are warn with the number that would do.
 
         Raises:
             ValueError: an unknown name, or a value that ``Material`` would not take; nothing is changed then.
@@ -301,13 +301,13 @@ class Simulation(Observed):
         env = self.layout.chosen(envs)
         block, lane = self.layout.at(env)
         after = self._parameters.copy()
-        after[env], fields = changed(self.material, after[env], figures)
+        after[env], fields = changed(self.material, after[env], properties)
         fabric_rows(self.mesh, after[env], self.bending.hinged, self.air_density)
-        guards.refuse_figures(self.integrator, self.mesh, self._parameters, after)
+        guards.refuse_properties(self.integrator, self.mesh, self._parameters, after)
         self._parameters = after
         for name, value in fields.items():
             getattr(self._fabric, name)[block, :, lane] = value
-        if len(fields) < len(figures):
+        if len(fields) < len(properties):
             self._apply_parameters(env)
             if warn:
                 _, first = np.unique(after[env], axis=0, return_index=True)
@@ -323,7 +323,7 @@ class Simulation(Observed):
     ) -> None:
         """Move collider ``index``; it drags the cloth.
 
-        With ``targets``, where its centre, or a plane's point, is to be at the end of the next step [m], (len(envs), 3): it goes
+        With ``targets``, where its center, or a plane's point, is to be at the end of the next step [m], (len(envs), 3): it goes
         there evenly, and then on with ``velocities``, or rests.  With ``velocities`` alone, from now on [m/s], (len(envs), 3).
 
         Raises:
@@ -357,7 +357,7 @@ class Simulation(Observed):
             ValueError: the state does not fit; nothing is changed then.
         """
         check_fits(state, self.get_state())
-        guards.refuse_figures(self.integrator, self.mesh, state.parameters, state.parameters)
+        guards.refuse_properties(self.integrator, self.mesh, state.parameters, state.parameters)
         self._contact.check_memory(state)
         sound = np.flatnonzero(~state.diverged)
         self._contact.check_apart(state.positions[sound], sound)
@@ -385,7 +385,7 @@ class Simulation(Observed):
     # --- from descriptions to rows --------------------------------------------------------------------------------------
 
     def _apply_parameters(self, env: NDArray) -> None:
-        """Write spring constants, dampers, drag and masses of environments from their material figures."""
+        """Write spring constants, dampers, drag and masses of environments from their material properties."""
         block, lane = self.layout.at(env)
         self._planned_substeps = 0
         for name, rows in fabric_rows(self.mesh, self._parameters[env], self.bending.hinged, self.air_density).items():

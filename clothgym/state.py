@@ -160,7 +160,7 @@ class State:
         hand_positions, hand_targets: where each hand is and is going [m], (num_envs, hands, 3).
         openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, hands).
         stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
-        parameters: the material figures they came from, (num_envs, figures).
+        parameters: the material properties they came from, (num_envs, properties).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
         self_contact: what the sheet's contact with itself remembers, by the names of ``contact_memory.SAVED``.
@@ -284,7 +284,7 @@ def at_rest(
 ) -> State:
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
-    anchors: particles, (anchors,).  hands: how many.  parameters: (figures,).  gravity, wind: (3,).  colliders: (colliders,
+    anchors: particles, (anchors,).  hands: how many.  parameters: (properties,).  gravity, wind: (3,).  colliders: (colliders,
     rows).  contact: of self-collision, see ``contact_memory.blank``.
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import count, finite, positive
-from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, coloured_hinges, coloured_springs, frozen
+from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
 
 FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
 
@@ -33,14 +33,14 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
     edges, inverse = np.unique(np.sort(directed_edges(corners), axis=1), axis=0, return_inverse=True)
     twice = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1)
     beside = np.bincount(inverse, weights=np.tile(twice / 2, 3))
-    hinges = _calibrated(coloured_hinges(x, corners), x)
+    hinges = _calibrated(colored_hinges(x, corners), x)
     # opposite corners: polygons of rigid sides store B kappa^2 / 2 an area where the radius of curvature is their distance l:
     # half the spring's constant times (l^3 kappa^2 / 32)^2, on the third of its triangles that an edge stands for
     across = hinges.particles[:, 2:]
     span = np.linalg.norm(x[across[:, 1]] - x[across[:, 0]], axis=1)
     area = np.bincount(corners.ravel(), weights=np.repeat(twice / 6, 3), minlength=len(x))
     around = _beside(hinges.particles[:, :2], edges, beside)
-    springs = coloured_springs(
+    springs = colored_springs(
         x,
         np.concatenate([edges, across]),
         np.repeat([EDGE, OPPOSITE], [len(edges), len(across)]),
@@ -53,7 +53,7 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
 
 
 def disc(radius: float, rings: int) -> ClothMesh:
-    """A round sheet, flat at z = 0 and centred on the origin: ring ``r`` has ``6 r`` particles, the first is the centre.
+    """A round sheet, flat at z = 0 and centered on the origin: ring ``r`` has ``6 r`` particles, the first is the center.
 
     Raises:
         ValueError: a radius that is not positive, or fewer than one ring.
@@ -77,7 +77,7 @@ def disc(radius: float, rings: int) -> ClothMesh:
 
 
 def load_mesh(path: str | Path) -> ClothMesh:
-    """A sheet from a mesh file (obj, ply, stl, off, glb, ...), in metres; its shape there is its rest shape.
+    """A sheet from a mesh file (obj, ply, stl, off, glb, ...), in meters; its shape there is its rest shape.
 
     Vertices at the very same place are one particle.  A reader may leave out vertices that no triangle uses (obj's does).
 

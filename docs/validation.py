@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from clothgym import INTEGRATORS, Material, Simulation, grid
 from clothgym.lab.scenes import bending_length, cantilever, elastica_droop
-from clothgym.mesh import SHEAR, STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
+from clothgym.mesh import SHEAR, STRUCTURAL_X, ClothMesh, Springs, colored_hinges
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -27,7 +27,7 @@ from matplotlib.collections import LineCollection
 
 PICTURE = Path(__file__).parent / "validation.png"
 G = 9.81
-COLOURS = dict(zip(INTEGRATORS, plt.get_cmap("tab10").colors))  # type: ignore[attr-defined]
+COLORS = dict(zip(INTEGRATORS, plt.get_cmap("tab10").colors))  # type: ignore[attr-defined]
 TIGHT: dict[str, dict[str, Any]] = {
     "implicit_euler": {"name": "implicit_euler", "tolerance": 1e-8},
     "projective_dynamics": {"name": "projective_dynamics", "iterations": 60},
@@ -42,7 +42,7 @@ def line(particles: int, spacing: float) -> ClothMesh:
     kind = np.full(len(ends), STRUCTURAL_X, np.int32)
     springs = Springs(ends, np.full(len(ends), spacing), kind, np.ones(len(ends)))
     none = np.zeros((0, 3), np.int32)
-    return ClothMesh((1.0, 1.0), x, springs, none, np.ones(particles), coloured_hinges(x, none), (2, particles))
+    return ClothMesh((1.0, 1.0), x, springs, none, np.ones(particles), colored_hinges(x, none), (2, particles))
 
 
 def chain(mesh: ClothMesh, method: Any, h: float, k: float, mass: NDArray | float, substeps: int = 1, **kwargs: Any) -> Simulation:
@@ -72,7 +72,7 @@ def orders(axes: Any) -> None:
             x, v = mass.positions[0, 1, 0] - 1, mass.velocities[0, 1, 0]
             errors.append(np.hypot(x - 0.1 * np.cos(1), v + 0.1 * np.sin(1)))
         label = f"{name}, order {method.order}" if method.order else f"{name}, does not converge"
-        axes.plot([1 / n for n in counts], errors, marker="o", ms=3, lw=1.2, color=COLOURS[name], label=label)
+        axes.plot([1 / n for n in counts], errors, marker="o", ms=3, lw=1.2, color=COLORS[name], label=label)
     axes.set(xscale="log", yscale="log", xlabel="substep x frequency", ylabel="error, of 0.1", title="Oscillator: order")
     axes.legend(fontsize=6.5, frameon=False)
 
@@ -93,7 +93,7 @@ def swings(axes: Any) -> None:
         for _ in range(120):
             cloth.step()
             energies.append((cloth.energy().total[0] - first) / scale)
-        axes.plot(np.arange(121) / 60, energies, lw=1.2, color=COLOURS[name], label=name)
+        axes.plot(np.arange(121) / 60, energies, lw=1.2, color=COLORS[name], label=name)
     axes.set(xlabel="time [s]", ylabel="energy gained / (weight x side)", title="Undamped swing: energy")
     axes.legend(fontsize=6.5, frameon=False)
 
@@ -136,13 +136,13 @@ def elastica(axes: Any) -> None:
     """Droop of a clamped strip over its weight, against the heavy elastica."""
     weights = np.geomspace(0.3, 60, 40)
     axes.plot(weights, [elastica_droop(w) for w in weights], "k-", lw=1, label="heavy elastica")
-    for bending, marker, colour in (("hinge", "o", "#d1495b"), ("quadratic", "x", "#2e86ab")):
+    for bending, marker, color in (("hinge", "o", "#d1495b"), ("quadratic", "x", "#2e86ab")):
         found = []
         for weight in (0.5, 2.0, 8.0, 30.0):
             fabric = Material(density=0.2, stretch_stiffness=200, shear_stiffness=80, bend_rigidity=2e-5, damping_time=1e-4)
             strip = cantilever(fabric, overhang=bending_length(fabric) * weight ** (1 / 3), bending=bending)
             found.append((strip.weight, strip.droop))
-        axes.plot(*zip(*found), marker, ms=6, color=colour, label=f"bending={bending!r}")
+        axes.plot(*zip(*found), marker, ms=6, color=color, label=f"bending={bending!r}")
     axes.set(xscale="log", xlabel="G = weight L^3 / B", ylabel="droop of the chord [degrees]", title="Cantilever")
     axes.legend(fontsize=7, frameon=False)
 

@@ -170,7 +170,7 @@ class ClothDrapeEnv(ClothEnv):
 
     ## Starting State
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
-    millimetre; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
+    millimeter; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
     Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),

@@ -15,7 +15,7 @@ from clothgym.mesh import ClothMesh
 # what ``summarize`` writes
 CENTROID, SPEED2, STRETCH2, FINITE = 0, 3, 4, 5
 SUMMARY = 6
-FAR2 = 1e6  # a kilometre or a kilometre a second is no cloth [m^2, m^2/s^2]
+FAR2 = 1e6  # a kilometer or a kilometer a second is no cloth [m^2, m^2/s^2]
 MOST_STRAIN = 1e3  # stands for the strain of a sheet that has diverged
 LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
 

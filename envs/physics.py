@@ -16,7 +16,7 @@ from clothgym.hands import Gripper
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
 from clothgym.mesh import ClothMesh
-from clothgym.parameters import AIR_DENSITY, FIGURES
+from clothgym.parameters import AIR_DENSITY, PROPERTIES
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
@@ -80,8 +80,8 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
     if not isinstance(ranges, Mapping):
         raise ValueError(f"randomize={ranges!r}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
     for name, bounds in ranges.items():
-        if name not in FIGURES:
-            raise ValueError(f"randomize: no material property {name!r} (there are: {', '.join(FIGURES)})")
+        if name not in PROPERTIES:
+            raise ValueError(f"randomize: no material property {name!r} (there are: {', '.join(PROPERTIES)})")
         if (
             np.shape(bounds) != (2,)
             or np.asarray(bounds).dtype.kind not in "iuf"
@@ -122,9 +122,9 @@ def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, floa
     """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
     if not ranges:
         return
-    values = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in FIGURES]
+    values = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in PROPERTIES]
     for corner in product(*values):
-        fabric = Material(**dict(zip(FIGURES, corner)))
+        fabric = Material(**dict(zip(PROPERTIES, corner)))
         stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity
         spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend))
 
@@ -145,8 +145,8 @@ def checked_material_option(
         )
     method = simulation.integrator
     for name, value in material.items():
-        if name not in FIGURES:
-            raise ValueError(f"reset option material: no property {name!r} (there are: {', '.join(FIGURES)})")
+        if name not in PROPERTIES:
+            raise ValueError(f"reset option material: no property {name!r} (there are: {', '.join(PROPERTIES)})")
         number(f"reset option material: {name}", value)
         if name in method.ignored or (name in method.shared and simulation.num_envs > 1):
             raise ValueError(f"reset option material: {refusal(method, name)}")
@@ -156,7 +156,7 @@ def checked_material_option(
 
 def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:
     """The fabric of the ranges that needs the smallest substeps: as light, stiff and damped as can be drawn."""
-    properties = {name: getattr(material, name) for name in FIGURES}
+    properties = {name: getattr(material, name) for name in PROPERTIES}
     for name, (low, high) in ranges.items():
         properties[name] = low if name == "density" else high
     return replace(material, **properties)  # type: ignore[arg-type]

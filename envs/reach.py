@@ -204,7 +204,7 @@ class ClothReachEnv(ClothEnv):
     ## Starting State
     The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
     x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a
-    millimetre.
+    millimeter.
 
     ## Episode End
     Terminated when evaluated, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice

@@ -376,7 +376,7 @@ class ClothStrainEnv(ClothEnv):
     | expert | 1.000 | 0.15 | 0.956 | 97 |
 
     ## Starting State
-    The sheet hangs at rest, with a ripple of a millimetre; the middle between its corners is at x = -0.65 +- 0.1 m, y within
+    The sheet hangs at rest, with a ripple of a millimeter; the middle between its corners is at x = -0.65 +- 0.1 m, y within
     0.1 m, z = 1.05 +- 0.05 m.  The post is within 0.1 m of the origin in x and y.  The first way-point is 0.35 m beside it, on
     a side that is drawn, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
     goal at x = 0.7 +- 0.1 m, y within 0.3 m, z = 1.05 +- 0.2 m.  The held edge lies along y, at the last two turned by up to

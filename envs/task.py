@@ -24,7 +24,7 @@ from clothgym.envs.episode import FAILURES, TaskState, names_of, record_of, reco
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
 from clothgym.material import Material
-from clothgym.parameters import AIR_DENSITY, FIGURES, of_material
+from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
 from clothgym.simulation import Simulation
 
 REWARD_MODES = ("delta", "sparse")
@@ -154,7 +154,7 @@ class Task(TaskDefinition):
         # what an episode remembers
         memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand)]
         memory += [("potential", float)]
-        memory += [("origin", np.float32, 3), ("material", float, len(FIGURES)), *self.remembers()]
+        memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES)), *self.remembers()]
         if self._in_numpy:
             memory += [("performance", float), ("success", bool), ("done", bool)]
         self.episode = records(count, memory)
@@ -204,7 +204,7 @@ class Task(TaskDefinition):
         material = self.episode["material"][envs]
         if not np.array_equal(material, simulation.parameters[envs]):
             # the declared ranges were held against the integrator's bound at construction; one episode's fabric is now
-            properties = {name: material[:, i] for i, name in enumerate(FIGURES)}
+            properties = {name: material[:, i] for i, name in enumerate(PROPERTIES)}
             simulation.set_parameters(envs, warn="material" in options, **properties)
         simulation.reset(envs, positions=starts)
         if self.wind is not None:
@@ -232,9 +232,9 @@ class Task(TaskDefinition):
         """The fabric of one environment's episode: the task's own, what is drawn, and what the reset's options say."""
         properties = of_material(self.physics.material)
         for name, (low, high) in self.randomize.items():
-            properties[FIGURES.index(name)] = self.generators[env].uniform(low, high)
+            properties[PROPERTIES.index(name)] = self.generators[env].uniform(low, high)
         for name, value in fixed.items():
-            properties[FIGURES.index(name)] = value
+            properties[PROPERTIES.index(name)] = value
         self.episode["material"][env] = properties
 
     def _place_colliders(self, envs: NDArray) -> None:

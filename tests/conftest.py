@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from clothgym import Material, Simulation
-from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
+from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
 
 
 def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
@@ -14,7 +14,7 @@ def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:
     ends = np.concatenate([ends[::2], ends[1::2]])
     springs = Springs(ends, np.full(len(ends), spacing), np.full(len(ends), STRUCTURAL_X, np.int32), np.ones(len(ends)))
     triangles = np.zeros((0, 3), np.int32)
-    hinges = coloured_hinges(positions, triangles)
+    hinges = colored_hinges(positions, triangles)
     return ClothMesh((1.0, 1.0), positions, springs, triangles, np.ones(particles), hinges, (2, particles))
 
 
@@ -38,7 +38,7 @@ def chain():
         time_step = time_step or h
         simulation = Simulation(
             line_mesh(particles, spacing),
-            # so soft and so damped that no integrator warns before the figures are set
+            # so soft and so damped that no integrator warns before the properties are set
             Material(stretch_stiffness=1e-9, shear_stiffness=0, bend_rigidity=0, damping_time=1e3),
             integrator=integrator,
             time_step=time_step,

@@ -37,7 +37,7 @@ def positions(env):
 
 
 def strains(x):
-    """Of the threads between neighbours, in float64 from positions alone, (..., threads)."""
+    """Of the threads between neighbors, in float64 from positions alone, (..., threads)."""
     x = x.reshape(*x.shape[:-2], ROWS, ROWS, 3)
     across, down = (np.linalg.norm(np.diff(x, axis=axis), axis=-1) / CELL - 1 for axis in (-2, -3))
     return np.concatenate([across.reshape(*x.shape[:-3], -1), down.reshape(*x.shape[:-3], -1)], axis=-1)

@@ -167,15 +167,15 @@ def test_core_lanes_of_different_fabrics(name, dtype):
     world = {"integrator": name, "colliders": solids, "anchors": [0], "dtype": dtype, "substeps": CORE_SUBSTEPS.get(name, 150)}
     world["contact"] = "sheet" if dtype == "float32" else "particles"  # which is compiled in half the time
     densities = np.linspace(0.12, 0.3, 17)
-    figures = {"gravity": densities[:, None] * (5, 0, -40)} if name == "projective_dynamics" else {"density": densities}
+    properties = {"gravity": densities[:, None] * (5, 0, -40)} if name == "projective_dynamics" else {"density": densities}
     batch = Simulation(mesh, num_envs=17, threads=1, **world)
-    batch.set_parameters(**figures)
+    batch.set_parameters(**properties)
     batch.reset(positions=positions)
     batch.step(20)
     assert not batch.diverged.any()
     for lane in (0, 9, 16):
         alone = Simulation(mesh, **world)
-        alone.set_parameters(**{figure: values[lane] for figure, values in figures.items()})
+        alone.set_parameters(**{figure: values[lane] for figure, values in properties.items()})
         alone.reset(positions=positions)
         alone.step(20)
         assert np.array_equal(alone.positions[0], batch.positions[lane])
@@ -191,7 +191,7 @@ def test_core_lanes_of_different_fabrics(name, dtype):
     ],
 )
 def test_lanes_that_bend_and_are_limited(name, bending, limit):
-    """Each lane has another start, so that it needs other sweeps and iterations than its neighbours; restored in mid-run, too."""
+    """Each lane has another start, so that it needs other sweeps and iterations than its neighbors; restored in mid-run, too."""
     mesh = grid(6, 6, 0.3, 0.3)
     world = {
         "integrator": name, "bending": bending, "strain_limit": limit, "anchors": [0],

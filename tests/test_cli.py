@@ -75,7 +75,7 @@ BY_NAME = {
     "view --policy .": "lacks config.json",
     "export ClothReech-v0 --out a.gif": "did you mean 'ClothReach-v0'?",
     "export patch --out a.fbx": "must end in",
-    "export patch --out a.glb --color strain": "meshes have the fabric's colour alone",
+    "export patch --out a.glb --color strain": "meshes have the fabric's color alone",
     "export patch --out a.gif --fps 100": "patch has 30 frames a second",
     "export ClothReach-v0 --out a.gif --fps 100": "ClothReach-v0 has 15 frames a second",
     "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",

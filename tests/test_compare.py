@@ -87,9 +87,9 @@ def test_costs_are_those_of_the_clock(monkeypatch):
     assert rows[0]["ns_per_element"] == pytest.approx(1e9 * 0.1 / (64 * 8 * 4 * len(TINY.mesh.springs.kind)))
 
 
-def coloured(picture, colour, apart=0.06):
+def colored(picture, color, apart=0.06):
     """Share of pixels with an integrator's hue, whatever the light is: chroma direction within ``apart`` radians and clear."""
-    wanted = np.array([int(colour[place : place + 2], 16) for place in (1, 3, 5)], float)
+    wanted = np.array([int(color[place : place + 2], 16) for place in (1, 3, 5)], float)
     chroma, aim = (a - a.mean(axis=-1, keepdims=True) for a in (picture[..., :3].astype(float), wanted))
     size = np.linalg.norm(chroma, axis=-1)
     along = chroma @ aim / (np.maximum(size, 1e-9) * np.linalg.norm(aim))
@@ -97,7 +97,7 @@ def coloured(picture, colour, apart=0.06):
 
 
 def test_the_picture_shows_each_stable_sheet(tiny):
-    """Panels in a row: the reference, then one of each integrator in its colour; the exploded one's room is empty."""
+    """Panels in a row: the reference, then one of each integrator in its color; the exploded one's room is empty."""
     from matplotlib import pyplot
 
     folder, _ = tiny
@@ -107,18 +107,18 @@ def test_the_picture_shows_each_stable_sheet(tiny):
     assert [np.mean(np.abs(p - panels[1]).max(axis=-1) > 20) > 0.05 for p in panels] == [True, False, True, True]
     for panel, owner in zip(panels, (None, None, "verlet", "xpbd")):
         seen = [
-            name for name in ("verlet", "xpbd", "implicit_euler", "rk4") if coloured(panel, compare_pictures.COLORS[name]) > 0.02
+            name for name in ("verlet", "xpbd", "implicit_euler", "rk4") if colored(panel, compare_pictures.COLORS[name]) > 0.02
         ]
         assert seen == ([owner] if owner else [])
 
 
 def test_the_plot_shows_each_line(tiny):
-    """A line of each integrator's colour is in the plot, and none of those that were not asked for."""
+    """A line of each integrator's color is in the plot, and none of those that were not asked for."""
     from matplotlib import pyplot
 
     folder, _ = tiny
     plot = 255 * pyplot.imread(folder / "work_precision.png")
-    found = {name for name, colour in compare_pictures.COLORS.items() if coloured(plot, colour, 0.03) > 1e-4}
+    found = {name for name, color in compare_pictures.COLORS.items() if colored(plot, color, 0.03) > 1e-4}
     assert {"verlet", "xpbd"} <= found and not found & {"rk4", "semi_implicit_euler", "projective_dynamics"}
 
 

@@ -1,4 +1,4 @@
-"""The drape: its reward, limits, observation and evaluation, against figures worked out here."""
+"""The drape: its reward, limits, observation and evaluation, against numbers worked out here."""
 
 import gymnasium as gym
 import numpy as np
@@ -11,7 +11,7 @@ from clothgym.envs.targets import Target, reference_coverage
 DRAPE = "clothgym:ClothDrape-v0"
 
 
-# --- the reward, the limits and what is seen, against figures made here --------------------------------------------------
+# --- the reward, the limits and what is seen, against numbers made here --------------------------------------------------
 
 
 def start(seed=3, **kwargs):
@@ -224,9 +224,9 @@ def laid(env, offset):
 
 def test_a_sheet_laid_on_the_target_succeeds_and_one_laid_beside_its_centre_does_not():
     env = gym.make(DRAPE)
-    centred, aside = laid(env, 0.0), laid(env, 0.25)
-    assert centred["is_success"] and centred["normalized_performance"] > 0.9
-    # what hangs over has no width: the centre of area comes nearer than it was laid
+    centered, aside = laid(env, 0.0), laid(env, 0.25)
+    assert centered["is_success"] and centered["normalized_performance"] > 0.9
+    # what hangs over has no width: the center of area comes nearer than it was laid
     assert 0.1 < aside["off_center"] < 0.25
     assert not aside["is_success"] and aside["normalized_performance"] < 0.8
 

@@ -1,4 +1,4 @@
-"""The drape with grippers: its fingers, potential, observation, starts and evaluation, against figures worked out here."""
+"""The drape with grippers: its fingers, potential, observation, starts and evaluation, against numbers worked out here."""
 
 from importlib import resources
 
@@ -41,7 +41,7 @@ def tips(env):
 
 
 def stretch(x):
-    """Of the threads between neighbours, length over rest length."""
+    """Of the threads between neighbors, length over rest length."""
     ends = x[..., SHEET.springs.particles[STRUCTURAL], :]
     return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1) * (ROWS - 1) / SIDE
 
@@ -248,7 +248,7 @@ def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():
     ("offset", "speed", "success"), [(0.0, 0.0, True), (0.0, 0.3, False), (0.13, 0.0, False), (0.09, 0.0, True)]
 )
 def test_success_asks_for_a_centred_sheet_at_rest(offset, speed, success):
-    """A flat sheet on a box, which is evaluated at once, without weight: at rest or not, centred or not."""
+    """A flat sheet on a box, which is evaluated at once, without weight: at rest or not, centered or not."""
     env, _ = start(options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.task
     env.step(np.zeros(8))

@@ -226,7 +226,7 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ({"colour": "red"}, "colour"),
+        ({"color": "red"}, "color"),
         ({"material": {"mass": 1}}, "mass"),
         ({"material": {"density": -1}}, "density"),
         ({"material": {"bend_rigidity": 0.1}}, "bend_rigidity"),
@@ -237,13 +237,13 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
 def test_bad_reset_options_are_named_and_leave_nothing_behind(env_id, options, name):
     env = make(env_id).unwrapped
     fresh, _ = env.reset(seed=0)
-    figures = env.task.simulation.parameters
+    properties = env.task.simulation.parameters
     env.reset(seed=1, options={"material": {"density": 0.3}})
     for _ in range(2):
         with pytest.raises(ValueError, match=name):
             env.reset(seed=0, options=options)
     again, _ = env.reset(seed=0)
-    assert np.array_equal(again, fresh) and np.array_equal(env.task.simulation.parameters, figures)
+    assert np.array_equal(again, fresh) and np.array_equal(env.task.simulation.parameters, properties)
 
 
 @every_id

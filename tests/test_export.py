@@ -183,7 +183,7 @@ def test_gif_keeps_frames_and_loops(tmp_path):
         assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - 80).max() <= 4
 
 
-def test_a_small_thing_keeps_its_colour_in_a_gif(tmp_path):
+def test_a_small_thing_keeps_its_color_in_a_gif(tmp_path):
     """A green dot on 0.02 % of a picture of greys and reds."""
     pytest.importorskip("PIL.Image")
     down, across = np.mgrid[:240, :240] / 240

@@ -30,7 +30,7 @@ def thrown(mesh, dtype, seed=0):
     return (*(np.ascontiguousarray(a.T[..., None].astype(dtype)) for a in (x, v)), np.zeros((3, mesh.num_particles, 1), dtype))
 
 
-def figures(dtype, rigidity=1e-3):
+def properties(dtype, rigidity=1e-3):
     return Elastic(STIFFNESS.astype(dtype)[:, None], np.full(1, rigidity, dtype), np.full(1, 2e-3, dtype))
 
 
@@ -40,7 +40,7 @@ def test_a_particle_gets_the_bits_of_a_plain_loop_over_the_springs(shape):
     mesh, real = grid(*shape, 0.3, 0.5), np.float32
     x, v, f = thrown(mesh, real)
     elements = grid_of(mesh, np.dtype(real), "springs")
-    add_grid_forces(x, v, f, elements, figures(real), room_for_forces(x, elements.offset))
+    add_grid_forces(x, v, f, elements, properties(real), room_for_forces(x, elements.offset))
     expected = np.zeros((3, mesh.num_particles), real)
     tau, one, columns = real(2e-3), real(1), shape[1]
     weights = dict(zip(map(tuple, np.sort(mesh.springs.particles, axis=1).tolist()), mesh.springs.weight))
@@ -64,7 +64,7 @@ def test_a_particle_gets_the_bits_of_a_plain_loop_over_the_springs(shape):
 def test_forces_and_products_are_those_of_lanes(shape, bending):
     mesh, real = grid(*shape, 0.3, 0.5), np.float64
     x, v, f = thrown(mesh, real)
-    elastic, bend = figures(real), np.full(1, 1e-3)
+    elastic, bend = properties(real), np.full(1, 1e-3)
     along, across = elastic.stiffness * 2, elastic.stiffness
     elements = grid_of(mesh, np.dtype(real), bending)
     scratch = room_for_forces(x, elements.offset)
@@ -105,22 +105,22 @@ def test_forces_leave_no_trace_in_their_scratch():
     x, v, f = thrown(mesh, np.float32)
     elements = grid_of(mesh, np.dtype(np.float32), "springs")
     scratch = room_for_forces(x, elements.offset)
-    add_grid_forces(x, v, f, elements, figures(np.float32), scratch)
+    add_grid_forces(x, v, f, elements, properties(np.float32), scratch)
     again = np.zeros_like(f)
-    add_grid_forces(x, v, again, elements, figures(np.float32), scratch)
+    add_grid_forces(x, v, again, elements, properties(np.float32), scratch)
     before = scratch.kinds.shape[2] - mesh.num_particles
     assert not scratch.kinds[:, :, :before].any()
     assert all(not scratch.kinds[:, a, before + mesh.num_particles - o :].any() for a, o in enumerate(elements.offset))
     assert np.array_equal(f.view(np.uint32), again.view(np.uint32))
 
 
-def test_springs_of_no_length_leave_their_neighbours_alone():
+def test_springs_of_no_length_leave_their_neighbors_alone():
     """Row ends that coincide are joined by springs without weight: no NaN may come of them."""
     mesh = grid(3, 4, 0.3, 0.3)
     x, v, f = thrown(mesh, np.float32)
     x[:, 4], x[:, 8] = x[:, 3], x[:, 7]
     elements = grid_of(mesh, np.dtype(np.float32), "springs")
-    add_grid_forces(x, v, f, elements, figures(np.float32), room_for_forces(x, elements.offset))
+    add_grid_forces(x, v, f, elements, properties(np.float32), room_for_forces(x, elements.offset))
     assert np.isfinite(f).all()
 
 

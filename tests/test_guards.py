@@ -1,4 +1,4 @@
-"""What keeps a simulation from going wrong unseen: divergence found in its very step, told, and kept from the neighbours."""
+"""What keeps a simulation from going wrong unseen: divergence found in its very step, told, and kept from the neighbors."""
 
 import warnings
 
@@ -21,7 +21,7 @@ def batch(num_envs=5, wild=2, factor=40.0, **kwargs):
 
 
 def gone_wrong(simulation):
-    """By its own look at what everybody can see: not finite, or faster than a kilometre a second."""
+    """By its own look at what everybody can see: not finite, or faster than a kilometer a second."""
     x, v = simulation.positions, simulation.velocities
     with np.errstate(invalid="ignore"):
         return ~(np.isfinite(x).all(axis=(1, 2)) & (np.abs(v) < 1e3).all(axis=(1, 2)))
@@ -77,7 +77,7 @@ def test_a_wrong_word_for_what_to_do_lists_the_right_ones():
 
 
 @pytest.mark.parametrize("integrator", ["semi_implicit_euler", "explicit_euler"])
-def test_neighbours_of_a_diverged_environment_keep_their_bits(integrator):
+def test_neighbors_of_a_diverged_environment_keep_their_bits(integrator):
     """The others of the batch, against a batch in which nothing goes wrong."""
     kwargs = {"integrator": integrator, "on_divergence": "ignore", "colliders": [Plane(point=(0, 0, -0.1))]}
     with_one, without = batch(factor=1000.0, **kwargs), batch(wild=None, **kwargs)
@@ -171,7 +171,7 @@ def test_a_sheet_may_begin_folded_on_itself(name):
 
 
 def test_forces_that_are_not_finite_are_seen_through_conjugate_gradients():
-    """Alone: in a batch a neighbour's iterations would carry them on."""
+    """Alone: in a batch a neighbor's iterations would carry them on."""
     simulation = Simulation(MESH, integrator="implicit_euler", anchors=[0], on_divergence="ignore")
     simulation._fabric.stiffness[:] = np.nan
     simulation.step()

@@ -20,7 +20,7 @@ def simulation(**kwargs):
 
 
 def gripper(particle, **kwargs):
-    """A gripper that begins at a particle's place at rest; neighbours are 0.05 m apart."""
+    """A gripper that begins at a particle's place at rest; neighbors are 0.05 m apart."""
     return Gripper(position=tuple(REST[particle]), **kwargs)
 
 

@@ -67,13 +67,13 @@ def test_another_method_s_option_is_ignored_with_a_warning():
 
 @pytest.mark.parametrize("figure", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"])
 def test_projective_dynamics_refuses_figures_that_differ(figure):
-    """One matrix for all: a figure may change for all environments, and then it does."""
+    """One matrix for all: a property may change for all environments, and then it does."""
     simulation = Simulation(SHEET, num_envs=3, integrator="projective_dynamics", anchors=[0], substeps=40, dtype="float64")
     simulation.step()
-    before, figures = simulation.positions, simulation.parameters
+    before, properties = simulation.positions, simulation.parameters
     with pytest.raises(ValueError, match=f"factorizes one matrix for all environments: {figure} cannot differ between them"):
         simulation.set_parameters(envs=[1], **{figure: 1.5 * getattr(simulation.material, figure)})
-    assert np.array_equal(simulation.parameters, figures)
+    assert np.array_equal(simulation.parameters, properties)
     changed = {figure: 1.5 * getattr(simulation.material, figure)}
     simulation.set_parameters(**changed)
     simulation.reset()

@@ -81,7 +81,7 @@ def test_two_triangles_with_a_common_edge(d, expected):
     assert count_intersections([(0, 1, 2), (1, 0, 3)], x).tolist() == [expected]
 
 
-def test_a_cell_folded_onto_its_neighbour():
+def test_a_cell_folded_onto_its_neighbor():
     # 4 triangles with a mirrored diagonal: two lie on their images, and each touches along the diagonal the other's
     mesh = grid(2, 3, 2, 1)
     folded = mesh.rest_positions * (1, 1, 1)

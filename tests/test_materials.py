@@ -31,7 +31,7 @@ def test_a_preset_s_figures_are_those_of_its_source(name):
 
 
 def test_the_fabrics_that_tasks_rest_on_stay_as_they_are():
-    """Figures as they were when the tasks were defined."""
+    """Properties as they were when the tasks were defined."""
     cotton, knit = Material.preset("cotton"), Material.preset("knit")
     assert (cotton.density, cotton.stretch_stiffness, cotton.shear_stiffness, cotton.bend_rigidity) == (0.1503, 261.1, 105, 2.34e-6)
     assert (knit.density, knit.stretch_stiffness, knit.shear_stiffness, knit.bend_rigidity) == (0.1782, 24.93, 11.64, 2.25e-7)

@@ -29,15 +29,15 @@ def test_areas_and_triangles_cover_the_sheet():
     assert normals[:, 2].sum() / 2 == pytest.approx(0.28, rel=1e-12)
 
 
-def test_no_two_springs_of_a_colour_share_a_particle():
+def test_no_two_springs_of_a_color_share_a_particle():
     springs = grid(6, 7, 1, 1).springs.particles
-    # colours are runs: a run ends where a particle comes back
+    # colors are runs: a run ends where a particle comes back
     seen, runs = set(), 1
     for a, b in springs.tolist():
         if a in seen or b in seen:
             seen, runs = set(), runs + 1
         seen |= {a, b}
-    assert runs <= 2 * 12  # greedy colouring of a graph of degree 12
+    assert runs <= 2 * 12  # greedy coloring of a graph of degree 12
 
 
 def test_the_mesh_cannot_be_changed():
@@ -90,7 +90,7 @@ def test_bend_springs_store_the_plate_s_energy_at_two_spacings():
     rigidity, spacing = 1e-4, 0.05
     k = spring_stiffness(mesh, np.array(300.0), np.array(0.0), np.array(rigidity))
     radius = 2 * spacing
-    chord = 2 * spacing * np.cos(spacing / radius / 2)  # between next but one neighbours
+    chord = 2 * spacing * np.cos(spacing / radius / 2)  # between next but one neighbors
     energy = k[BEND_X + 1] * (2 * spacing - chord) ** 2 / 2 / (spacing * 0.05)
     assert energy == pytest.approx(rigidity / radius**2 / 2, rel=0.03)
 

@@ -138,7 +138,7 @@ def test_places_in_a_batch():
     assert np.array_equal(simulation.positions, after)
 
 
-def test_diverged_neighbour_does_no_harm():
+def test_diverged_neighbor_does_no_harm():
     vertices, triangles = box_mesh()
     simulation = Simulation(
         grid(3, 3, 0.1, 0.1), num_envs=2, on_divergence="ignore", colliders=[MeshCollider(vertices=vertices, triangles=triangles)]

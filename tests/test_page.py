@@ -181,7 +181,7 @@ def test_the_most_strained_thread_that_the_page_names_is_the_cores(visitor):
     visitor.tab.get_by_text("play / pause").click()
 
 
-def test_menus_switch_the_integrator_and_the_colours(visitor):
+def test_menus_switch_the_integrator_and_the_colors(visitor):
     visitor.choose("integrator", "verlet")
     visitor.until(lambda: visitor.stage.sheets[0].simulation.integrator.name == "verlet")
     visitor.tab.get_by_text("verlet", exact=True).first.wait_for(timeout=1e3 * DEADLINE)

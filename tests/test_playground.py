@@ -70,7 +70,7 @@ def test_readings_are_those_of_the_positions():
     assert pull[2] == pytest.approx(-9.81 * mass.sum(), rel=0.02)
 
 
-def test_colours_by_strain_are_loudest_where_the_test_finds_the_most_strained_springs():
+def test_colors_by_strain_are_loudest_where_the_test_finds_the_most_strained_springs():
     stage = advanced(SceneStage("patch", Settings(fabric="knit", air_drag=0.75)), 60)
     mesh, x = stage.scene.mesh, stage.frame.positions[0]
     springs = yarns(mesh)
@@ -92,7 +92,7 @@ def test_colours_by_strain_are_loudest_where_the_test_finds_the_most_strained_sp
     assert f"| {i} to {j} |" in visitor.controls["readings"].content
 
 
-def test_the_colours_of_pushed_idle_and_loaded_springs_are_the_scales():
+def test_the_colors_of_pushed_idle_and_loaded_springs_are_the_scales():
     assert np.array_equal(ramp(np.array([-2.0, 0.0, 1.0, 7.0])), RAMP[[0, 1, -1, -1]].astype(np.uint8))
 
 

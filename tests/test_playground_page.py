@@ -162,7 +162,7 @@ def test_plots_end_where_the_frames_do_after_a_reset_and_in_another_scene(monkey
     assert spans() == {(0.0, 2.0)}
 
 
-def test_comparison_has_a_sheet_and_a_colour_for_each():
+def test_comparison_has_a_sheet_and_a_color_for_each():
     visitor, client = page()
     visitor.controls["compared 1"].value = "verlet"
     visitor.controls["compare"].turn(True)
@@ -170,8 +170,8 @@ def test_comparison_has_a_sheet_and_a_colour_for_each():
     assert [sheet.name for sheet in visitor.stage.sheets] == ["semi_implicit_euler", "verlet"]
     visitor.controls["show"].turn("fabric")
     visitor.tick()
-    colours = [client.scene.handles[f"/sheet{k}/front"].color for k in range(2)]
-    assert len(set(colours)) == 2 and not visitor.controls["integrator"].visible
+    colors = [client.scene.handles[f"/sheet{k}/front"].color for k in range(2)]
+    assert len(set(colors)) == 2 and not visitor.controls["integrator"].visible
     visitor.controls["compare"].turn(False)
     visitor.tick()
     assert len(visitor.stage.sheets) == 1
@@ -228,7 +228,7 @@ def test_files_hold_what_was_shown(tmp_path):
     assert len(Recording.load(tmp_path / "flag.npz").frames) == 4
 
 
-def test_a_saved_picture_has_the_colours_that_are_shown():
+def test_a_saved_picture_has_the_colors_that_are_shown():
     iio = pytest.importorskip("imageio.v3")
     stage = advanced(SceneStage("patch", Settings(fabric="knit", gravity=9.81), compared=("semi_implicit_euler", "xpbd")), 10)
     camera = NullClient().camera

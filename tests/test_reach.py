@@ -1,4 +1,4 @@
-"""The reach: its reward, limits, observation and evaluation, against figures worked out here."""
+"""The reach: its reward, limits, observation and evaluation, against numbers worked out here."""
 
 import gymnasium as gym
 import numpy as np
@@ -249,7 +249,7 @@ def test_the_expert_succeeds_from_every_start():
 
 
 def test_who_never_moves_scores_nothing():
-    """But for the centimetre by which the ripple moves the corner, perhaps towards the goal."""
+    """But for the centimeter by which the ripple moves the corner, perhaps towards the goal."""
     info = play(lambda env: np.zeros((20, 3)), seed=0)
     env = gym.make_vec(REACH, num_envs=20)
     env.reset(seed=0)

@@ -160,7 +160,7 @@ def test_cloth_resting_on_a_solid_hides_it():
 
 
 def test_smooth_cloth_is_lifted_out_of_solids():
-    """A few millimetres inside: onto the surface, along its normal; deep inside or outside: left alone."""
+    """A few millimeters inside: onto the surface, along its normal; deep inside or outside: left alone."""
     half, yaw, lift = (0.1, 0.2, 0.3), math.pi / 2, 0.004
 
     def pushed(point, half, radius):

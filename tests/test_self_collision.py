@@ -36,13 +36,13 @@ def test_the_tree_finds_all_pairs_of_leaves_once(mesh, far):
     number = far_leaves(pairs, far, balls, boxes, hulls, found)
     wide = extra[pairs.corners].max(axis=1)
     low, high = x[pairs.corners].min(axis=1) - wide[:, None], x[pairs.corners].max(axis=1) + wide[:, None]
-    centre = x[pairs.corners].mean(axis=1)
-    radius = np.linalg.norm(x[pairs.corners] - centre[:, None], axis=2).max(axis=1) + wide
+    center = x[pairs.corners].mean(axis=1)
+    radius = np.linalg.norm(x[pairs.corners] - center[:, None], axis=2).max(axis=1) + wide
     expected = {
         (a, b) for a in range(leaves) for b in range(a + 1, leaves)
         if not set(pairs.corners[a]) & set(pairs.corners[b])
         and np.all(low[a] <= high[b] + far) and np.all(low[b] <= high[a] + far)
-        and np.linalg.norm(centre[a] - centre[b]) <= radius[a] + radius[b] + far
+        and np.linalg.norm(center[a] - center[b]) <= radius[a] + radius[b] + far
     }  # fmt: skip
     assert number == len(expected)
     assert {tuple(pair) for pair in found[:number].tolist()} == expected

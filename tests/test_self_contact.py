@@ -220,7 +220,7 @@ def test_a_sheet_too_far_from_the_origin_is_reported():
     clothgym.Simulation(sheet(), self_collision="strict", dtype="float64").reset(positions=far)
 
 
-def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbours():
+def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbors():
     mesh = sheet(9)
     x = np.stack([three_layers(mesh, 0.03)] * 3)
     v = np.zeros_like(x)

@@ -1,4 +1,4 @@
-"""Floor 6: what colour and light say, against light and colours worked out by hand."""
+"""Floor 6: what color and light say, against light and colors worked out by hand."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def red_over_blue(image):
 
 
 @pytest.mark.parametrize("smooth", [False, True])
-def test_front_and_back_differ_in_colour(smooth):
+def test_front_and_back_differ_in_color(smooth):
     draw = renderer(FACING, smooth=smooth, front=(200, 40, 40), back=(40, 40, 200))
     front = upright()
     back = front * (-1, 1, 1)
@@ -41,7 +41,7 @@ def test_pattern_follows_the_material():
 
 
 def test_threads_lie_over_and_under_each_other():
-    """Where a coloured stripe crosses a light one, up close, threads of the one and of the other alternate both ways."""
+    """Where a colored stripe crosses a light one, up close, threads of the one and of the other alternate both ways."""
     near = Camera(eye=(0, -0.1, 0.5), target=(0, 0, 0.5), vertical_fov=60)
     image = renderer(near, width=200, height=200, check=SIDE / 12, front=(200, 40, 40)).rgb(upright()).astype(float)
     # the picture shows 0.1155 m: a stripe is 86.6 pixels wide, and has 20 threads of 4.3
@@ -79,7 +79,7 @@ def linear(image):
 
 
 def test_a_touching_sheet_darkens_the_floor_at_its_edge_and_a_floating_one_does_not():
-    """The contact shadow falls off within centimetres, on the side of the lamp as well, where no cast shadow lies."""
+    """The contact shadow falls off within centimeters, on the side of the lamp as well, where no cast shadow lies."""
     draw = renderer(Camera(eye=(0, 0, 2.5), target=(0, 0, 0), up=(0, 1, 0)), width=240, height=240)
     empty = linear(draw.rgb(FAR_AWAY)).sum(axis=2)
     half = 2.5 * math.tan(math.radians(35) / 2)  # of what is seen [m]
@@ -137,7 +137,7 @@ def test_edges_are_antialiased():
     np.testing.assert_allclose(smooth.mean(), jagged.mean(), rtol=0.01)
 
 
-def test_the_most_strained_place_has_the_colour_that_says_so():
+def test_the_most_strained_place_has_the_color_that_says_so():
     """A level sheet that is stretched more and more towards its middle column, seen from straight above under an even light."""
     matplotlib = pytest.importorskip("matplotlib")
     n = 17
@@ -157,7 +157,7 @@ def test_the_most_strained_place_has_the_colour_that_says_so():
         white = linear(draw.rgb(x, values=np.zeros(n * n)))
         for column in (8, 5, 2):
             pixel = round(200 + x[column, 0] * 200.5 / (2 * math.tan(math.radians(10))))
-            # the same light falls on both pictures: their quotient is that of the two colours
+            # the same light falls on both pictures: their quotient is that of the two colors
             share = min(of_columns[column] / full, 1)
             hot, cold = (decoded(255 * np.array(magma((248 - 192 * part) / 255)[:3])) for part in (share, 0))
             np.testing.assert_allclose(light[200, pixel] / white[200, pixel], hot / cold, atol=0.04)
@@ -176,7 +176,7 @@ def test_heat_is_magma():
             heat_colors(**wrong)
 
 
-def test_markers_are_spheres_of_their_colour():
+def test_markers_are_spheres_of_their_color():
     draw = renderer(FACING, width=121, height=121)
     image = draw.rgb(FAR_AWAY, (), [((0, 0, 0.5), (20, 200, 20))])
     assert image[60, 60, 1] > 1.5 * image[60, 60, 0]

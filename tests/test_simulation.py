@@ -131,7 +131,7 @@ def test_stiffness_beyond_the_bound_warns_when_it_is_set():
         s.set_parameters([1], stretch_stiffness=261e3)
 
 
-def test_a_diverging_lane_leaves_its_neighbours_bits_alone():
+def test_a_diverging_lane_leaves_its_neighbors_bits_alone():
     s, calm = (simulation(num_envs=3, on_divergence="ignore") for _ in range(2))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -74,7 +74,7 @@ def test_implicit_euler_s_tolerance_bounds_what_its_solver_leaves():
 
 @pytest.mark.parametrize("h", [5e-3, 1e-2])
 def test_a_hanging_chain_of_one_xpbd_pass_is_as_soft_as_its_formula(h):
-    """A spring of the second colour leaves a substep at T/k; one of the first is then drawn longer by its neighbours'
+    """A spring of the second color leaves a substep at T/k; one of the first is then drawn longer by its neighbors'
     corrections, h^2 T/m each."""
     softer = TENSION / K
     for first in range(0, LINKS, 2):

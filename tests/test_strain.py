@@ -1,4 +1,4 @@
-"""The strain task: its costs, tension, way, reward, limits and observation, against figures worked out here."""
+"""The strain task: its costs, tension, way, reward, limits and observation, against numbers worked out here."""
 
 from dataclasses import replace
 

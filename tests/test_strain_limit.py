@@ -89,7 +89,7 @@ def test_limiting_a_free_sheet_keeps_its_momentum():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sweep_is_not_enough_and_more_are_reported(seed):
-    """Each correction stretches the neighbours: sweeps go on until the largest strain of threads and diagonals, worked out here
+    """Each correction stretches the neighbors: sweeps go on until the largest strain of threads and diagonals, worked out here
     from the positions, is within the tolerance."""
     mesh, x, v, w = stretched(seed)
     x[[0, 5]] = mesh.rest_positions[[0, 5]]

@@ -9,7 +9,7 @@ from clothgym import Box, Capsule, Gripper, Material, MeshCollider, Plane, Simul
 COTTON = Material.preset("cotton", air_drag=0.2)
 AXIS = (1, 0.3, 0)
 CHAIR, BOWL = chair(), bowl()
-# a solid, its distance, the height of its top above its centre, and its size [m]
+# a solid, its distance, the height of its top above its center, and its size [m]
 SOLIDS = {
     "sphere": (Sphere(radius=0.12, friction=0.5), lambda x: sphere_distance(x, 0.12), 0.12, 0.24),
     "capsule": (
@@ -86,13 +86,13 @@ def test_small_sphere_does_not_come_through_between_particles(lift):
     simulation = Simulation(mesh, COTTON, anchors=[np.flatnonzero(at)], colliders=[ball], gravity=(0, 0, 0))
     simulation.step(8)
     x = simulation.positions[0]
-    centre = simulation.collider_positions[0, 0]
-    assert centre[2] == pytest.approx(-0.02 + 0.5 * 8 / 60, abs=1e-4)
+    center = simulation.collider_positions[0, 0]
+    assert center[2] == pytest.approx(-0.02 + 0.5 * 8 / 60, abs=1e-4)
     # it presses into a taut sheet: what lies deeper than it moved in a substep is taken back gently
-    assert depth(x, mesh.triangles, lambda p: sphere_distance(p - centre, 0.01)) < 0.1 * 0.02
+    assert depth(x, mesh.triangles, lambda p: sphere_distance(p - center, 0.01)) < 0.1 * 0.02
     # the sheet is above the ball, not around it
-    near = np.linalg.norm(x[:, :2] - centre[:2], axis=1) < 0.05
-    assert x[near, 2].max() > centre[2]
+    near = np.linalg.norm(x[:, :2] - center[:2], axis=1) < 0.05
+    assert x[near, 2].max() > center[2]
 
 
 def test_box_edge_does_not_come_through_between_particles():
@@ -103,17 +103,17 @@ def test_box_edge_does_not_come_through_between_particles():
     box = Box(center=(0.02, 0, -0.06), half_sides=(0.03, 0.3, 0.03), rotation=quarter, velocity=(0, 0, 0.5))
     simulation = Simulation(mesh, COTTON, anchors=[held], colliders=[box], gravity=(0, 0, 0))
     simulation.step(8)
-    centre = simulation.collider_positions[0, 0]
+    center = simulation.collider_positions[0, 0]
     turn = rotation(*quarter)
-    assert depth(simulation.positions[0], mesh.triangles, lambda p: box_distance(p - centre, 0.03, turn)) < 0.01 * 0.06
-    assert simulation.positions[0, :, 2].max() > centre[2] + 0.03
+    assert depth(simulation.positions[0], mesh.triangles, lambda p: box_distance(p - center, 0.03, turn)) < 0.01 * 0.06
+    assert simulation.positions[0, :, 2].max() > center[2] + 0.03
 
 
 def test_penetration_is_that_of_the_surface():
     """Corners around a small ball: no particle is in it, the triangle is, by its radius; and particles in a plane."""
     mesh = grid(2, 2, 0.2, 0.2)
-    for centre, expected in (((0.05, -0.04, 0.004), 0.006), ((0.05, -0.04, 0.3), 0.0)):
-        simulation = Simulation(mesh, num_envs=3, colliders=[Sphere(center=centre, radius=0.01)], dtype="float64")
+    for center, expected in (((0.05, -0.04, 0.004), 0.006), ((0.05, -0.04, 0.3), 0.0)):
+        simulation = Simulation(mesh, num_envs=3, colliders=[Sphere(center=center, radius=0.01)], dtype="float64")
         assert simulation.contacts().distance.min() > 0.01
         assert simulation.penetration() == pytest.approx(np.full(3, expected), abs=1e-9)
     simulation = Simulation(mesh, colliders=[Plane(point=(0, 0, 0.02), normal=(1, 0, 1))], dtype="float64")

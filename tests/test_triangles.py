@@ -203,13 +203,13 @@ CASES += [(name, "quadratic") for name in ("semi_implicit_euler", "projective_dy
 @pytest.mark.parametrize(("integrator", "bending"), CASES)
 @pytest.mark.filterwarnings("ignore:.*too few for:UserWarning")
 def test_a_loaded_sheet_falls_as_all_things_do(loaded, integrator, bending):
-    """Momentum m (v + g t) to rounding; the centre v t + g t^2/2, or a first-order method's g t (t + h)/2, or between."""
+    """Momentum m (v + g t) to rounding; the center v t + g t^2/2, or a first-order method's g t (t + h)/2, or between."""
     s = free_sheet(loaded, integrator, bending)
     mass = 1 / s.get_state().free_inverse_mass[0]
-    centre = mass @ s.positions[0] / mass.sum()
+    center = mass @ s.positions[0] / mass.sum()
     s.step(6)
     t, h = 6 / 120, 1 / 960
-    fallen = mass @ s.positions[0] / mass.sum() - centre
+    fallen = mass @ s.positions[0] / mass.sum() - center
     np.testing.assert_allclose(mass @ s.velocities[0] / mass.sum(), (0.3, -0.2, 0.1 - G * t), atol=1e-9)
     np.testing.assert_allclose(fallen[:2], (0.3 * t, -0.2 * t), atol=1e-9)
     assert abs(fallen[2] - (0.1 * t - G * t * t / 2)) <= G * t * h / 2 + 1e-9

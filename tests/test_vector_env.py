@@ -60,7 +60,7 @@ def test_same_step_mode_gives_the_last_observation_in_info(env_id):
 
 
 def assert_infos_agree(info, expected):
-    """Gymnasium's info against ours: its keys and masks, and the figures where a mask says that they are meant."""
+    """Gymnasium's info against ours: its keys and masks, and the properties where a mask says that they are meant."""
     for key, value in expected.items():
         if key.startswith("_"):
             continue

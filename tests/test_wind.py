@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym import INTEGRATORS, Material, Simulation, State, Wind, grid
-from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, coloured_hinges
+from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
 from clothgym.registration import ENVIRONMENTS
 
 NAMES = list(INTEGRATORS)
@@ -35,9 +35,9 @@ def accelerated(mesh, positions, velocities, wind, air_density, material, h=1e-6
     return (s.velocities[0] - before) / s.get_state().free_inverse_mass[0][:, None] / h
 
 
-def air(mesh, positions, velocities, wind, air_density=RHO, **figures):
+def air(mesh, positions, velocities, wind, air_density=RHO, **properties):
     """Force of the air on each particle [N]: what is there with air, less what is there without."""
-    with_air, without = Material(**figures), Material(**{**figures, "air_drag": 0.0})
+    with_air, without = Material(**properties), Material(**{**properties, "air_drag": 0.0})
     args = (mesh, positions, np.broadcast_to(velocities, positions.shape), wind)
     return accelerated(*args, air_density, with_air) - accelerated(*args, 0.0, without)
 
@@ -54,7 +54,7 @@ def one_triangle():
     length = np.linalg.norm(positions[1] - positions[0], keepdims=True)
     springs = Springs(ends, length, np.array([STRUCTURAL_X], np.int32), np.ones(1))
     triangles = np.array([[0, 1, 2]], np.int32)
-    return ClothMesh((1.0, 1.0), positions, springs, triangles, np.full(3, 0.003), coloured_hinges(positions, triangles))
+    return ClothMesh((1.0, 1.0), positions, springs, triangles, np.full(3, 0.003), colored_hinges(positions, triangles))
 
 
 # --- the force ------------------------------------------------------------------------------------------------------------
@@ -70,17 +70,17 @@ def test_one_triangle_feels_the_formula_s_force_shared_by_its_corners(seed):
     assert force == pytest.approx(np.tile(expected / 3, (3, 1)), rel=1e-5, abs=1e-9)
 
 
-@pytest.mark.parametrize("figures", [{}, {"drag_coefficient": 0.7, "skin_friction": 0.1}, {"drag_coefficient": 0.0}])
+@pytest.mark.parametrize("properties", [{}, {"drag_coefficient": 0.7, "skin_friction": 0.1}, {"drag_coefficient": 0.0}])
 @pytest.mark.parametrize("density", [1.2, 0.4])
-def test_a_crumpled_sheet_feels_the_sum_over_its_triangles(figures, density):
+def test_a_crumpled_sheet_feels_the_sum_over_its_triangles(properties, density):
     rng = np.random.default_rng(1)
     x = tilted(0.4) + rng.normal(scale=0.005, size=(SHEET.num_particles, 3))
     velocity, wind = np.array([0.3, -1.0, 0.5]), np.array([2.0, 0.7, -0.4])
     expected = sum(
-        formula(x[t], velocity, wind, density, figures.get("drag_coefficient", CD), figures.get("skin_friction", CF))
+        formula(x[t], velocity, wind, density, properties.get("drag_coefficient", CD), properties.get("skin_friction", CF))
         for t in SHEET.triangles
     )
-    force = air(SHEET, x, velocity, wind, air_density=density, **figures).sum(axis=0)
+    force = air(SHEET, x, velocity, wind, air_density=density, **properties).sum(axis=0)
     assert force == pytest.approx(expected, rel=1e-5)
 
 
@@ -207,7 +207,7 @@ def test_gusts_have_the_mean_the_strength_and_the_memory_that_they_are_said_to_h
     for k, expected in ((1, np.exp(-time_step / gust_time)), (lag, np.exp(-1)), (3 * lag, np.exp(-3))):
         correlation = np.mean(gusts[:-k] * gusts[k:], axis=0) / gust**2
         assert correlation == pytest.approx([expected] * 3, abs=0.03)
-    # the components know nothing of each other, and the figures are a normal distribution's
+    # the components know nothing of each other, and the properties are a normal distribution's
     assert np.corrcoef(gusts.T) == pytest.approx(np.eye(3), abs=0.03)
     assert np.mean(np.abs(gusts) < gust) == pytest.approx(0.6827, abs=0.01)
 
@@ -243,10 +243,10 @@ BAD_WINDS = [
 ]
 
 
-@pytest.mark.parametrize(("figures", "name"), BAD_WINDS)
-def test_bad_winds_are_named(figures, name):
+@pytest.mark.parametrize(("properties", "name"), BAD_WINDS)
+def test_bad_winds_are_named(properties, name):
     with pytest.raises(ValueError, match=name):
-        Wind(**figures)
+        Wind(**properties)
 
 
 # --- in environments ------------------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """PPO with a Lagrange multiplier: dual ascent on the price of a step that breaks the constraint.
 
-The learner maximises ``return - multiplier * cost``; after each rollout the multiplier moves by ``rate * (J - limit)`` with the
+The learner maximizes ``return - multiplier * cost``; after each rollout the multiplier moves by ``rate * (J - limit)`` with the
 mean cost J of the episodes that ended in it, by no more than that of an excess of ``CLIP``, and never below zero (Ray, Achiam and
 Amodei 2019, Benchmarking Safe Exploration, "PPO-Lagrangian", here without a critic of the cost's own).  The price is the
 environment's own ``cost_penalty``.

@@ -34,7 +34,7 @@ from clothgym._jit import disjoint, kernel
 from clothgym.elements import Scratch, room_for_forces
 from clothgym.forces import Oscillators
 
-Figures = frozenset[str]
+Properties = frozenset[str]
 
 
 class Work(NamedTuple):
@@ -102,8 +102,8 @@ class Integrator:
     fields: int = 1
     multipliers: bool = False
     prepare: Callable[[Preparation], tuple[NDArray, ...]] | None = None
-    shared: Figures = frozenset()
-    ignored: Figures = frozenset()
+    shared: Properties = frozenset()
+    ignored: Properties = frozenset()
     limits_strain: bool = False
 
     def automatic_substeps(self, time_step: float, largest: float) -> int:

@@ -34,7 +34,7 @@ Case = tuple[str, Callable[[], list[Row]]]  # what is measured, and its rows
 
 
 def machine() -> Row:
-    """What the figures were taken on."""
+    """The machine and the versions."""
     name = platform.processor() or platform.machine()
     if os.path.exists("/proc/cpuinfo"):
         with open("/proc/cpuinfo") as file:
@@ -66,7 +66,7 @@ def seconds_per_call(call: Callable[[], object], budget: float = 0.5) -> float:
 
 
 def core_cases(quick: bool) -> Iterator[Case]:
-    """A sheet of a metre, hanging from two corners in air at 60 Hz, with automatic substeps."""
+    """A sheet of a meter, hanging from two corners in air at 60 Hz, with automatic substeps."""
     for integrator in INTEGRATORS:
         for side in (17, 25) if quick else (13, 17, 25, 35, 50):
             for num_envs in (1, 64) if quick else (1, 16, 64, 256):

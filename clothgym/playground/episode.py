@@ -16,8 +16,7 @@ from clothgym.envs.episode import within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stability, visible
-from clothgym.playground.world import FIGURES as SLIDERS
-from clothgym.playground.world import Settings
+from clothgym.playground.world import SLIDERS, Settings
 from clothgym.registration import checked_id
 from clothgym.render.solids import drawn
 from clothgym.simulation import Simulation

@@ -16,7 +16,7 @@ from clothgym.checks import positive
 from clothgym.collisions import MeshCollider
 from clothgym.material import spring_stiffness
 from clothgym.mesh import SHEAR, ClothMesh, Hinges, Springs, frozen
-from clothgym.parameters import FIGURES
+from clothgym.parameters import PROPERTIES
 from clothgym.render import Camera, Drawn
 from clothgym.render.solids import KINDS
 from clothgym.simulation import Simulation
@@ -74,9 +74,9 @@ def touching(simulation: Simulation) -> NDArray[np.bool_]:
 
 def stiffness(simulation: Simulation) -> NDArray[np.float64]:
     """Of its first sheet's springs by kind [N/m], (kinds,); bending springs only if hinges do not bend the sheet."""
-    figures = dict(zip(FIGURES, simulation.parameters[0]))
-    bend = 0.0 if simulation.bending.hinged else figures["bend_rigidity"]
-    moduli = (figures["stretch_stiffness"], figures["shear_stiffness"], bend)
+    properties = dict(zip(PROPERTIES, simulation.parameters[0]))
+    bend = 0.0 if simulation.bending.hinged else properties["bend_rigidity"]
+    moduli = (properties["stretch_stiffness"], properties["shear_stiffness"], bend)
     return spring_stiffness(simulation.mesh, *(np.array(modulus) for modulus in moduli))
 
 

@@ -139,7 +139,7 @@ def flag() -> Scene:
     )
 
 
-def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, colour: tuple[int, int, int], top: float) -> Scene:
+def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, color: tuple[int, int, int], top: float) -> Scene:
     """A sheet that falls onto a solid; its corners can be dragged."""
     mesh = grid(25, 25, 0.9, 0.9)
     return Scene(
@@ -153,7 +153,7 @@ def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, colour
         names=("corner 1", "corner 2", "corner 3", "corner 4"),
         handles=(0, 1, 2, 3),
         colliders=(Plane(), solid),
-        colours={1: colour},
+        colors={1: color},
         camera=Camera(eye=(1.25, -1.4, 0.95), target=(0.0, 0.0, 0.2)),
         strained=0.03,
     )
@@ -201,7 +201,7 @@ def cape() -> Scene:
             Capsule(center=tuple(place + TORSO), radius=0.14, height=1.18),
             Sphere(center=tuple(place + HEAD), radius=0.105),
         ),
-        colours={1: STEEL, 2: (222, 190, 164)},
+        colors={1: STEEL, 2: (222, 190, 164)},
         motion=wear_the_cape,
         camera=Camera(eye=(-1.0, -3.1, 1.6), target=(0.0, 0.0, 0.66)),
         strained=0.05,

@@ -15,7 +15,7 @@ from clothgym.checks import indices, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.guards import refusal
 from clothgym.lab.compare import BURST
-from clothgym.parameters import FIGURES, of_material
+from clothgym.parameters import PROPERTIES, of_material
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.scenes import scene_named
 from clothgym.playground.world import FRAME, Scene, Settings, Targets, begin, drive
@@ -314,8 +314,8 @@ class SceneStage(Stage):
         made = []
         for sheet in self.sheets:
             name = sheet.name if self.compared else after.integrator
-            figures = changed_figures(before, after)
-            ignored = figures & integrators.get(name).ignored
+            properties = changed_properties(before, after)
+            ignored = properties & integrators.get(name).ignored
             if ignored:
                 self.notes["ignored"] = refusal(integrators.get(name), sorted(ignored)[0]).capitalize() + "."
             if rebuilt or ignored:
@@ -382,19 +382,19 @@ def own(settings: Settings, integrator: str, limited: bool) -> Settings:
 # --- changing a simulation ----------------------------------------------------------------------------------------------
 
 
-def changed_figures(before: Settings, after: Settings) -> set[str]:
+def changed_properties(before: Settings, after: Settings) -> set[str]:
     """Properties of the fabric in which two settings differ."""
-    pairs = zip(FIGURES, of_material(before.material), of_material(after.material))
+    pairs = zip(PROPERTIES, of_material(before.material), of_material(after.material))
     return {name for name, old, new in pairs if old != new}
 
 
 def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> str:
     """Change a running simulation in place.  Returns a sentence if its substeps stay since there is no bound, else ""."""
-    figures: dict[str, Any] = {name: getattr(after.material, name) for name in changed_figures(before, after)}
+    properties: dict[str, Any] = {name: getattr(after.material, name) for name in changed_properties(before, after)}
     if after.gravity != before.gravity:
-        figures["gravity"] = (0, 0, -after.gravity)
-    if figures:
-        simulation.set_parameters(warn=False, **figures)
+        properties["gravity"] = (0, 0, -after.gravity)
+    if properties:
+        simulation.set_parameters(warn=False, **properties)
     if after.friction != before.friction:
         state = simulation.get_state()
         state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction

@@ -18,12 +18,12 @@ from clothgym.limiting import checked_limit
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.render import Camera, Drawn
-from clothgym.render.solids import WARM_GREY, drawn
+from clothgym.render.solids import WARM_GRAY, drawn
 from clothgym.simulation import GRAVITY, Simulation
 
 FRAME = 1 / 60  # control step [s]
 Vector = tuple[float, float, float]
-FIGURES = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
+SLIDERS = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,14 +69,14 @@ class Settings:
         if self.substeps != "auto":
             count("substeps", self.substeps, "'auto' or ")
         fabric = Material.preset(self.fabric)
-        for name in FIGURES:
+        for name in SLIDERS:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, getattr(fabric, name))
         self.material  # noqa: B018 - an invalid fabric is refused here
 
     @property
     def material(self) -> Material:
-        return Material.preset(self.fabric, **{name: getattr(self, name) for name in FIGURES})
+        return Material.preset(self.fabric, **{name: getattr(self, name) for name in SLIDERS})
 
     def changed(self, **changes: Any) -> Settings:
         """A copy with some settings changed; another fabric brings all its properties except the drag of the air.
@@ -87,7 +87,7 @@ class Settings:
         for name in changes:
             known("setting", name, [item.name for item in fields(self)])
         if "fabric" in changes and changes["fabric"] != self.fabric:
-            changes = {name: None for name in FIGURES if name != "air_drag"} | changes
+            changes = {name: None for name in SLIDERS if name != "air_drag"} | changes
         return replace(self, **changes)
 
 
@@ -106,7 +106,7 @@ class Scene:
         anchors: particles, or patches of them, that can be held; ``names`` of them; those ``held`` at first.
         handles: anchors that can be dragged.
         colliders: solids that the sheet feels; ``scenery``: solids that are drawn besides.
-        colours: of the colliders that are drawn, by number.
+        colors: of the colliders that are drawn, by number.
         motion: where anchors are to be at a time [s], (anchors, 3) [m], and colliders, by number; None where nothing moves.
         rests: time at which moving anchors are released [s].
         camera: its view.
@@ -125,7 +125,7 @@ class Scene:
     held: tuple[int, ...] = ()
     handles: tuple[int, ...] = ()
     colliders: tuple[Collider, ...] = ()
-    colours: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
+    colors: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
     scenery: tuple[Drawn, ...] = ()
     motion: Callable[[float], tuple[NDArray, Targets]] | None = None
     rests: float = np.inf
@@ -156,7 +156,7 @@ class Scene:
     def solids(self, simulation: Simulation | None = None) -> list[Drawn]:
         """What is drawn beside the sheet and the floor: the solids where they are now, or at first."""
         visible = [
-            (number, drawn((collider, self.colours.get(number, WARM_GREY))))
+            (number, drawn((collider, self.colors.get(number, WARM_GRAY))))
             for number, collider in enumerate(self.colliders)
             if not isinstance(collider, Plane)
         ]

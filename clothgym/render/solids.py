@@ -18,7 +18,7 @@ Color = tuple[int, int, int]
 Drawable = Collider | tuple[Collider | Sequence[float], Color]
 
 KINDS = {"sphere": Sphere, "capsule": Capsule, "box": Box, "mesh": MeshCollider}
-WARM_GREY = (196, 189, 178)
+WARM_GRAY = (196, 189, 178)
 MARKER_RADIUS = 0.011  # of the sphere that stands for a position [m]
 SMALL = 0.03  # radius of a round solid, a marker say, that is drawn with the fewer segments [m]
 BOX_EDGE = 0.01  # radius to which the edges of a box are rounded [m]
@@ -39,7 +39,7 @@ class Drawn(NamedTuple):
     """A solid, where its ``center`` is, and its color, sRGB from 0 to 255."""
 
     collider: Shape
-    color: Color = WARM_GREY
+    color: Color = WARM_GRAY
 
     @property
     def kind(self) -> str:
@@ -83,16 +83,16 @@ class Drawn(NamedTuple):
 
 
 def drawn(thing: Drawable) -> Drawn:
-    """What a collider (in grey), a (collider, color), or a (position [m], color), a small sphere, looks like.
+    """What a collider (in gray), a (collider, color), or a (position [m], color), a small sphere, looks like.
 
     Raises:
         ValueError: none of these, a plane, or a color out of range.
     """
-    pair = (thing, WARM_GREY) if isinstance(thing, Collider) else thing
+    pair = (thing, WARM_GRAY) if isinstance(thing, Collider) else thing
     if not isinstance(pair, tuple) or len(pair) != 2 or (isinstance(pair[0], Collider) and not isinstance(pair[0], Shape)):
         raise ValueError(
             f"{thing!r} cannot be drawn: must be a Sphere, Capsule, Box or MeshCollider, or (collider, color), or (position in "
-            "metres, color); the floor z = 0 is always drawn"
+            "meters, color); the floor z = 0 is always drawn"
         )
     solid, color = pair
     check_color(f"color of {solid!r}", color)
