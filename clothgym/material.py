@@ -57,8 +57,8 @@ class Material:
     def preset(name: str, **changes: float) -> Material:
         """A measured fabric by name, with some properties changed if wanted: ``Material.preset("cotton", density=0.2)``."""
         known("material preset", name, PRESETS)
-        for name in changes:
-            known("material property", name, [field.name for field in fields(Material)])
+        for change in changes:
+            known("material property", change, [field.name for field in fields(Material)])
         return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
 
 
