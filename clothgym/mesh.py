@@ -13,8 +13,8 @@ from clothgym.checks import positive
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
 
-# spring kinds: each has a stiffness of its own (see material.spring_stiffness).  Those before SHEAR are the threads, or the
-# edges of a triangle mesh; those after it resist bending
+# kinds of springs, each with a stiffness of its own (see material.spring_stiffness).  Those before SHEAR are structural: a grid's
+# yarns, or the edges of a triangle mesh.  Those after SHEAR resist bending
 STRUCTURAL_X, STRUCTURAL_Y, EDGE, SHEAR, BEND_X, BEND_Y, OPPOSITE = range(7)
 NUM_KINDS = 7
 
@@ -23,8 +23,8 @@ class Springs(NamedTuple):
     """Springs sorted by color: no two of one color share a particle.
 
     particles: ends, (springs, 2).  rest_length: [m], (springs,).  kind: index of the stiffness, (springs,).
-    weight: share of that stiffness, (springs,): half for a spring on a grid's border, which stands for half a strip of cloth;
-    1/m^2 for OPPOSITE, whose stiffness is in N m.
+    weight: factor of that stiffness, (springs,).  It is 1/2 for a spring on a grid's border, which stands for half a strip of
+    cloth, and has the unit 1/m^2 for OPPOSITE, whose stiffness is in N m.
     """
 
     particles: Int
@@ -34,13 +34,13 @@ class Springs(NamedTuple):
 
 
 class Hinges(NamedTuple):
-    """The inner edges, across which two triangles bend, sorted by color; on a grid those of both ways to cut its cells.
+    """The inner edges, across which two triangles bend, sorted by color; on a grid, those of both ways to cut its cells.
 
     particles: both ends of the edge, then the opposite corners of its triangles, (hinges, 4).
-    weight: bending moment of a hinge over rigidity times angle, (hinges,): e/h, with e the edge's length and h the spacing of
-    the hinge lines.
+    weight: bending moment over rigidity times angle, (hinges,): e/h, with the length e of the edge and the distance h between
+    parallel hinges.
     rest_angle: [rad], (hinges,), zero where the sheet is flat at rest.
-    slopes: of the angle with respect to the particles' displacement along the normal, at rest [1/m], (hinges, 4).
+    slopes: derivatives of the angle at rest with respect to displacements along the normal [1/m], (hinges, 4).
     """
 
     particles: Int
@@ -56,7 +56,7 @@ class ClothMesh:
     Attributes:
         size: width along x and height along y [m].
         rest_positions: particles at rest [m], (particles, 3); in a grid row r, column c is particle ``r * columns + c``.
-        springs: structural and shear springs, or edges; and those that resist bending.
+        springs: structural and shear springs, or edges; and skip springs, which resist bending.
         triangles: particle indices, (triangles, 3); a grid's are counter-clockwise seen from +z.
         area: share of the sheet's area that each particle stands for [m^2], (particles,).
         hinges: inner edges.
@@ -73,6 +73,7 @@ class ClothMesh:
 
     @property
     def num_particles(self) -> int:
+        """Number of particles."""
         return len(self.rest_positions)
 
     @property
@@ -80,15 +81,15 @@ class ClothMesh:
         """``shape`` of a grid.
 
         Raises:
-            ValueError: the mesh is no grid.
+            ValueError: the mesh is not a grid.
         """
         if self.shape is None:
-            raise ValueError("this mesh is no grid: it has no rows, columns or corners; make one with clothgym.grid")
+            raise ValueError("this mesh is not a grid, so it has no rows, columns or corners; make a grid with clothgym.grid")
         return self.shape
 
     @property
     def spacing(self) -> tuple[float, float]:
-        """Rest distance of a grid's neighbors along x and y [m]."""
+        """Distance at rest between neighbors in a grid, along x and y [m]."""
         rows, columns = self.grid_shape
         return self.size[0] / (columns - 1), self.size[1] / (rows - 1)
 
@@ -102,25 +103,29 @@ class ClothMesh:
 def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     """A rectangular sheet of ``rows`` x ``cols`` particles, ``width`` (along x) by ``height`` (along y) meters.
 
-    Springs as in Provot 1995: structural to the four neighbors, shear along both diagonals, bend to the next but one.
+    The springs are those of Provot 1995: structural to the four neighbors, shear along both diagonals, and skip springs, which
+    resist bending, to the second neighbors.
 
     Raises:
         ValueError: fewer than two rows or columns, or a side that is not positive and finite.
     """
+    # bad arguments
     for name, count in (("rows", rows), ("cols", cols)):
         if not isinstance(count, (int, np.integer)) or count < 2:
             raise ValueError(f"{name}={count!r}: a sheet needs at least 2 {name} of particles, as an integer")
     for name, side in (("width", width), ("height", height)):
         positive(name, side)
+    # particles, row by row
     rows, cols = int(rows), int(cols)
     dx, dy = width / (cols - 1), height / (rows - 1)
     index = np.arange(rows * cols).reshape(rows, cols)
     y, x = np.meshgrid(np.arange(rows) * dy - height / 2, np.arange(cols) * dx - width / 2, indexing="ij")
     positions = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
 
-    # tributary widths: 1 inside, 1/2 on the border, so that area, mass and stiffness all sum to the sheet's own
+    # tributary widths: 1 inside, 1/2 on the border, so that area, mass and stiffness add up to those of the sheet
     across_y = np.where((np.arange(rows) == 0) | (np.arange(rows) == rows - 1), 0.5, 1.0)
     across_x = np.where((np.arange(cols) == 0) | (np.arange(cols) == cols - 1), 0.5, 1.0)
+    # springs: kind, first ends, second ends, weights
     ones = np.ones((rows, cols))
     families = [
         (STRUCTURAL_X, index[:, :-1], index[:, 1:], ones[:, 1:] * across_y[:, None]),
@@ -143,14 +148,14 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     triangles = np.stack([first, second], axis=1).reshape(-1, 3).astype(np.int32)
     area = (dx * dy * np.outer(across_y, across_x)).ravel()
 
-    # hinges of these triangles and of those with the other diagonal in each cell, each counting half: with the former alone every
-    # second particle differs from its neighbors, gives way to a bend, and leaves a strip two thirds of its rigidity
+    # hinges of these triangles and of those with the other diagonal in each cell, each with half the weight.  With the former alone
+    # every second particle differs from its neighbors and yields to a bend, which leaves a strip two thirds of its rigidity
     third = np.where(even, np.stack([a, b, c], 1), np.stack([a, b, d], 1))
     fourth = np.where(even, np.stack([b, d, c], 1), np.stack([a, d, c], 1))
     both = [colored_hinges(positions, t) for t in (triangles, np.stack([third, fourth], axis=1).reshape(-1, 3))]
     hinges = Hinges(*(np.concatenate(fields) for fields in zip(*both)))
-    # e/h is right for the lines of the grid.  The diagonals alone resist the twist of a cell, whose energy per area
-    # B (d2u/dxdy)^2 asks for half of what e/h gives on square cells: then a bend costs the same in any direction
+    # e/h is right for the grid's lines.  Only the diagonals resist the twist of a cell, whose energy per area is B (d2u/dxdy)^2.
+    # On square cells that needs half of e/h; then a bend stores the same energy in any direction
     diagonal = np.ptp(hinges.particles[:, :2] % cols, axis=1) * np.ptp(hinges.particles[:, :2] // cols, axis=1) > 0
     weights = np.where(diagonal, 2 * dx * dy / (dx * dx + dy * dy), hinges.weight) / 2
     hinges = Hinges(*(frozen(field) for field in hinges._replace(weight=weights)))
@@ -160,7 +165,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
 
 
 def colored_springs(positions: Real, ends: NDArray, kind: NDArray, weight: NDArray) -> Springs:
-    """Springs between those ends, sorted by color, as long as they are."""
+    """Springs between ``ends``, (springs, 2), sorted by color, at rest in these positions [m]; kind, weight: (springs,)."""
     order = np.argsort(_greedy_colors(ends, len(positions)), kind="stable")
     ends = ends[order]
     return Springs(
@@ -172,12 +177,16 @@ def colored_springs(positions: Real, ends: NDArray, kind: NDArray, weight: NDArr
 
 
 def inner_edges(triangles: NDArray) -> NDArray[np.int64]:
-    """Ends and opposite corners of the edges that two triangles share, (edges, 4): triangle (i, j, k) has i to j, and
-    (j, i, l) has j to i."""
+    """Ends and opposite corners of the edges that two triangles share, (edges, 4).
+
+    The edge (i, j, k, l) belongs to triangle (i, j, k), which has it from i to j, and to (j, i, l), which has it from j to i.
+    """
+    # every edge of every triangle, with its direction
     triangles = triangles.astype(np.int64)
     directed = np.concatenate([triangles[:, [0, 1, 2]], triangles[:, [1, 2, 0]], triangles[:, [2, 0, 1]]])
     size = triangles.max(initial=0) + 1
     forward, backward = directed[:, 0] * size + directed[:, 1], directed[:, 1] * size + directed[:, 0]
+    # the partner of an edge is the one in the opposite direction, if any; of the two, the one with i < j is kept
     order = np.argsort(forward)
     place = np.minimum(np.searchsorted(forward[order], backward), len(directed) - 1)
     partner = order[place]
@@ -186,23 +195,27 @@ def inner_edges(triangles: NDArray) -> NDArray[np.int64]:
 
 
 def colored_hinges(positions: Real, triangles: NDArray) -> Hinges:
-    """The inner edges of triangles, sorted by color.
+    """The inner edges of triangles, sorted by color, flat or bent as they are in these positions [m].
 
-    The weight is ``e/h`` with h the mean height of both triangles over the edge, ``e^2/(A_0 + A_1)``: exact for a cylinder on
-    equilateral triangles (Seung and Nelson 1988, eq. 13, ``kappa = sqrt(3)/2 kappa~``).
+    The weight is ``e/h``, with h the mean height of both triangles over the edge: ``e^2/(A_0 + A_1)``.  It is exact for a cylinder
+    of equilateral triangles (Seung and Nelson 1988, eq. 13, ``kappa = sqrt(3)/2 kappa~``).
     """
+    # no triangles, no hinges
     if not len(triangles):
         none = np.zeros(0)
         return Hinges(np.zeros((0, 4), np.int32), none, none, np.zeros((0, 4)))
+    # the edges by color
     particles = inner_edges(triangles)
     particles = particles[np.argsort(_greedy_colors(particles, len(positions)), kind="stable")]
+    # the angle at rest, as in ``bending.hinge_angles``
     xi, xj, xk, xl = (positions[particles[:, c]] for c in range(4))
     e, a, b = xj - xi, xk - xi, xl - xi
     length = np.linalg.norm(e, axis=1)
     one, two = np.cross(e, a), np.cross(b, e)  # normals times twice the areas
     one_size, two_size = np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1)
     angle = np.arctan2(-length * np.sum(one * b, axis=1), np.sum(one * two, axis=1))
-    # a corner at height h over the edge tilts its triangle by 1/h; the foot of the height divides that between the ends
+    # displacing a corner at height h over the edge changes the angle by 1/h; the foot of the height divides the opposite change
+    # between the ends
     tilt_k, tilt_l = -length / one_size, -length / two_size
     foot_k, foot_l = np.sum(a * e, axis=1) / length**2, np.sum(b * e, axis=1) / length**2
     slopes = np.stack([-(1 - foot_k) * tilt_k - (1 - foot_l) * tilt_l, -foot_k * tilt_k - foot_l * tilt_l, tilt_k, tilt_l], axis=1)
@@ -215,7 +228,10 @@ def colored_hinges(positions: Real, triangles: NDArray) -> Hinges:
 
 
 def _greedy_colors(members: NDArray[np.int64], particles: int) -> NDArray[np.int64]:
-    """Smallest color that no particle of an element has yet, element by element; members: (elements, particles of each)."""
+    """Colors such that no two elements of one color share a particle, (elements,); members: (elements, particles of each).
+
+    Element by element, each gets the smallest color that none of its particles has yet.
+    """
     taken: list[set[int]] = [set() for _ in range(particles)]
     colors = np.empty(len(members), np.int64)
     for element, own in enumerate(members.tolist()):
@@ -229,5 +245,6 @@ def _greedy_colors(members: NDArray[np.int64], particles: int) -> NDArray[np.int
 
 
 def frozen(array: NDArray) -> NDArray:
+    """The same array, from now on read-only."""
     array.flags.writeable = False
     return array

@@ -1,4 +1,4 @@
-"""Floor 1: sheets of triangles: from arrays, from files, and the disc of the drape test."""
+"""Floor 1: sheets of triangles: from arrays, from files, and the disk of the drape test."""
 
 from __future__ import annotations
 
@@ -15,27 +15,28 @@ FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below 
 
 
 def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
-    """A sheet whose rest shape is that of the triangles, flat or not.
+    """A sheet that at rest has the shape of these triangles, flat or not.
 
-    Its edges are springs with the weight ``(A_0 + A_1)/e^2`` of Van Gelder 1998 (Approximate simulation of elastic membranes by
-    triangulated spring meshes), which give equilateral triangles the fabric's Young's modulus, and Poisson's ratio 1/3.
+    Its edges are springs with the weight ``(A_0 + A_1)/e^2`` of Van Gelder 1998, Approximate simulation of elastic membranes by
+    triangulated spring meshes.  They give equilateral triangles the fabric's Young's modulus, and Poisson's ratio 1/3.
 
     Args:
         vertices: [m], (particles, 3).
         triangles: indices of vertices, (triangles, 3), all with the same side up.
 
     Raises:
-        ValueError: not such arrays, a triangle without area, an edge of more than two triangles or of two that disagree on
-            which side is up, or a vertex of no triangle; the message names it.
+        ValueError: other shapes or types; a triangle without area; an edge of more than two triangles, or of two that disagree on
+            which side is up; or a vertex that belongs to no triangle.  The message names it.
     """
+    # the edges, and the area of the triangles beside each
     x = finite("vertices", vertices)
     corners = _checked(x, triangles)
     edges, inverse = np.unique(np.sort(directed_edges(corners), axis=1), axis=0, return_inverse=True)
     twice = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1)
     beside = np.bincount(inverse, weights=np.tile(twice / 2, 3))
     hinges = _calibrated(colored_hinges(x, corners), x)
-    # opposite corners: polygons of rigid sides store B kappa^2 / 2 an area where the radius of curvature is their distance l:
-    # half the spring's constant times (l^3 kappa^2 / 32)^2, on the third of its triangles that an edge stands for
+    # skip springs between opposite corners at a distance l: they store B kappa^2 / 2 per area where the radius of curvature is l.
+    # A spring stores half its constant times (l^3 kappa^2 / 32)^2, on a third of both triangles
     across = hinges.particles[:, 2:]
     span = np.linalg.norm(x[across[:, 1]] - x[across[:, 0]], axis=1)
     area = np.bincount(corners.ravel(), weights=np.repeat(twice / 6, 3), minlength=len(x))
@@ -53,13 +54,14 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
 
 
 def disc(radius: float, rings: int) -> ClothMesh:
-    """A round sheet, flat at z = 0 and centered on the origin: ring ``r`` has ``6 r`` particles, the first is the center.
+    """A round sheet, flat at z = 0 and centered on the origin; the first particle is the center, and ring ``r`` has ``6 r``.
 
     Raises:
         ValueError: a radius that is not positive, or fewer than one ring.
     """
     positive("radius", radius)
     count("rings", rings)
+    # ring by ring: its particles, and the triangles between it and the ring within, in six sectors
     points, triangles = [np.zeros((1, 3))], []
     for ring in range(1, rings + 1):
         angle = np.arange(6 * ring) * 2 * np.pi / (6 * ring)
@@ -77,27 +79,30 @@ def disc(radius: float, rings: int) -> ClothMesh:
 
 
 def load_mesh(path: str | Path) -> ClothMesh:
-    """A sheet from a mesh file (obj, ply, stl, off, glb, ...), in meters; its shape there is its rest shape.
+    """A sheet from a mesh file (obj, ply, stl, off, glb, ...) in meters; its shape in the file is its shape at rest.
 
-    Vertices at the very same place are one particle.  A reader may leave out vertices that no triangle uses (obj's does).
+    Vertices at exactly the same position become one particle.  Some readers, such as that of obj, omit vertices that no triangle
+    uses.
 
     Raises:
-        ImportError: trimesh is not there: ``pip install clothgym[mesh]``.
-        ValueError: the file is none, holds no triangles, or is no sheet (see ``triangle_mesh``).
+        ImportError: trimesh is missing: ``pip install clothgym[mesh]``.
+        ValueError: there is no such file, it cannot be read or holds no triangles, or they form no sheet (see ``triangle_mesh``).
     """
     vertices, triangles = read_triangles(path, "load_mesh", "sheet")
     try:
         return triangle_mesh(vertices, triangles)
     except ValueError as error:
-        raise ValueError(f"{str(path)!r} is no sheet: {error}") from error
+        raise ValueError(f"{str(path)!r} is not a sheet: {error}") from error
 
 
 def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDArray]:
-    """Vertices [m] and triangles of a mesh file, those at the very same place merged; who reads, and what, for the sentences.
+    """Vertices [m], (vertices, 3), and triangles, (triangles, 3), of a mesh file; vertices at the same position are merged.
+
+    who, what: the caller and the kind of object that it reads, for error messages.
 
     Raises:
-        ImportError: trimesh is not there.
-        ValueError: the file is none, holds no triangles, or vertices that are nowhere or in no triangle.
+        ImportError: trimesh is missing.
+        ValueError: there is no such file, it cannot be read or holds no triangles, or a vertex is not finite or in no triangle.
     """
     try:
         import trimesh
@@ -106,6 +111,7 @@ def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDAr
     if not Path(path).is_file():
         problem = "it is a folder: name a file in it" if Path(path).is_dir() else "there is no such file: check the path"
         raise ValueError(f"{str(path)!r}: {problem}")
+    # trimesh reads the file
     advice = f"export the {what} as a triangle mesh, for instance obj or ply"
     try:
         loaded: Any = trimesh.load(path, force="mesh", process=False)
@@ -113,20 +119,21 @@ def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDAr
         raise ValueError(f"{str(path)!r} cannot be read as a mesh ({error or type(error).__name__}): {advice}") from error
     if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
         raise ValueError(f"{str(path)!r} holds no triangles: {advice}")
+    # vertices without a finite position, and those in no triangle, are refused
     try:
         x = np.array(loaded.vertices, np.float64)
         nowhere = np.flatnonzero(~np.isfinite(x).all(axis=1))
         if len(nowhere):
-            raise ValueError(f"vertex {nowhere[0]} is at {x[nowhere[0]].tolist()}: give it a finite place")
+            raise ValueError(f"vertex {nowhere[0]} is at {x[nowhere[0]].tolist()}: give it a finite position")
         return _merged(x, corners_of(x, np.array(loaded.faces)))
     except ValueError as error:
-        raise ValueError(f"{str(path)!r} is no {what}: {error}") from error
+        raise ValueError(f"{str(path)!r} is not a {what}: {error}") from error
 
 
 def _merged(x: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
-    """Vertices without repetition, in the order in which they first come, and the triangles between them.
+    """Distinct vertices, in the order of their first appearance, and the triangles between them.
 
-    Some formats repeat a vertex in every triangle; where texture or normals differ it is the same particle still.
+    Some formats repeat a vertex in each of its triangles, or where texture or normals differ.  It is still the same particle.
     """
     _, first, which = np.unique(x, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -136,12 +143,13 @@ def _merged(x: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
-    """Hinges whose weights are scaled together so that cylinders, averaged over their directions, store B kappa^2 / 2 an area.
+    """The hinges with their weights scaled by a common factor, so that cylinders store B kappa^2 / 2 per area.
 
-    A hinge stands for a third of its triangles.  In the plane of its unfolded triangles, with x along the edge, a surface of
-    curvature K turns it by ``a K_xx + b K_yy + 2 c K_xy``; over the directions of a cylinder the square's mean is
-    ``3/8 (a^2 + b^2) + ab/4 + c^2/2``.
+    This is the mean over the directions of the cylinders.  A hinge stands for a third of both its triangles.  Unfold these into a
+    plane with x along the edge.  A surface of curvature K then turns the hinge by ``a K_xx + b K_yy + 2 c K_xy``.  For a cylinder
+    the mean square of this over all directions is ``3/8 (a^2 + b^2) + ab/4 + c^2/2``, times kappa^2.
     """
+    # both opposite corners in the plane of the unfolded triangles
     xi, xj, xk, xl = (x[hinges.particles[:, c]] for c in range(4))
     length = np.linalg.norm(xj - xi, axis=1)
     along = (xj - xi) / length[:, None]
@@ -152,6 +160,7 @@ def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
     zero = np.zeros_like(length)
     px = np.stack([zero, length, unfolded[0][0], unfolded[1][0]], axis=1)
     py = np.stack([zero, zero, unfolded[0][1], unfolded[1][1]], axis=1)
+    # the turn of each hinge, and its mean square
     a, b, c = (np.sum(hinges.slopes * q, axis=1) / 2 for q in (px * px, py * py, px * py))
     square = 3 / 8 * (a * a + b * b) + a * b / 4 + c * c / 2
     area = (length * (np.abs(py[:, 2]) + np.abs(py[:, 3])) / 2).sum() / 3
@@ -159,19 +168,23 @@ def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
 
 
 def directed_edges(triangles: NDArray) -> NDArray:
-    """Directed edges, (3 triangles, 2)."""
+    """The edges of each triangle with their directions, (3 triangles, 2)."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def _beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
-    """Area of the triangles beside some of the edges [m^2], (len(ends),)."""
+    """Area of the triangles beside the edges with these ends [m^2], (len(ends),); edges and their areas are sorted by ends."""
     size = edges.max() + 1
     ends = np.sort(ends, axis=1).astype(np.int64)
     return area[np.searchsorted(edges[:, 0] * size + edges[:, 1], ends[:, 0] * size + ends[:, 1])]
 
 
 def corners_of(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
-    """Triangles between those vertices, which are all in use."""
+    """``triangles`` as int64, (triangles, 3), if each vertex of x, (vertices, 3), is in one of them.
+
+    Raises:
+        ValueError: other shapes or types, an index that is out of range, or a vertex in no triangle.
+    """
     if x.ndim != 2 or x.shape[1] != 3 or not len(x):
         raise ValueError(f"vertices have shape {x.shape}: must be (particles, 3)")
     corners = np.asarray(triangles)
@@ -187,7 +200,11 @@ def corners_of(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
 
 
 def refuse_degenerate(x: NDArray, corners: NDArray) -> None:
-    """Refuse triangles without area."""
+    """Refuse triangles without area.
+
+    Raises:
+        ValueError: a triangle whose area is at most FLATTEST/2 times its longest side squared; the message names it.
+    """
     sides = [x[corners[:, b]] - x[corners[:, a]] for a, b in ((0, 1), (1, 2), (2, 0))]
     twice = np.linalg.norm(np.cross(sides[0], sides[2]), axis=1)
     longest = np.max([np.sum(side**2, axis=1) for side in sides], axis=0)
@@ -198,18 +215,24 @@ def refuse_degenerate(x: NDArray, corners: NDArray) -> None:
 
 
 def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
-    """Triangles that make a sheet."""
+    """``triangles`` as int64, (triangles, 3), if they form a sheet.
+
+    Raises:
+        ValueError: they do not, see ``triangle_mesh``.
+    """
+    # each triangle has an area, and is there once
     corners = corners_of(x, triangles)
     refuse_degenerate(x, corners)
     _, first, again = np.unique(np.sort(corners, axis=1), axis=0, return_index=True, return_counts=True)
     if np.any(again > 1):
         twin = corners[first[np.argmax(again > 1)]].tolist()
-        raise ValueError(f"triangle {twin} is there {again.max()} times: remove it but for one")
+        raise ValueError(f"triangle {twin} is there {again.max()} times: remove all but one")
+    # each directed edge belongs to one triangle
     directed, times = np.unique(directed_edges(corners), axis=0, return_counts=True)
     if np.any(times > 1):
         a, b = directed[np.argmax(times > 1)].tolist()
         total = int(np.sum(np.all(np.sort(directed_edges(corners), axis=1) == sorted((a, b)), axis=1)))
         if total > 2:
             raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two, remove the others")
-        raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: turn one round")
+        raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: reverse one of them")
     return corners

@@ -1,4 +1,4 @@
-"""Floor 1: steady wind and gusts, as a series of air velocities drawn from a generator."""
+"""Floor 1: steady wind and gusts: a random series of air velocities."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from clothgym.checks import finite, number
 
 @dataclass(frozen=True, kw_only=True)
 class Wind:
-    """What the air may do in an episode.
+    """The distribution of the wind in an episode: a steady horizontal wind, and gusts.
 
     Attributes:
-        speed: range of the steady part's speed [m/s]; it blows horizontally.
-        direction: range of where it blows to, as an angle from the x axis [rad].
-        gust: root mean square of each of the gusts' three components [m/s].
-        gust_time: their correlation time [s].
+        speed: range of the steady wind's speed [m/s].
+        direction: range of the direction in which it blows, as an angle from the x axis [rad].
+        gust: root mean square of each of the three components of the gusts [m/s].
+        gust_time: correlation time of the gusts [s].
 
     Gusts are a first-order Markov process, ``u' = u r + sqrt(1 - r^2) gust xi`` with ``r = exp(-dt/gust_time)``: Dryden's
     longitudinal turbulence (MIL-F-8785C, 3.7.1), of scale ``gust_time`` times the speed.
 
     Raises:
-        ValueError: a range that is none, a speed or gust below zero, or a time that is not positive.
+        ValueError: not a range [low, high], a speed or gust below zero, or a time that is not positive.
     """
 
     speed: Sequence[float] = (0.0, 0.0)
@@ -40,14 +40,14 @@ class Wind:
             if bounds.shape != (2,) or bounds[0] > bounds[1]:
                 raise ValueError(f"wind {name}={getattr(self, name)!r}: must be a range [low, high]")
         if self.speed[0] < 0:
-            raise ValueError(f"wind speed={self.speed!r}: must not be below zero; turn the direction instead")
+            raise ValueError(f"wind speed={self.speed!r}: must not be below zero; change the direction instead")
         if number("wind gust", self.gust) < 0:
             raise ValueError(f"wind gust={self.gust!r}: must be zero or positive")
         if number("wind gust_time", self.gust_time) <= 0:
             raise ValueError(f"wind gust_time={self.gust_time!r}: must be positive")
 
     def series(self, rng: np.random.Generator, steps: int, time_step: float) -> NDArray[np.float64]:
-        """Velocities of the air in successive control steps [m/s], (steps, 3): one steady wind, and gusts on it."""
+        """Velocities of the air in successive control steps [m/s], (steps, 3): a steady wind plus gusts; time_step: [s]."""
         speed, direction = rng.uniform(self.speed[0], self.speed[1]), rng.uniform(self.direction[0], self.direction[1])
         noise = rng.standard_normal((steps, 3))
         out = np.empty((steps, 3))
@@ -57,7 +57,10 @@ class Wind:
 
 @kernel
 def gusts(noise, rms, keep, out):
-    """The process of the class, from its stationary distribution on."""
+    """``u <- u r + sqrt(1 - r^2) gust xi`` from step to step into ``out``, (steps, 3), see ``Wind``.
+
+    It starts from its stationary distribution.  noise: xi, (steps, 3).  rms: gust [m/s].  keep: r.
+    """
     fresh = np.sqrt(1 - keep * keep)
     for c in range(noise.shape[1]):
         u = rms * noise[0, c]
