@@ -306,7 +306,7 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
 
 @inlined
 def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
-    """Force on a triangle with sides p and q [m] in a relative wind u [m/s], in N: see ``forces.add_lane_air_forces``."""
+    """Force on a triangle with sides p and q [m] in a relative wind u [m/s], in N; see ``forces.add_lane_air_forces``."""
     # normal times twice the area
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
     twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)

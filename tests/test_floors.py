@@ -24,6 +24,7 @@ FLOORS = {
     "clothgym.grid_forces": 3,
     "clothgym.integrators": 4,
     "clothgym.collisions": 4,
+    "clothgym.hand_kernels": 4,
     "clothgym.hands": 4,
     "clothgym.guards": 4,
     "clothgym.limiting": 4,
