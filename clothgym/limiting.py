@@ -30,7 +30,7 @@ SWEEPS = 100  # at most, in a substep
 BEFORE, AFTER, USED = 0, 1, 2
 
 largest_strain = placeholder(
-    "largest_strain", "of (x, weave, largest): writes the largest strain of the threads and diagonals of each lane, (lanes,)"
+    "largest_strain", "of (x, weave, largest): writes the largest strain of the structural and shear springs in each lane, (lanes,)"
 )
 
 
