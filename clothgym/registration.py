@@ -14,7 +14,7 @@ from clothgym.checks import known
 ENVIRONMENTS = {
     "ClothReach-v0": (
         "ClothReach",
-        "Bring the free corner of a hanging sheet to a point where it can rest, and calm it there.",
+        "Bring the free corner of a hanging sheet to a point where it can rest, and bring it to rest there.",
     ),
     "ClothDrape-v0": (
         "ClothDrape",

@@ -330,7 +330,7 @@ def test_contact_and_air_density_reach_the_simulation():
 
 def rows(env_id, heading):
     """Cells of the table under a heading of an id's page."""
-    page = getattr(clothgym.envs, f"{ENVIRONMENTS[env_id]}Env").__doc__
+    page = getattr(clothgym.envs, f"{ENVIRONMENTS[env_id][0]}Env").__doc__
     lines = inspect.cleandoc(page).split(f"## {heading}\n")[1].split("\n## ")[0].splitlines()
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line.startswith("|")][2:]
 

@@ -101,7 +101,7 @@ def time_step_of(name: str) -> float:
     """Of the frames of a scene or an environment [s]."""
     if name in SCENES:
         return STEPS * FRAME
-    entry: Any = gym.spec(name).entry_point
+    entry: Any = gym.spec(name.rpartition(":")[2]).entry_point
     environment: Any = gym.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
     return environment.task_class.physics.time_step
 
