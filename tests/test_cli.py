@@ -47,7 +47,7 @@ def test_list_names_what_there_is(capsys):
 
 BY_VALUE = {
     "fold": "choose from",
-    "--verson": "",
+    "--verson": "unrecognized arguments: --verson",
     "view --port abc": "--port: 'abc': must be an integer from 0 to 65535",
     "view --port 65536": "from 0 to 65535",
     "view --replay gone.npz": "no such file",
@@ -75,7 +75,7 @@ BY_NAME = {
     "view --policy .": "lacks config.json",
     "export ClothReech-v0 --out a.gif": "did you mean 'ClothReach-v0'?",
     "export patch --out a.fbx": "must end in",
-    "export patch --out a.glb --color strain": "meshes have the fabric's color alone",
+    "export patch --out a.glb --color strain": "meshes only have the fabric's color",
     "export patch --out a.gif --fps 100": "patch has 30 frames a second",
     "export ClothReach-v0 --out a.gif --fps 100": "ClothReach-v0 has 15 frames a second",
     "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",
