@@ -1,4 +1,4 @@
-"""Floor 2: what holds a sheet together, as arrays for kernels; shared by all environments."""
+"""Floor 2: springs, hinges and triangles as arrays for kernels; all environments share them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
-ROWS = 27  # of scratch
-ALIKE = 1e-6  # share of a length up to which springs of a kind are as long as each other
-# rows and columns from a spring's first end to its second, for each kind of a grid's springs
+ROWS = 27  # of ``Scratch.rows``
+ALIKE = 1e-6  # relative difference up to which the springs of a kind count as equally long
+# kinds of springs on a grid, with the rows and columns from the first end to the second
 KINDS = ((STRUCTURAL_X, 0, 1), (STRUCTURAL_Y, 1, 0), (SHEAR, 1, 1), (SHEAR, 1, -1), (BEND_X, 0, 2), (BEND_Y, 2, 0))
 
 
 class SpringArrays(NamedTuple):
-    """The mesh's springs in the kernel's dtype, shared by all lanes (see ``mesh.Springs``)."""
+    """The mesh's springs in the kernel's dtype, shared by all lanes.
+
+    particles: ends, (springs, 2).  rest_length: [m].  kind, weight: see ``mesh.Springs``.  The last three are (springs,).
+    """
 
     particles: NDArray
     rest_length: NDArray
@@ -27,13 +30,14 @@ class SpringArrays(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """A grid's springs and hinges by kinds: one of a kind joins particle p to those at constant offsets from it.
+    """A grid's springs and hinges by kinds: those of a kind join particle p to particles at constant offsets from it.
 
-    Where that would wrap around the end of a row its weight is zero.
+    Where that would wrap around the end of a row the weight is zero.
 
-    offset, stiffness, rest_length: from a spring's first end to its second, the row of ``Elastic.stiffness``, and its rest length
-    [m], (kinds,).  weight: share of that stiffness, (kinds, particles), for as many kinds as are springs.
-    curve: what the quadratic bending model adds along each offset, over the rigidity [1/m^2], (kinds, particles) or none.
+    offset: from a spring's first end to its second, (kinds,).  stiffness: row of ``Elastic.stiffness``, (kinds,).  rest_length:
+    [m], (kinds,).  weight: share of the stiffness, (kinds, particles), for the kinds that are springs.
+    curve: coefficient of the quadratic bending model along each offset, for a rigidity of 1 [1/m^2], (kinds, particles), or (0,
+    particles).
     hinge: offsets from a hinge's first end to its second and to both opposite corners, (families, 3).  hinge_weight: (families,
     particles).
     """
@@ -48,10 +52,10 @@ class Grid(NamedTuple):
 
 
 class GridSurface(NamedTuple):
-    """A grid's triangles by cells, each known by the particle p at its first corner.
+    """A grid's triangles by cells; a cell has the index of the particle at its first corner.
 
-    cell: offsets of its corners, (4,).  even: 1.0 for cells that are cut from their first corner to their last, (particles,).
-    shares: of its first triangle that its corners stand for, and of its second, (8, particles), zero where there is no cell.
+    cell: offsets of the corners, (4,).  even: 1.0 for cells that are cut from their first corner to their last, (particles,).
+    shares: the corners' shares of the first triangle, then of the second, (8, particles); zero where there is no cell.
     """
 
     cell: NDArray
@@ -60,9 +64,10 @@ class GridSurface(NamedTuple):
 
 
 class BendArrays(NamedTuple):
-    """The mesh's hinges in the kernel's dtype, shared by all lanes (see ``mesh.Hinges``); none where skip springs bend instead.
+    """The mesh's hinges in the kernel's dtype, shared by all lanes; empty if skip springs resist bending.
 
-    curves: coefficients q, (hinges, 4), with which the quadratic model's energy is ``B/2 |sum_i q_i x_i|^2``.
+    particles: (hinges, 4).  weight, rest_angle [rad]: (hinges,); see ``mesh.Hinges``.  curves: coefficients q [1/m] of the
+    quadratic model, whose energy is ``B/2 |sum_i q_i x_i|^2``, (hinges, 4).
     """
 
     particles: NDArray
@@ -72,17 +77,17 @@ class BendArrays(NamedTuple):
 
 
 class Elements(NamedTuple):
-    """All that holds a sheet together, one by one."""
+    """The springs and hinges of a sheet, one by one."""
 
     springs: SpringArrays
     bends: BendArrays
 
 
 class Scratch(NamedTuple):
-    """Room for the forces of elements, whose content does not outlive a call.
+    """Scratch for the forces of elements.  The content of ``rows`` is lost when a call ends.
 
-    rows: (ROWS, lanes), or (ROWS, particles) where particles lie side by side.  kinds: forces of a grid's springs by kind,
-    (3, kinds, ``before`` + particles); what stands before a kind's first spring and after its last is zero, and stays so.
+    rows: (ROWS, lanes), or (ROWS, particles) where particles are adjacent in memory.  kinds: forces of a grid's springs by kind,
+    (3, kinds, ``before`` + particles); the entries before a kind's first spring and after its last are zero, and stay so.
     """
 
     rows: NDArray
@@ -90,7 +95,10 @@ class Scratch(NamedTuple):
 
 
 class Elastic(NamedTuple):
-    """What the elements' forces scale with, by lane; a part of ``Fabric``."""
+    """Coefficients of the elements' forces by lane, a part of ``state.Fabric``.
+
+    stiffness: of springs by kind [N/m], (kinds, lanes).  rigidity: of hinges [N m], (lanes,).  damping_time: [s], (lanes,).
+    """
 
     stiffness: NDArray
     rigidity: NDArray
@@ -98,17 +106,17 @@ class Elastic(NamedTuple):
 
 
 class SurfaceArrays(NamedTuple):
-    """The mesh's triangles, (triangles, 3), and the shares of each that its corners stand for, (triangles, 3)."""
+    """The mesh's triangles, (triangles, 3), and the corners' shares of the force on each, (triangles, 3)."""
 
     triangles: NDArray
     shares: NDArray
 
 
 class Weave(NamedTuple):
-    """What a sheet's forces go over, in the form that the layout wants.
+    """Everything that exerts forces on a sheet, in the form that the memory layout needs.
 
-    springs: one by one.  elements: all of them, or by kinds.  air: triangles, or cells.  triangles: (triangles, 3).
-    offset: of the kinds, where particles lie side by side, or none.
+    springs: one by one.  elements: springs and hinges, one by one or by kinds.  air: triangles, or cells.  triangles: (triangles,
+    3).  offset: of the kinds, where particles are adjacent in memory; otherwise empty.
     """
 
     springs: SpringArrays
@@ -119,17 +127,19 @@ class Weave(NamedTuple):
 
 
 def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, any_order: bool) -> Elements:
-    """The mesh's elements as a kernel of this dtype wants them: those that bend are hinges, or springs if not ``hinged``.
+    """The mesh's elements as arrays of this dtype; if ``hinged``, hinges resist bending, otherwise skip springs do.
 
-    Springs are sorted by color, or by particle if they may come in any order: the latter is a fifth faster on wide blocks, as a
-    particle's rows are still in the first cache when its next spring comes.  Gauss-Seidel keeps the colors, which have no preferred
+    Springs are sorted by particle if ``any_order``, otherwise by color.  By particle is a fifth faster on wide blocks, as a
+    particle's rows are still in the first cache when its next spring comes.  Gauss-Seidel methods need the colors, which prefer no
     direction.
     """
+    # springs
     s, h = mesh.springs, mesh.hinges
     order = np.lexsort((s.particles.max(axis=1), s.particles.min(axis=1))) if any_order else np.arange(len(s.kind))
     if hinged:
         order = order[s.kind[order] <= SHEAR]
     springs = SpringArrays(s.particles[order], s.rest_length[order].astype(dtype), s.kind[order], s.weight[order].astype(dtype))
+    # hinges, or none
     used = slice(None) if hinged else slice(0)
     curves = np.sqrt(h.weight)[used, None] * h.slopes[used]
     bends = BendArrays(h.particles[used], h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype), curves.astype(dtype))
@@ -137,7 +147,7 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, any_order: bo
 
 
 def weave_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, by_particle: bool) -> Weave:
-    """A mesh's weave, of elements and a surface made for it."""
+    """The weave of a mesh, from the mesh's ``elements`` and ``surface``; arguments as for ``grid_of`` and ``Weave``."""
     dtype = surface.shares.dtype
     if not by_particle:
         return Weave(elements.springs, elements, surface, surface.triangles, np.zeros(0, np.int64))
@@ -146,9 +156,11 @@ def weave_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bendin
 
 
 def is_regular(mesh: ClothMesh) -> bool:
-    """Whether a mesh's springs are those of a grid, of one length a kind: else they cannot be taken by kinds."""
+    """Whether a mesh has exactly the springs of a grid, of one length in each kind, so that they can be taken by kinds."""
+    # a grid with both triangles in each cell
     if mesh.shape is None or len(mesh.triangles) != 2 * (mesh.shape[0] - 1) * (mesh.shape[1] - 1):
         return False
+    # each spring is of a known kind, as long as the others of its kind, and there only once
     columns, springs = mesh.shape[1], mesh.springs
     first, second = np.sort(springs.particles, axis=1).T
     down, right = second // columns - first // columns, second % columns - first % columns
@@ -163,18 +175,20 @@ def is_regular(mesh: ClothMesh) -> bool:
 
 def grid_of(mesh: ClothMesh, dtype: np.dtype, bending: str) -> Grid:
     """A regular grid's elements by kinds; bending: "springs", "hinge" or "quadratic"."""
+    # springs: weights by kind and first end
     columns, n = mesh.grid_shape[1], mesh.num_particles
     first, second = np.sort(mesh.springs.particles, axis=1).T
     kind = _kind_of(first, second, columns)
     weight, rest_length = np.zeros((len(KINDS), n)), np.ones(len(KINDS))
     weight[kind, first] = mesh.springs.weight
     rest_length[kind] = mesh.springs.rest_length
+    # bending: families of hinges, or the coefficients of the quadratic model
     hinge, hinge_weight = np.zeros((0, 3), np.int64), np.zeros((0, n))
     curve = np.zeros((len(KINDS) if bending == "quadratic" else 0, n))
     if bending == "hinge":
         hinge, hinge_weight = _hinge_families(mesh)
     elif bending == "quadratic":
-        # |sum q_i x_i|^2 of a hinge pulls each two of its particles together with -q_i q_j
+        # the energy |sum q_i x_i|^2/2 attracts particles i and j with -q_i q_j times their distance
         h = mesh.hinges
         q = np.sqrt(h.weight)[:, None] * h.slopes
         for a in range(4):
@@ -195,11 +209,13 @@ def grid_of(mesh: ClothMesh, dtype: np.dtype, bending: str) -> Grid:
 
 def grid_surface_of(mesh: ClothMesh, dtype: np.dtype) -> GridSurface:
     """A regular grid's triangles by cells."""
+    # cells, by the particle at the first corner; the last row and column have none
     rows, columns = mesh.grid_shape
     n = mesh.num_particles
     cell = np.array([0, 1, columns, columns + 1])
     row, column = np.divmod(np.arange(n), columns)
     first = np.repeat(np.flatnonzero((row < rows - 1) & (column < columns - 1)), 2)
+    # the shares of both triangles, at the places of their corners in the cell
     surface, shares = surface_arrays(mesh, np.dtype(np.float64)), np.zeros((2, 4, n))
     for corner in range(3):
         place = np.searchsorted(cell, surface.triangles[:, corner] - first)
@@ -208,14 +224,17 @@ def grid_surface_of(mesh: ClothMesh, dtype: np.dtype) -> GridSurface:
 
 
 def _kind_of(first: NDArray, second: NDArray, columns: int) -> NDArray[np.int64]:
-    """Place in ``KINDS`` of pairs of particles, the lower first."""
+    """Index into ``KINDS`` of pairs of particles, ``first < second``, (pairs,)."""
     down, right = second // columns - first // columns, second % columns - first % columns
     known = {(r, c): k for k, (_, r, c) in enumerate(KINDS)}
     return np.array([known[pair] for pair in zip(down.tolist(), right.tolist())], np.int64)
 
 
 def _hinge_families(mesh: ClothMesh) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """A grid's hinges by where their other corners lie from their first end: offsets, and weights by that end."""
+    """Families of a grid's hinges, whose other corners have the same offsets from the first end.
+
+    Returns the offsets, (families, 3), and the weights by first end, (families, particles).
+    """
     columns, particles = mesh.grid_shape[1], mesh.hinges.particles.astype(np.int64)
     down, right = (part[:, 1:] - part[:, :1] for part in (particles // columns, particles % columns))
     families, family = np.unique(np.concatenate([down, right], axis=1), axis=0, return_inverse=True)
@@ -226,7 +245,7 @@ def _hinge_families(mesh: ClothMesh) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 @kernel
 def room_for_forces(x, offset):
-    """Scratch for one block; x: (3, particles, lanes); offset: see ``Weave``."""
+    """The ``Scratch`` of one block; x: (3, particles, lanes); offset: see ``Weave``."""
     _, particles, lanes = x.shape
     before = 0
     for o in offset:
@@ -236,7 +255,7 @@ def room_for_forces(x, offset):
 
 
 def digest_of(mesh: ClothMesh, hinged: bool, contact: str) -> NDArray[np.uint64]:
-    """What tells one sheet, with what bends it and how it collides with itself, from another."""
+    """A digest of a sheet: its mesh, whether hinges resist its bending, and how it collides with itself."""
     digest = hashlib.sha256(bytes([hinged]) + contact.encode())
     for array in (mesh.rest_positions, mesh.triangles, *mesh.springs, *mesh.hinges):
         digest.update(np.ascontiguousarray(array).tobytes())
@@ -244,10 +263,10 @@ def digest_of(mesh: ClothMesh, hinged: bool, contact: str) -> NDArray[np.uint64]
 
 
 def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
-    """The mesh's triangles as a kernel of this dtype wants them.
+    """The mesh's triangles and the corners' shares, in this dtype.
 
-    A corner's share of a triangle follows from the area that the particle stands for: on a grid, whose diagonals alternate,
-    thirds would give every second particle twice its neighbors' force.
+    A corner's share follows from the area that the particle stands for.  With thirds, every second particle of a grid, whose
+    diagonals alternate, would receive twice the force of its neighbors.
     """
     triangles = mesh.triangles
     around = np.bincount(triangles.ravel(), minlength=mesh.num_particles)

@@ -1,4 +1,4 @@
-"""Floor 4: what keeps a simulation from going wrong unseen: bounds on the substep, and a look at every step's outcome."""
+"""Floor 4: guards: bounds on the substep, properties that an integrator cannot have, and the detection of divergence."""
 
 from __future__ import annotations
 
@@ -17,16 +17,21 @@ from clothgym.mesh import ClothMesh
 from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
 
-FASTEST = 1e3  # no cloth moves at a kilometer a second [m/s]
+FASTEST = 1e3  # [m/s]: no cloth moves at a kilometer per second
 
 
 @apart
 def mark_diverged(x, v, diverged):
-    """Set the flags, (lanes,), of lanes where something is not finite, or faster than ``FASTEST``."""
+    """Set the flags, (lanes,), of lanes with a position that is not finite or a speed component above ``FASTEST``.
+
+    x [m], v [m/s]: (3, particles, lanes).
+    """
+    # one sheet: its arrays are flat
     limit = x.dtype.type(FASTEST)
     if diverged.shape[0] == 1:
         diverged[0] |= not (_all_within(v.reshape(v.size), limit) and _all_within(x.reshape(x.size), x.dtype.type(np.inf)))
         return
+    # lane by lane
     for c in range(3):
         for p in range(x.shape[1]):
             for l in range(x.shape[2]):
@@ -36,7 +41,7 @@ def mark_diverged(x, v, diverged):
 
 @kernel
 def _all_within(values, limit):
-    """Whether all are smaller than ``limit``, whatever their sign; what is not a number is not."""
+    """Whether ``|value| < limit`` for all values, which is false for NaN."""
     beyond = 0
     for e in range(values.shape[0]):
         beyond |= not abs(values[e]) < limit
@@ -46,7 +51,10 @@ def _all_within(values, limit):
 def oscillators(
     mesh: ClothMesh, elements: Elements, bending: Bending, fabric: Fabric, free_w: NDArray, block: int, lane: int
 ) -> Oscillators:
-    """What decides on the substep of the environment in that block and lane; elements in float64."""
+    """The properties that determine the substep of the environment in that block and lane.
+
+    elements: in float64.  free_w: inverse masses without attachments [1/kg], (blocks, particles, lanes).
+    """
     return Oscillators(
         positions=mesh.rest_positions,
         elements=elements,
@@ -59,10 +67,10 @@ def oscillators(
 
 
 def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_step: float) -> int:
-    """Substeps of a control step [s] from the integrator's bound.
+    """Number of substeps in a control step [s], from the integrator's bound.
 
     Raises:
-        ValueError: it has none: no substep is small enough.
+        ValueError: there is no bound: no substep is small enough.
     """
     largest, why = integrator.largest_substep(oscillators)
     if largest <= 0:
@@ -74,15 +82,15 @@ def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_st
 
 
 def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_step: float, substeps: int) -> None:
-    """Warn of the first environment for which the substeps are too few, with the number that would do."""
+    """Warn of the first environment for which the substeps are too few, with the number that is enough."""
     h = time_step / substeps
     for one in each:
-        # the sharp bound needs an eigenvalue: only for those that a quick one does not clear
+        # the sharp bound needs an eigenvalue: compute it only where the quick bound is exceeded
         if h <= integrator.surely_allowed(one):
             continue
         largest, why = integrator.largest_substep(one)
         if h > largest:
-            remedy = "Take another integrator, or a fabric with damping_time."
+            remedy = "Use another integrator, or a fabric with damping_time."
             if largest > 0:
                 remedy = f"Use substeps={integrator.automatic_substeps(time_step, largest)} or substeps='auto'."
             warnings.warn(
@@ -97,14 +105,16 @@ def refuse_properties(integrator: Integrator, mesh: ClothMesh, before: NDArray, 
     """Refuse material properties that an integrator or a mesh cannot have; before, after: (num_envs, properties).
 
     Raises:
-        ValueError: a property that means nothing to them has changed, or one that enters a matrix differs between environments.
+        ValueError: a property that they do not use has changed, or one that enters a shared matrix differs between environments.
     """
+    # a triangle mesh has no shear stiffness of its own
     shear = PROPERTIES.index("shear_stiffness")
     if mesh.shape is None and not np.array_equal(after[:, shear], before[:, shear]):
         raise ValueError(
-            "shear_stiffness means nothing on a triangle mesh: its edges have one stiffness, and its shear modulus follows from "
-            "stretch_stiffness and Poisson's ratio 1/3; change that, or take a grid"
+            "shear_stiffness has no effect on a triangle mesh: its edges have one stiffness, and its shear modulus follows from "
+            "stretch_stiffness and Poisson's ratio 1/3; change stretch_stiffness, or use a grid"
         )
+    # properties that the integrator ignores or shares
     for column, name in enumerate(PROPERTIES):
         if name in integrator.ignored and not np.array_equal(after[:, column], before[:, column]):
             raise ValueError(refusal(integrator, name))
@@ -113,20 +123,22 @@ def refuse_properties(integrator: Integrator, mesh: ClothMesh, before: NDArray, 
 
 
 def refusal(integrator: Integrator, name: str) -> str:
-    """Why an integrator refuses a property."""
+    """The sentence with which an integrator refuses a material property."""
     if name in integrator.ignored:
-        return f"{integrator.name} knows no {name}: its stiffness is a matter of its options ({', '.join(integrator.options)})"
+        return f"{integrator.name} does not use {name}: its options ({', '.join(integrator.options)}) set its stiffness"
     return (
-        f"{integrator.name} factorizes one matrix for all environments: {name} cannot differ between them; set it for all, or take "
+        f"{integrator.name} factorizes one matrix for all environments: {name} cannot differ between them; set it for all, or use "
         "another integrator"
     )
 
 
 def report_divergence(new: NDArray, steps: NDArray, integrator: Integrator, substeps: int, stop: bool) -> None:
-    """Tell of environments that have just diverged, a mask.
+    """Warn of environments that have just diverged.
+
+    new: mask, (num_envs,).  steps: control steps since each environment's reset, (num_envs,).
 
     Raises:
-        FloatingPointError: instead of a warning, if ``stop``.
+        FloatingPointError: if ``stop``, instead of the warning.
     """
     envs = np.flatnonzero(new)
     if not len(envs):
@@ -135,8 +147,8 @@ def report_divergence(new: NDArray, steps: NDArray, integrator: Integrator, subs
     more = f" and {len(envs) - 8} more" if len(envs) > 8 else ""
     message = (
         f"{which}{more} diverged in control step {steps[envs[0]]}: {integrator.name} with {substeps} substeps left a position that "
-        f"is not finite or a speed above {FASTEST:g} m/s. Use more substeps ('auto' follows the bound), slower hands or a softer "
-        "fabric; reset() starts them afresh. The other environments are not affected."
+        f"is not finite or a speed above {FASTEST:g} m/s. Use more substeps ('auto' follows the bound), slower attachments or "
+        "a softer fabric; reset() restarts them. The other environments are not affected."
     )
     if stop:
         raise FloatingPointError(message)

@@ -144,7 +144,7 @@ def _largest_in_lanes(x, weave, largest):
 def _sweep(x, v, w, springs, limit, enough, largest):
     """Visit each structural and shear spring, in the lanes whose largest strain is beyond ``enough``.
 
-    With n the direction from i to j and L the limit, ``x_i <- x_i + s (|d| - L) n``, ``x_j <- x_j - (1 - s) (|d| - L) n``.
+    With direction n from i to j and greatest length L, ``x_i <- x_i + s (|d| - L) n`` and ``x_j <- x_j - (1 - s) (|d| - L) n``.
     If both ends are free s is 1/2 (Provot 1995).  Then the impulse ``max(n . (v_j - v_i), 0)/(w_i + w_j)`` along n on both ends.
     """
     ends, rest_length, kind, _ = springs

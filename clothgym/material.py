@@ -1,4 +1,4 @@
-"""Floor 1: what a fabric is, in SI units, and what it means to the springs of a sheet."""
+"""Floor 1: the properties of a fabric in SI units, and the spring constants of a sheet that follow from them."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class Material:
         density: mass per area [kg/m^2].
         stretch_stiffness: Young's modulus times thickness [N/m].
         shear_stiffness: shear modulus times thickness [N/m].
-        bend_rigidity: plate rigidity B [N m]: a cylinder of curvature kappa stores B kappa^2 / 2 per area.  Skip-one springs
-            (``bending="springs"``) have no rigidity in the flat state; they store that where the radius of curvature is two
+        bend_rigidity: plate rigidity B [N m]: a cylinder of curvature kappa stores B kappa^2 / 2 per area.  Skip springs
+            (``bending="springs"``) have no rigidity in the flat state.  They store this energy where the radius of curvature is two
             grid spacings.
-        damping_time: Kelvin-Voigt retardation time [s]: each spring's damper is this time its stiffness.
-        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_lane_air_forces``; 1.2 is a square plate's.
-        skin_friction: its coefficient edge on to the wind, by the area of one side.
-        air_drag: linear drag, force per area and velocity [N s/m^3], whatever the wind is.  Air itself has none; it calms slow
-            swings, which the quadratic law hardly does.  0.72 is that law's force at 1 m/s.
-        source: where the properties come from.
+        damping_time: Kelvin-Voigt retardation time [s]; times a spring's stiffness, it is the constant of the spring's damper.
+        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_lane_air_forces``; a square plate has 1.2.
+        skin_friction: C_F of the fabric edge on to the wind, by the area of one side.
+        air_drag: linear drag, force per area and velocity [N s/m^3], whatever the wind is.  Real air has none.  It damps slow
+            swings, which the quadratic law hardly damps.  0.72 gives the force of that law at 1 m/s.
+        source: where the values come from.
 
     Raises:
-        ValueError: a property that is negative (or zero, where zero makes no fabric) or not finite.
+        ValueError: a property that is not finite or negative, or a density or stretch stiffness of zero.
     """
 
     density: float = 0.150
@@ -55,14 +55,18 @@ class Material:
 
     @staticmethod
     def preset(name: str, **changes: float) -> Material:
-        """A measured fabric by name, with some properties changed if wanted: ``Material.preset("cotton", density=0.2)``."""
+        """A measured fabric by name, with some properties changed if wanted: ``Material.preset("cotton", density=0.2)``.
+
+        Raises:
+            ValueError: no such preset or property (the message lists the right ones), or a value that is out of range.
+        """
         known("material preset", name, PRESETS)
         for change in changes:
             known("material property", change, [field.name for field in fields(Material)])
         return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
 
 
-# the fabrics of Clyde, Teran and Tamstorf 2017, whose densities are per area (docs/materials.md says how we know)
+# the fabrics of Clyde, Teran and Tamstorf 2017, whose densities are per area (the evidence is in docs/materials.md)
 _SECOND_TABLE = "of the second table of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457)"
 
 # Stretch: Young's modulus E times thickness t.  Shear: E t / (2 (1 + nu)).  Bending: E t^3 / (12 (1 - nu^2)).
@@ -73,7 +77,7 @@ PRESETS: dict[str, Material] = {
         shear_stiffness=105.0,
         bend_rigidity=2.34e-6,
         source="100 % cotton of the Codim-IPC driver (Li et al. 2021, arXiv:2012.04457): 472.64 kg/m^3, 0.318 mm, 0.821 MPa, "
-        "nu 0.243; damping_time and what concerns the air are not measured there and are ours",
+        "nu 0.243; damping_time and the properties in air are not measured there, but chosen by us",
     ),
     "knit": Material(
         density=0.1782,
@@ -116,34 +120,37 @@ PRESETS: dict[str, Material] = {
 def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: NDArray) -> NDArray[np.float64]:
     """Spring constants by kind [N/m], (kinds, ...), that give a sheet the fabric's moduli.
 
-    A triangle mesh has one kind of edge: with the weights of Van Gelder it takes Young's modulus; its Poisson ratio is 1/3, and
-    its shear modulus follows from these, whatever the fabric's is (see ``triangles.triangle_mesh``).
+    The edges of a triangle mesh are of one kind.  With the weights of Van Gelder their stiffness is Young's modulus.  Poisson's
+    ratio is then 1/3, and the shear modulus follows from these, whatever that of the fabric is (see ``triangles.triangle_mesh``).
 
-    On a grid of cells a x b with diagonals d, springs k_x, k_y, k_d (both diagonals) and skip-one k_b make a sheet with
-    ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)``, ``C12 = C66 = 2 k_d a b/d^2`` and Young's modulus
-    ``C11 - C12^2/C11`` (small strains; checked against a stretched and a sheared sheet in the tests).  Poisson's ratio
-    ``C12/C11`` falls out.  All arguments have the same shape ``(...)`` [N/m, N/m, N m].
+    On a grid with cells a x b and diagonals d, springs k_x, k_y, k_d (both diagonals) and skip springs k_b make a sheet with
+    ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)``, ``C12 = C66 = 2 k_d a b/d^2`` and Young's modulus ``C11 - C12^2/C11``.  This
+    holds for small strains; the tests check it on stretched and sheared sheets.  Poisson's ratio is then ``C12/C11``.
+
+    stretch, shear [N/m] and bend [N m] have the same shape ``(...)``.
 
     Raises:
         ValueError: no spring network has these moduli (shear too stiff for the stretch, or cells too oblong).
     """
     stretch, shear, bend = (np.asarray(q, np.float64) for q in (stretch, shear, bend))
     k = np.zeros((NUM_KINDS, *stretch.shape))
+    # triangles: edges, and skip springs between opposite corners
     if mesh.shape is None:
         k[EDGE], k[OPPOSITE] = stretch, 1024 * bend
         return k
+    # a grid: the diagonals take the shear, and the structural springs the rest of C11
     a, b = mesh.spacing
     d2 = a * a + b * b
     k[SHEAR] = shear * d2 / (2 * a * b)
     c11 = (stretch + np.sqrt(stretch**2 + 4 * shear**2)) / 2
     for structural, skip, along, across in ((STRUCTURAL_X, BEND_X, a, b), (STRUCTURAL_Y, BEND_Y, b, a)):
-        # energy of skip springs per area, k kappa^4 along^5 / (32 across), equals B kappa^2 / 2 at kappa = 1 / (2 along)
+        # skip springs store k kappa^4 along^5 / (32 across) per area; this equals B kappa^2 / 2 at kappa = 1 / (2 along)
         k[skip] = 64 * bend * across / along**3
         k[structural] = (c11 - 2 * k[SHEAR] * along**3 / (across * d2)) * across / along - 4 * k[skip]
     if np.any(k < 0):
         raise ValueError(
             f"no springs on cells of {a:.4g} x {b:.4g} m have stretch_stiffness={stretch.min():.4g} N/m with "
             f"shear_stiffness={shear.max():.4g} N/m and bend_rigidity={bend.max():.4g} N m: lower the shear stiffness or the "
-            "rigidity, use a coarser grid, or make the cells nearer to square"
+            "rigidity, use a coarser grid, or make the cells more nearly square"
         )
     return k

@@ -1,4 +1,4 @@
-"""Floor 2: the material properties of each environment, and the rows that kernels read in their place."""
+"""Floor 2: the material properties of each environment, and the arrays for kernels that follow from them."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ FIELDS = ("gravity", "wind")
 
 
 def of_material(material: Material) -> NDArray[np.float64]:
-    """A fabric's properties, in the order of ``PROPERTIES``."""
+    """A fabric's properties, in the order of ``PROPERTIES``, (properties,)."""
     return np.array([getattr(material, name) for name in PROPERTIES])
 
 
 def changed(
     material: Material, parameters: NDArray, changes: Mapping[str, Any]
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Environments' properties, (envs, properties), with some changed, and the fields among the changes, (envs, 3) each.
+    """Properties with some of them changed, (envs, properties), and the fields among the changes, (envs, 3) each.
 
     Raises:
-        ValueError: an unknown name, or a value that ``Material`` would not take.
+        ValueError: an unknown name, or a value that ``Material`` would not accept.
     """
     parameters = parameters.copy()
     fields: dict[str, NDArray[np.float64]] = {}
@@ -49,9 +49,9 @@ def changed(
 
 
 def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density: float) -> dict[str, NDArray[np.float64]]:
-    """What becomes of properties, (envs, properties), on a mesh: rows of ``state.Fabric`` without the fields, (envs, ...).
+    """The arrays of a ``state.Fabric`` without the fields, (envs, ...), from properties on a mesh, (envs, properties).
 
-    hinged: whether hinges resist bending, and no springs.
+    hinged: whether hinges resist bending; otherwise skip springs do.  air_density: [kg/m^3].
 
     Raises:
         ValueError: no spring network on this mesh has these moduli.
@@ -67,5 +67,5 @@ def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density:
 
 
 def inverse_masses(mesh: ClothMesh, parameters: NDArray) -> NDArray[np.float64]:
-    """Of the particles, if nothing holds them [1/kg], (envs, particles)."""
+    """Inverse masses of the particles without attachments [1/kg], (envs, particles)."""
     return 1 / (parameters[:, PROPERTIES.index("density"), None] * mesh.area)

@@ -50,7 +50,7 @@ def test_the_warning_names_environment_step_and_remedy_and_comes_once():
         loud.step()
     text = str(told[0].message)
     assert text.startswith(f"environment 2 diverged in control step {step}: semi_implicit_euler with {loud.substeps} substeps")
-    assert "Use more substeps" in text and "reset() starts them afresh" in text
+    assert "Use more substeps" in text and "reset() restarts them" in text
     loud.step(5)  # warnings are errors here: it is not told twice
 
 

@@ -101,7 +101,7 @@ def test_projective_dynamics_takes_what_its_matrix_does_not_know():
 def test_pbd_refuses_figures_that_mean_nothing_to_it(figure):
     simulation = Simulation(SHEET, num_envs=2, integrator="pbd")
     with pytest.raises(
-        ValueError, match=rf"pbd knows no {figure}: its stiffness is a matter of its options \(iterations, stretch, b"
+        ValueError, match=rf"pbd does not use {figure}: its options \(iterations, stretch, bend\) set its stiffness"
     ):
         simulation.set_parameters(**{figure: 1.5 * getattr(simulation.material, figure)})
     simulation.set_parameters(density=[0.1, 0.2])
@@ -125,7 +125,7 @@ def test_explicit_euler_has_no_automatic_substeps_without_damping():
         ValueError, match="substeps='auto': explicit_euler has no bound here, without damping it grows at any substep"
     ):
         Simulation(SHEET, material, integrator="explicit_euler")
-    with pytest.warns(UserWarning, match="too few for explicit_euler.*Take another integrator, or a fabric with damping_time"):
+    with pytest.warns(UserWarning, match="too few for explicit_euler.*Use another integrator, or a fabric with damping_time"):
         simulation = Simulation(SHEET, material, integrator="explicit_euler", substeps=10)
     assert simulation.largest_substep()[0] == 0
     assert Simulation(SHEET, integrator="explicit_euler").substeps > 100

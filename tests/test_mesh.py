@@ -106,7 +106,7 @@ def test_square_cells_follow_the_published_formula():
 
 
 def test_impossible_moduli_are_refused_with_a_remedy():
-    with pytest.raises(ValueError, match="nearer to square"):
+    with pytest.raises(ValueError, match="more nearly square"):
         Simulation(grid(5, 21, 0.1, 1.0), Material(stretch_stiffness=10.0, shear_stiffness=1000.0))
 
 
