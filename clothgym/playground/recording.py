@@ -237,8 +237,8 @@ def _as_text(solid: Drawn) -> str:
 def _from_text(text: str) -> Drawn:
     given: dict[str, Any] = json.loads(text)
     kind = KINDS[given["kind"]]
-    # in older files each solid has the sizes of all kinds, and those that are not its own are null
-    own = {item.name: _tuple(given[item.name]) for item in fields(kind) if given.get(item.name) is not None}
+    # in older files each solid has the sizes of all kinds, its own and others
+    own = {item.name: _tuple(given[item.name]) for item in fields(kind) if item.name in given}
     return Drawn(kind(**own), _tuple(given["color"]))
 
 
