@@ -296,7 +296,7 @@ def test_what_cannot_be_drawn_is_refused(solid, message):
     ("arguments", "message"),
     [
         ({"eye": (0, math.nan, 1)}, "eye"),
-        ({"eye": (0, 0, 0)}, "apart from its target"),
+        ({"eye": (0, 0, 0)}, "must differ from its target"),
         ({"eye": (0, 0, 1)}, "up"),
         ({"vertical_fov": 180.0}, "vertical_fov=180.0"),
         ({"near": 0.0}, "near=0.0"),
