@@ -322,13 +322,13 @@ def test_settings_reach_an_episode_and_stay_through_a_reset():
     assert stage.simulation.integrator.name == "verlet" and np.array_equal(stage.simulation.positions, x)
     assert stage.stabilities()[0].share <= 1
     stage.change(self_collision="fast")
-    assert "begun again" in stage.notes["anew"] and stage.frame.time == 0
+    assert "started again" in stage.notes["restart"] and stage.frame.time == 0
 
 
 def test_wind_begins_an_episode_anew_and_blows_in_it():
     stage = advanced(EpisodeStage("ClothReach-v0", policy="noop"), 3)
     stage.change(wind=3.0)
-    assert "begun again" in stage.notes["anew"] and stage.frame.time == 0
+    assert "started again" in stage.notes["restart"] and stage.frame.time == 0
     advanced(stage, 1)
     assert np.linalg.norm(stage.simulation.get_state().wind[0]) == pytest.approx(3.0)
 

@@ -189,7 +189,7 @@ class EpisodeStage(Stage):
         blows = (after.wind, after.gust) != (self.settings.wind, self.settings.gust)  # an episode's wind is drawn as it begins
         if blows or not self._goes_on(state):
             self.reset()
-            self.notes["anew"] = "This cannot change within an episode: it has begun again."
+            self.notes["restart"] = "This cannot change within an episode: it has started again."
 
     def _goes_on(self, state: Any) -> bool:
         """Continue from a state; returns whether it fits."""
