@@ -49,7 +49,7 @@ LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a h
 
 
 class Episodes:
-    """A batch of an id: the expert acts in even environments, and odd ones get random actions, and what is over begins anew."""
+    """A batch of an id: the expert acts in even environments, and odd ones get random actions, and what is over begins again."""
 
     def __init__(self, env_id: str, num_envs: int, threads: int, options: Row, **kwargs: Any) -> None:
         self.env: Any = gym.make_vec(
@@ -60,21 +60,21 @@ class Episodes:
 
     def reset(self, seed: int = 0) -> Row:
         observation, info = self.env.reset(seed=seed, options=self.options)
-        return self._told(observations=observation, infos=info)
+        return self._brought(observations=observation, infos=info)
 
     def step(self) -> Row:
         actions = np.array([random.uniform(-1, LETS_GO, self.env.single_action_space.shape) for random in self.random])
         actions[::2] = self.env.expert_actions()[::2]
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        told = self._told(observations=observation, rewards=reward, infos={**info, "ends": terminated | 2 * truncated})
+        brought = self._brought(observations=observation, rewards=reward, infos={**info, "ends": terminated | 2 * truncated})
         over = terminated | truncated
         if over.any():
             self.env.reset(options={**self.options, "reset_mask": over})
-        return told
+        return brought
 
-    def _told(self, **told: Any) -> Row:
+    def _brought(self, **brought: Any) -> Row:
         simulation = self.env.task.simulation
-        return {"positions": simulation.positions, "velocities": simulation.velocities, **told}
+        return {"positions": simulation.positions, "velocities": simulation.velocities, **brought}
 
 
 def environments() -> Iterator[tuple[str, str, Row, Row]]:
@@ -97,28 +97,28 @@ def of_an_id(name: str, env_id: str, options: Row, kwargs: Row) -> dict[str, Row
     except ValueError as error:
         return {name: {"digest": f"refused: {str(error)[:70]}...", "parts": {}}}
     for step in range(LATER + STEPS):
-        told = episodes.step()
+        brought = episodes.step()
         if step < STEPS:
-            early.add(**told)
+            early.add(**brought)
         if step >= LATER:
-            late.add(**told)
+            late.add(**brought)
     return {f"{name}, from 1": early.row(), f"{name}, from {LATER + 1}": late.row()}
 
 
 # --- batches ------------------------------------------------------------------------------------------------------------------
 
 
-def _environment(told: Any, env: int) -> Any:
-    return {key: _environment(value, env) for key, value in told.items()} if isinstance(told, dict) else told[env]
+def _environment(brought: Any, env: int) -> Any:
+    return {key: _environment(value, env) for key, value in brought.items()} if isinstance(brought, dict) else brought[env]
 
 
 def by_environment(episodes: Episodes, steps: int, count: int) -> list[str]:
     """A digest of what each of the first environments does in so many steps."""
     digests = [Digest() for _ in range(count)]
     for _ in range(steps):
-        told = episodes.step()
+        brought = episodes.step()
         for env, digest in enumerate(digests):
-            digest.add(**_environment(told, env))
+            digest.add(**_environment(brought, env))
     return [digest.row()["digest"] for digest in digests]
 
 
@@ -155,9 +155,9 @@ def batches(select: list[str]) -> bool:
 def tell(name: str, found: list[list[str]], reference: list[list[str]]) -> bool:
     """Print whether the environments of a batch do what they do in the first; halves of the run by environment."""
     differ = [[i for i, (a, b) in enumerate(zip(ours, theirs)) if a != b] for ours, theirs in zip(found, reference)]
-    told = "; ".join(f"part {k + 1}: {len(d)} of {len(found[0])} differ, {d[:5]}" for k, d in enumerate(differ) if d)
-    print(f"{name:<66} {told or 'same bits'}", flush=True)
-    return not told
+    brought = "; ".join(f"part {k + 1}: {len(d)} of {len(found[0])} differ, {d[:5]}" for k, d in enumerate(differ) if d)
+    print(f"{name:<66} {brought or 'same bits'}", flush=True)
+    return not brought
 
 
 # --- the command --------------------------------------------------------------------------------------------------------------

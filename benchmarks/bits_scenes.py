@@ -19,13 +19,13 @@ BENDING = ("springs", "hinge", "quadratic")
 
 
 class Digest:
-    """Of all that it is told, by part."""
+    """Of all that is added, by part."""
 
     def __init__(self) -> None:
         self.hashes: dict[str, Any] = {}
 
-    def add(self, **told: Any) -> None:
-        for part, value in told.items():
+    def add(self, **parts: Any) -> None:
+        for part, value in parts.items():
             _feed(self.hashes.setdefault(part, hashlib.sha256()), value)
 
     def row(self) -> Row:

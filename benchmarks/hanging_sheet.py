@@ -4,7 +4,7 @@
     python benchmarks/hanging_sheet.py                    # measures what the results lack, prints the tables, draws the plot
     python benchmarks/hanging_sheet.py --only ours        # one section only: ours, mujoco, static or drape
     python benchmarks/hanging_sheet.py --again            # times once more and keeps the faster time, on a machine that is shared
-    python benchmarks/hanging_sheet.py --fresh            # measures anew, about six minutes
+    python benchmarks/hanging_sheet.py --fresh            # measures again, about six minutes
 
 A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighboring corners are held; there is
 neither contact nor air.  The error is the rms distance over particles, at the end, from the same simulator's converged run, so

@@ -145,10 +145,10 @@ def main() -> None:
     RESULT.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
     print(f"{'integrator':<40} {'lanes':>5} {'ns/pass':>8} {'yardstick':>9} {'ratio':>6} {'to solves':>9}")
     for row in rows:
-        told = row["integrator"] + "".join(f", {value:g} {key}" for key, value in row["options"].items())
-        told += ", damped" if row["damped"] and row["integrator"] == "xpbd" else ""
+        label = row["integrator"] + "".join(f", {value:g} {key}" for key, value in row["options"].items())
+        label += ", damped" if row["damped"] and row["integrator"] == "xpbd" else ""
         figures = "".join(f" {row[key]:>9.2f}" for key in ("yardstick_ns", "ratio", "ratio_to_solves") if key in row)
-        print(f"{told:<40} {row['lanes']:>5} {row['ns_per_pass']:>8.2f}{figures}")
+        print(f"{label:<40} {row['lanes']:>5} {row['ns_per_pass']:>8.2f}{figures}")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ trained with
     python training/train.py --timesteps 1024000 --run FOLDER --env-kwargs '{"integrator": "xpbd", "substeps": 100}'
 
 and the like; each is named by the integrator in its own configuration.  Results are written after each cell and taken up again;
-``--fresh`` measures anew.  They are in ``results/invariance.json``, and the matrix in ``docs/transfer.png``.
+``--fresh`` measures again.  They are in ``results/invariance.json``, and the matrix in ``docs/transfer.png``.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def trained_on(run: str) -> str:
     kwargs = policies.env_kwargs(run)
     method = kwargs.get("integrator", DrapeTask.physics.integrator)
     name, options = (method, {}) if isinstance(method, str) else (method["name"], {k: v for k, v in method.items() if k != "name"})
-    told = [f"{kwargs.get('substeps', DrapeTask.physics.substeps)} substeps", *(f"{v:g} {k}" for k, v in options.items())]
-    return f"{name} ({', '.join(told)})"
+    described = [f"{kwargs.get('substeps', DrapeTask.physics.substeps)} substeps", *(f"{v:g} {k}" for k, v in options.items())]
+    return f"{name} ({', '.join(described)})"
 
 
 def print_invariance(rows: list[dict[str, Any]]) -> None:

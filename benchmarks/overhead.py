@@ -1,4 +1,4 @@
-"""What everything that is not physics costs: observation, reward, judgement, resets and the Stable-Baselines3 adapter.
+"""What everything that is not physics costs: observation, reward, evaluation, resets and the Stable-Baselines3 adapter.
 
     python benchmarks/overhead.py                    # prints, and writes benchmarks/results/overhead.json
     python benchmarks/overhead.py ClothDrape-v0      # some environments only: prints

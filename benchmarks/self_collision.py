@@ -7,7 +7,7 @@
 Sections of ``results/self_collision.json``:
 
 * maneuvers: those of ``clothgym.starts`` on sheets of a meter, five seeds each: frames (control steps of 1/60 s) with an
-  intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation told.  Modes:
+  intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation reported.  Modes:
   "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
 * drape: steps of random actions in ClothDrape-v0 with ``self_collision="strict"``, by target.
@@ -135,8 +135,12 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, s
         worst = max(worst, int(found.max()))
         count += 1
         if mode in ("fast", "strict"):
-            told = state.simulation.self_contacts
-            gap, lag, clamped = min(gap, float(told.gap.min())), max(lag, float(told.lag.max())), clamped + int(told.clamped.sum())
+            report = state.simulation.self_contacts
+            gap, lag, clamped = (
+                min(gap, float(report.gap.min())),
+                max(lag, float(report.lag.max())),
+                clamped + int(report.clamped.sum()),
+            )
         if count * FRAME >= seconds:
             break
     row: Row = {"frames": count * seeds, "intersecting": int(bad.sum()), "by_seed": bad.tolist(), "worst": worst}
@@ -146,7 +150,7 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, s
 
 
 def measure_drape(target: str, steps: int = STEPS) -> Row:
-    """Environment steps of random actions, summed over a batch; episodes begin anew when they end."""
+    """Environment steps of random actions, summed over a batch; episodes begin again when they end."""
     lanes = min(LANES, steps)
     env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=lanes, autoreset_mode="Disabled", self_collision="strict")
     options = {"target": {"shape": TARGETS[target]}}

@@ -252,8 +252,8 @@ def print_ratio(rows: list[Row]) -> None:
     ours = {row["lanes"]: row["frames/s"] for row in rows if row["engine"] == "clothgym"}
     for row in rows:
         if row["contact"] == "ipc":
-            told = ", ".join(f"{lanes} lanes {speed / row['frames/s']:.0f} times" for lanes, speed in ours.items())
-            print(f"over MuJoCo's ipc with {row['steps']} steps a frame: {told} (wanted: {TARGET_RATIO})")
+            ratios = ", ".join(f"{lanes} lanes {speed / row['frames/s']:.0f} times" for lanes, speed in ours.items())
+            print(f"over MuJoCo's ipc with {row['steps']} steps a frame: {ratios} (wanted: {TARGET_RATIO})")
 
 
 def draw(rows: list[Row], path: Path) -> None:

@@ -1,7 +1,7 @@
 """Which integrator, with how many substeps, each task should take: error against cost on the task's own sheet and control step.
 
     python benchmarks/task_accuracy.py            # measures what the results lack, prints the tables, draws the plot
-    python benchmarks/task_accuracy.py --fresh    # measures anew, some ten minutes
+    python benchmarks/task_accuracy.py --fresh    # measures again, some ten minutes
 
 * swing: the sheet, flat and held by its anchors (the gripper task's by the drape's), swings for half a second; the error is the rms
   distance of its particles from a converged run (float64, ``rk4``), by the sheet's side.

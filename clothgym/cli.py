@@ -201,7 +201,7 @@ def _warm_up(options: argparse.Namespace) -> None:
     from clothgym.simulation import Simulation
 
     def episode(env_id: str, **kwargs: Any) -> None:
-        """To the judgement: it has kernels too."""
+        """To the evaluation, which has kernels of its own."""
         env = gym.make(env_id, render_mode="rgb_array", **kwargs)
         env.reset(seed=0)
         while not env.step(env.unwrapped.expert_action())[2]:  # type: ignore[attr-defined]

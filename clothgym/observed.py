@@ -139,7 +139,7 @@ class Observed:
     @property
     def self_contacts(self) -> SelfContacts | None:
         """Contacts of each sheet with itself in the last control step; None without ``self_collision``."""
-        return self._contact.told()
+        return self._contact.report()
 
     def intersections(self) -> NDArray:
         """Number of pairs of triangles that intersect, (num_envs,); -1 where positions are not finite.

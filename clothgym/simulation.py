@@ -28,7 +28,7 @@ from clothgym.state import Fabric, Layout, State, at_rest, check_fits
 
 GRAVITY = 9.81
 SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
-AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is worked out anew at most this often [s]
+AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is computed again at most this often [s]
 
 
 class Simulation(Observed):
@@ -192,7 +192,7 @@ class Simulation(Observed):
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
 
     def _prepare(self) -> None:
-        """Make the integrator's plan, and what else the main loop is told, anew if the properties or the substeps have changed."""
+        """Renew the integrator's plan and the main loop's schedule where properties or substeps have changed."""
         if self._planned_substeps == self.substeps:
             return
         self._planned_substeps = self.substeps

@@ -65,7 +65,7 @@ class View(NamedTuple):
 
 
 class Orders(NamedTuple):
-    """What a simulation is told for the next step, live: written by those who have checked what they write, at a kernel's price.
+    """Targets for the next step, live: kernels write here what has been checked before.
 
     targets: where hands are to be [m], (block, hands, 3, lane).  openings: how far their fingers are to open, from 0 to 1,
     (block, hands, lane).  wind: velocity of the air [m/s], (block, 3, lane).

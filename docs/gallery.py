@@ -1,4 +1,4 @@
-"""The moving pictures of docs/gallery.md and of the README, made anew: every scene of the playground and every task.
+"""The moving pictures of docs/gallery.md and of the README: every scene of the playground and every task.
 
 python docs/gallery.py                  # all of them, in some minutes
 python docs/gallery.py flag cape        # some

@@ -1,4 +1,4 @@
-"""The pictures of the README, made anew.
+"""The pictures of the README.
 
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
 python docs/pictures.py --contact                                  # contact alone

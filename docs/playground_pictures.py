@@ -1,4 +1,4 @@
-"""The picture of the playground's page, made anew: python docs/playground_pictures.py"""
+"""The picture of the playground's page: python docs/playground_pictures.py"""
 
 from __future__ import annotations
 

@@ -198,8 +198,8 @@ def strain_map(axes: Any) -> None:
         drawn = LineCollection(list(flipped), array=strain, cmap="turbo", lw=0.9, clim=(0, 1.75))
         axes.add_collection(drawn)
         worst = int(np.argmax(strain))
-        told = "no limit" if limit is None else f"limit {limit:.0%}"
-        axes.text(offset, 0.62, f"{told}: {strain.max():.1%}", ha="center", fontsize=8)
+        label = "no limit" if limit is None else f"limit {limit:.0%}"
+        axes.text(offset, 0.62, f"{label}: {strain.max():.1%}", ha="center", fontsize=8)
         axes.plot(*flipped[worst].T, color="black", lw=3)
     axes.set(title="Provot's sheet: strain; black: the largest", xlim=(-0.8, 3.1), ylim=(-1.1, 0.8), aspect="equal")
     axes.axis("off")

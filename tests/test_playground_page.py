@@ -110,7 +110,7 @@ def test_the_last_frame_of_an_episode_is_read_with_its_judgement():
     visitor, _ = page("ClothReach-v0")
     while not visitor.stage.over:
         visitor.tick()
-    assert "Judged: a success" in visitor.controls["notes"].content
+    assert "Evaluated: a success" in visitor.controls["notes"].content
     assert visitor.controls["state"].content.endswith("over: reset to start again")
     assert visitor.controls["moment"].value == len(visitor.stage.recording.frames) - 1
 

@@ -1,4 +1,4 @@
-"""Self-collision: nothing passes through itself, judged by a count that knows nothing of it."""
+"""Self-collision: nothing passes through itself, by a count that knows nothing of it."""
 
 import numpy as np
 import pytest

@@ -20,7 +20,7 @@ from tqdm import tqdm
 def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int) -> tuple[NDArray, NDArray]:
     """Observations and the expert's actions, (samples, size) each, from some episodes of each environment of a batch.
 
-    noise: largest standard deviation of the disturbance; each environment draws its own anew for each of the rounds.
+    noise: largest standard deviation of the disturbance; each environment draws its own for each of the rounds.
     """
     rng = np.random.default_rng(seed)
     task = env.unwrapped.env.task  # type: ignore[attr-defined]

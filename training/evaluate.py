@@ -50,7 +50,7 @@ class Args:
     """Where to write the scores, if anywhere."""
 
     def __post_init__(self) -> None:
-        """Everything is checked here, before torch is imported; an error is told as that of a wrong flag is."""
+        """Everything is checked here, before torch is imported; errors look like those of a wrong flag."""
         self.env = checked_id(self.env)
         if self.episodes < 1:
             raise ValueError(f"--episodes {self.episodes}: must be at least 1")
@@ -159,15 +159,15 @@ def main(args: Args) -> None:
     for name in args.policy:
         kwargs |= policies.env_kwargs(name)
     kwargs |= policies.parsed_kwargs(args.env_kwargs)
-    # what the environment or a checkpoint does not take is told before anything runs
+    # what the environment or a checkpoint does not take is reported before anything runs
     with refused():
         chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
         gym.make_vec(args.env, num_envs=1, **kwargs).close()
     for name, policy in chosen.items():
         episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
         scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
-    told = f", {json.dumps(kwargs)}" if kwargs else ""
-    print(f"{args.env}{told}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
+    given = f", {json.dumps(kwargs)}" if kwargs else ""
+    print(f"{args.env}{given}, {args.episodes} episodes from seed {args.seed}\n{table(scores)}")
     if args.json is not None:
         write_json(args.json, scores[args.policy[0]] if len(scores) == 1 else scores)
         print(f"written to {args.json}")

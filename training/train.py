@@ -4,7 +4,7 @@
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
     python training/train.py --env ClothStrain-v0 --algo ppo_lagrange   # runs/ClothStrain-v0_ppo_lagrange_0
     python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
-    python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored anew
+    python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored again
 
 The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
 (Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), evaluation.json (the final
@@ -62,7 +62,7 @@ class Args:
     config: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Everything is checked here, before what is slow is imported; an error is told as that of a wrong flag is."""
+        """Everything is checked here, before what is slow is imported; errors look like those of a wrong flag."""
         self.env = checked_id(self.env)
         for name in ("timesteps", "eval_episodes", "final_episodes", "threads"):
             value = getattr(self, name)

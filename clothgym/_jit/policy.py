@@ -92,7 +92,7 @@ def kernel(function: Callable[..., Any], apart: bool = False, flags: Flags = COU
     Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
 
     apart: compile it once for all its callers, who jump to it.  Of others numba links the code into each kernel above them, and
-    optimizes it anew there: right for what is short, and minutes in all for what is long and has many callers.
+    optimizes it again there: right for what is short, and minutes in all for what is long and has many callers.
     flags: the compiler's, see ``disjoint``.
     """
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
@@ -122,7 +122,7 @@ def disjoint(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """A part of the kernels that call it, by the same policy: for a long one with one caller, and for the shortest.
 
-    It is compiled there alone.  A kernel's code is optimized anew in each kernel above it, so a chain of long ones with one caller
+    It is compiled there alone.  A kernel's code is optimized again in each kernel above it, so a chain of long ones with one caller
     each would be optimized as often as it is long.
     """
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]

@@ -33,7 +33,7 @@ def read_config(folder: Path, env_id: str | None = None) -> dict[str, Any]:
     if config.get("clothgym") != clothgym.__version__:
         raise ValueError(
             f"{str(folder)!r} was trained with clothgym {config.get('clothgym')}, this is {clothgym.__version__}: "
-            "its scores would not be comparable; train anew, or install that version"
+            "its scores would not be comparable; train again, or install that version"
         )
     if env_id not in (None, config["env"]):
         raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
@@ -77,4 +77,4 @@ def load_tensors(folder: Path, name: str = CHECKPOINT) -> dict[str, Any]:
     try:
         return torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:
-        raise ValueError(f"{str(path)!r} cannot be read as a checkpoint ({error}): train anew") from error
+        raise ValueError(f"{str(path)!r} cannot be read as a checkpoint ({error}): train again") from error

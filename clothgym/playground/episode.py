@@ -26,7 +26,7 @@ Policy = Callable[[Any, NDArray], NDArray]  # (environment, observation) -> acti
 BOXED = ("integrator", "bending", "strain_limit", "self_collision", "wind", "gust")  # settings that need a new environment
 
 
-KEPT_NOTES = ("judgement", "run", "air")  # notes that a change of settings does not affect
+KEPT_NOTES = ("evaluation", "run", "air")  # notes that a change of settings does not affect
 
 
 def expert(env: Any, observation: NDArray) -> NDArray:
@@ -101,8 +101,8 @@ class EpisodeStage(Stage):
         trained = getattr(self.policies[policy], "env_kwargs", None)
         if trained is not None and trained != self._given:
             self._begin(trained)
-            told = ", ".join(f"{name}={value!r}" for name, value in trained.items()) or "the environment's own options"
-            self.notes["run"] = f"As {policy} was trained, with {told}."
+            options = ", ".join(f"{name}={value!r}" for name, value in trained.items()) or "the environment's own options"
+            self.notes["run"] = f"As {policy} was trained, with {options}."
         self.policy = policy
 
     def reset(self, seed: int | None = None) -> None:
@@ -114,7 +114,7 @@ class EpisodeStage(Stage):
         self._dragged: dict[int, NDArray] = {}
         self._closed = np.full(len(self.hands()), self.env.task.hand_actions > 3 and not len(self.simulation.grippers))
         self._over, self._time, self._cost, self.total = False, 0.0, 0.0, 0.0
-        self.notes.pop("judgement", None)
+        self.notes.pop("evaluation", None)
         wind = self.env.task.wind
         if wind is not None and wind.speed[0] != wind.speed[1]:
             self.notes["air"] = "Each episode draws its wind, at most what the sliders show, from any side."
@@ -135,7 +135,7 @@ class EpisodeStage(Stage):
         self.total += reward
         self._over = terminated or truncated
         if self._over:
-            self.notes["judgement"] = _judgement(info, self.total)
+            self.notes["evaluation"] = _evaluation(info, self.total)
         return self._keep(self._look(info["reward_terms"]))
 
     def _look(self, terms: Mapping[str, float]) -> Frame:
@@ -278,8 +278,8 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
     )
 
 
-def _judgement(info: Mapping[str, Any], total: float) -> str:
+def _evaluation(info: Mapping[str, Any], total: float) -> str:
     if info["failure"]:
         return f"The episode failed: {info['failure'].replace('_', ' ')}. Return {total:.2f}."
     outcome = "a success" if info["is_success"] else "no success"
-    return f"Judged: {outcome}, performance {info['normalized_performance']:.2f}, return {total:.2f}."
+    return f"Evaluated: {outcome}, performance {info['normalized_performance']:.2f}, return {total:.2f}."

@@ -204,7 +204,7 @@ class SelfCollision:
         return 0 if self.options is None else self.sheet.memory.bounds.shape[1]
 
     def forgive(self, who: NDArray, blocks: slice = slice(None)) -> None:
-        """Take from particles, (blocks, particles, lanes), what they lag: one that has left a hand owes the next one nothing."""
+        """Take from particles, (blocks, particles, lanes), their lag: it ends with the attachment that they lagged behind."""
         memory = self.sheet.memory
         np.moveaxis(memory.lag[blocks], 1, 3)[who] = 0
         memory.behind[blocks] = contact_memory.largest_lag(memory.lag[blocks])
@@ -224,7 +224,7 @@ class SelfCollision:
                 stacklevel=3,
             )
 
-    def told(self) -> SelfContacts | None:
+    def report(self) -> SelfContacts | None:
         """What happened in the last control step."""
         if self.options is None:
             return None
