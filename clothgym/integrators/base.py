@@ -86,6 +86,7 @@ class Integrator:
         shared: material properties that must be the same in all environments.
         ignored: material properties that have no meaning for the method.
         limits_strain: whether the method bounds the springs' strain, whatever the forces are.
+        color: of its lines in plots.
     """
 
     name: str
@@ -105,6 +106,7 @@ class Integrator:
     shared: Properties = frozenset()
     ignored: Properties = frozenset()
     limits_strain: bool = False
+    color: str = "#8a8f98"
 
     def automatic_substeps(self, time_step: float, largest: float) -> int:
         """Number of substeps in a control step [s], for each to be at most ``safety`` times the largest substep [s]."""

@@ -53,6 +53,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 EXPLICIT_EULER = Integrator(
     "explicit_euler",
+    color="#8a8f98",
     order=1,
     cost="one force pass",
     damping="as an explicit force, and it alone can make the method stable",

@@ -238,6 +238,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 IMPLICIT_EULER = Integrator(
     "implicit_euler",
+    color="#3a8f4e",
     order=1,
     cost="a force pass, a matrix product, and one more for each iteration",
     damping="implicitly, in the matrix",

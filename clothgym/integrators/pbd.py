@@ -128,6 +128,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 PBD = Integrator(
     "pbd",
+    color="#8c6239",
     order=None,
     cost="one projection pass for each iteration",
     damping="not at all: the projections damp far more",

@@ -308,6 +308,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 PROJECTIVE_DYNAMICS = Integrator(
     "projective_dynamics",
+    color="#12a5a5",
     order=1,
     cost="a force pass and two triangular solves for each iteration",
     damping="implicitly, in the matrix and in each iteration's forces",

@@ -120,6 +120,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 RK4 = Integrator(
     "rk4",
+    color="#7b4fa3",
     order=4,
     cost="four force passes",
     damping="as a part of the derivative, at full order",

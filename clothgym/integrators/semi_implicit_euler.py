@@ -51,6 +51,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 # the bound is that of the flat sheet; stretched and folded sheets have slightly higher frequencies, hence the margin of a fifth
 SEMI_IMPLICIT_EULER = Integrator(
     "semi_implicit_euler",
+    color="#d1495b",
     order=1,
     cost="one force pass",
     damping="as an explicit force",

@@ -68,6 +68,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 VERLET = Integrator(
     "verlet",
+    color="#2f6fb5",
     order=2,
     cost="one force pass",
     damping="as an explicit force, in which it is of order 1",

@@ -303,6 +303,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
 XPBD = Integrator(
     "xpbd",
+    color="#edae49",
     order=1,
     cost="one projection pass for each iteration",
     damping="implicitly, in each projection",

@@ -9,21 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.integrators import INTEGRATORS
 from clothgym.lab.compare_plan import LANES, Row, Setting, described
 from clothgym.lab.compare_scenes import Scene
 from clothgym.render import Camera, Renderer
 
 INK, QUIET = "#2b2d42", "#8d99ae"
-COLORS = {
-    "explicit_euler": "#8a8f98",
-    "semi_implicit_euler": "#d1495b",
-    "verlet": "#2f6fb5",
-    "rk4": "#7b4fa3",
-    "implicit_euler": "#3a8f4e",
-    "projective_dynamics": "#12a5a5",
-    "pbd": "#8c6239",
-    "xpbd": "#edae49",
-}
 REFERENCE = "#c4bdb2"
 STYLES = (("-", "o"), ("--", "s"), (":", "^"))
 PANEL, ACROSS, DPI = 300, 5, 100  # pixels of a sheet's picture, sheets in a row, pixels of an inch
@@ -66,15 +57,14 @@ def draw_work_precision(results: Row, path: Path) -> None:
         if failed:
             notes.append(f"unstable with {max(failed)}" + " or fewer" * (len(failed) > 1) if stable else "always unstable")
         x, y = ([row[key] for row in stable] for key in ("ms_batch", "error_mm"))
-        look = {"ls": style, "marker": marker, "ms": 4.5, "lw": 1.5, "mfc": COLORS[name] if seen[name] == 1 else "white"}
-        axes.plot(x, np.maximum(y, FLOATING), color=COLORS[name], label="\n   ".join([label, *notes]), **look)
+        look = {"ls": style, "marker": marker, "ms": 4.5, "lw": 1.5, "mfc": INTEGRATORS[name].color if seen[name] == 1 else "white"}
+        axes.plot(x, np.maximum(y, FLOATING), color=INTEGRATORS[name].color, label="\n   ".join([label, *notes]), **look)
         if stable and seen[name] == 1:
             for row in (stable[0], stable[-1]):
                 place = row["ms_batch"], max(row["error_mm"], FLOATING)
                 beside = (4, -10) if name == "semi_implicit_euler" else (4, 4)  # verlet's line is the same
-                axes.annotate(
-                    row["substeps"], place, beside, textcoords="offset points", fontsize=7.5, color=COLORS[name], clip_on=True
-                )
+                look = {"fontsize": 7.5, "color": INTEGRATORS[name].color, "clip_on": True}
+                axes.annotate(row["substeps"], place, beside, textcoords="offset points", **look)
     scene, about = results["scene"], results["reference"]
     bound = 5 * max(scene["size"][2:])
     axes.axhline(bound, color=QUIET, lw=0.9, ls=(0, (6, 4)), zorder=0)
@@ -105,7 +95,7 @@ def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting
         outcome = f"{row['error_mm']:.3g} mm off" if row["stable"] else "unstable"
         detail = setting.variant or f"{setting.substeps} substeps"
         labels.append(f"{setting.integrator}\n{detail}, {outcome}")
-        pictures.append(_picture(scene, sheet if sheet is not None else None, COLORS[setting.integrator]))
+        pictures.append(_picture(scene, sheet if sheet is not None else None, INTEGRATORS[setting.integrator].color))
     across = min(ACROSS, len(pictures))
     down = -(-len(pictures) // across)
     figure = plt.figure(figsize=(across * PANEL / DPI, down * (PANEL + 52) / DPI), facecolor="white")
@@ -117,7 +107,7 @@ def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting
         axes.imshow(picture, aspect="auto", interpolation="antialiased")
         axes.set_axis_off()
         first, second = label.split("\n")
-        color = COLORS.get(first, INK)
+        color = INTEGRATORS[first].color if first in INTEGRATORS else INK
         middle, under = left + 0.5 / across, top - high
         unit = 1 / (down * (PANEL + 52))
         figure.text(middle, under - 6 * unit, first, ha="center", va="top", fontsize=12, weight="bold", color=color)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.lab.compare_pictures import COLORS
+from clothgym.integrators import INTEGRATORS
 from clothgym.mesh import EDGE, STRUCTURAL_X
 from clothgym.playground.recording import Frame, Recording, strains, tensions, yarns
 from clothgym.playground.stage import UNLIMITED, Hand
@@ -55,10 +55,10 @@ def spring_values(recording: Recording, frame: Frame, sheet: int, mode: str, spr
 
 def own_color(label: str) -> tuple[int, int, int] | None:
     """Color of a compared sheet: that of its integrator, paler without a strain limit; None if the label is not an integrator."""
-    color = COLORS.get(label.removesuffix(UNLIMITED))
-    if color is None:
+    method = INTEGRATORS.get(label.removesuffix(UNLIMITED))
+    if method is None:
         return None
-    red, green, blue = (int(color[k : k + 2], 16) for k in (1, 3, 5))
+    red, green, blue = (int(method.color[k : k + 2], 16) for k in (1, 3, 5))
     if label.endswith(UNLIMITED):
         red, green, blue = (round(0.35 * c + 0.65 * PALE) for c in (red, green, blue))
     return red, green, blue
