@@ -291,7 +291,7 @@ def test_a_port_in_use_gives_the_next():
         (["flagg"], "did you mean 'flag'"),
         (["--port", "99999"], "from 0 to 65535"),
         (["--replay", "nowhere.npz"], "nowhere.npz"),
-        (["--policy", "nowhere"], "policy 'nowhere': is no folder of a training run"),
+        (["--policy", "nowhere"], "no policy 'nowhere' (there are: noop, random, expert"),
     ],
 )
 def test_the_command_says_what_is_wrong(arguments, words, capsys):
