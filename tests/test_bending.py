@@ -11,7 +11,7 @@ from clothgym.elements import Elastic, element_arrays, room_for_forces
 from clothgym.forces import add_lane_forces
 from clothgym.mesh import BEND_X, NUM_KINDS, STRUCTURAL_X
 
-HINGED = ["hinge", "quadratic"]
+HINGED = [name for name, model in BENDING.items() if model.hinged]
 B = 3e-4
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from clothgym import Material, Simulation, disc, grid
-from clothgym.bending import add_hinge_forces, add_hinge_products, add_quadratic_forces, add_quadratic_products
+from clothgym.bending import BENDING, add_hinge_forces, add_hinge_products, add_quadratic_forces, add_quadratic_products
 from clothgym.elements import KINDS, Elastic, element_arrays, grid_of, grid_surface_of, is_regular, room_for_forces, surface_arrays
 from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products
 from clothgym.grid_forces import (
@@ -140,7 +140,7 @@ def test_only_regular_grids_go_by_kinds():
     assert not Simulation(mesh, integrator="xpbd").layout.by_particle
 
 
-@pytest.mark.parametrize("bending", ["springs", "quadratic", "hinge"])
+@pytest.mark.parametrize("bending", BENDING)
 def test_a_sheet_by_kinds_swings_as_one_whose_springs_are_taken_one_by_one(bending):
     """A spring that is 1e-5 longer than the others of its kind makes a grid irregular, and changes next to nothing."""
     mesh, found = grid(6, 7, 0.3, 0.3), []
