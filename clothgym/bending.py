@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
 from clothgym.checks import known
-from clothgym.elements import ROWS, BendArrays
+from clothgym.elements import WORK_ROWS, BendArrays
 from clothgym.mesh import ClothMesh
 
 # arctan(z)/z in powers of z^2, for z^2 up to tan(pi/8)^2, interpolated at Chebyshev points: error at most 8e-13
@@ -281,7 +281,7 @@ def hinge_rates(pi, pj, pk, pm, s, out):
 @inlined
 def hinge_rows(scratch, lanes):
     """The parts of ``Scratch.rows`` that hinges use: angle, rate, slopes (12, lanes), geometry (11, lanes), and two more rows."""
-    rows = scratch.reshape(scratch.size)[: ROWS * lanes].reshape((ROWS, lanes))
+    rows = scratch.reshape(scratch.size)[: WORK_ROWS * lanes].reshape((WORK_ROWS, lanes))
     return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
 
 

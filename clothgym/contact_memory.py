@@ -63,7 +63,7 @@ FIELDS = {
     "looks": Kept("environment", np.int32),
     "report": Kept("environment", np.float64, REPORT_SIZE, saved=False),
 }
-ROWS = {"contacts": MOST_CONTACTS, "constraints": MOST_CONSTRAINTS}  # for each vertex
+MOST_PER_VERTEX = {"contacts": MOST_CONTACTS, "constraints": MOST_CONSTRAINTS}  # for each vertex
 SAVED = {name: kept for name, kept in FIELDS.items() if kept.saved}
 
 
@@ -73,9 +73,9 @@ def allocate(layout: Layout, particles: int, dtype: np.dtype) -> dict[str, NDArr
     arrays: dict[str, NDArray] = {}
     for name, kept in FIELDS.items():
         columns = (kept.columns,) if kept.columns else ()
-        if kept.of in ROWS:
+        if kept.of in MOST_PER_VERTEX:
             # rows are written where they are needed only: an operating system gives no memory to what has never been touched
-            arrays[name] = np.empty((*lanes, ROWS[kept.of] * particles, *columns), kept.dtype or dtype)
+            arrays[name] = np.empty((*lanes, MOST_PER_VERTEX[kept.of] * particles, *columns), kept.dtype or dtype)
             continue
         shape = {"vector": (layout.blocks, 3, particles, layout.lanes), "particle": (layout.blocks, particles, layout.lanes)}
         arrays[name] = np.full(shape.get(kept.of, (*lanes, *columns)), kept.start, kept.dtype or dtype)
@@ -104,10 +104,10 @@ def public(memory: Any, layout: Layout) -> dict[str, NDArray]:
     state: dict[str, NDArray] = {}
     for name, kept in SAVED.items():
         array = getattr(memory, name)
-        if kept.of not in ROWS:
+        if kept.of not in MOST_PER_VERTEX:
             state[name] = (layout.vectors_to_public if kept.of == "vector" else layout.to_public)(array)
     for name, kept in SAVED.items():
-        if kept.of in ROWS:
+        if kept.of in MOST_PER_VERTEX:
             array, count = getattr(memory, name), state[kept.of]
             used = array.reshape(-1, *array.shape[2:])[: layout.num_envs, : count.max()]
             there = np.arange(used.shape[1]) < count[:, None]
@@ -129,11 +129,11 @@ def check(state: dict[str, NDArray], layout: Layout, particles: int, sound: NDAr
     advice = "give what get_state() of such a simulation gave"
     for name, kept in SAVED.items():
         given = state[name]
-        rows = given.shape[1] if kept.of in ROWS and given.ndim > 1 else 0
+        rows = given.shape[1] if kept.of in MOST_PER_VERTEX and given.ndim > 1 else 0
         fits = given.shape == _public_shape(kept, layout.num_envs, particles, rows)
-        if fits and kept.of in ROWS:
+        if fits and kept.of in MOST_PER_VERTEX:
             count = state[kept.of]
-            fits = count.min(initial=0) >= 0 and count.max(initial=0) <= rows <= ROWS[kept.of] * particles
+            fits = count.min(initial=0) >= 0 and count.max(initial=0) <= rows <= MOST_PER_VERTEX[kept.of] * particles
         if not fits:
             raise ValueError(f"the state's self_contact[{name!r}] has shape {given.shape}, which does not fit: {advice}")
         # what a gap constraint may come no closer than is infinite where it may not move
@@ -157,7 +157,7 @@ def restore(memory: Any, state: dict[str, NDArray], layout: Layout, x: NDArray) 
     begin(memory, block, lane, x)
     for name, kept in SAVED.items():
         array, given = getattr(memory, name), state[name]
-        if kept.of in ROWS:
+        if kept.of in MOST_PER_VERTEX:
             array[block, lane, : given.shape[1]] = given
         elif kept.of == "environment":
             array[block, lane] = given
@@ -176,6 +176,6 @@ def largest_lag(lag: NDArray) -> NDArray:
 
 
 def _public_shape(kept: Kept, num_envs: int, particles: int, rows: int) -> tuple[int, ...]:
-    if kept.of in ROWS:
+    if kept.of in MOST_PER_VERTEX:
         return (num_envs, rows, kept.columns)
     return {"vector": (num_envs, particles, 3), "particle": (num_envs, particles)}.get(kept.of, (num_envs,))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
-ROWS = 27  # of ``Scratch.rows``
+WORK_ROWS = 27  # of ``Scratch.rows``
 ALIKE = 1e-6  # relative difference up to which the springs of a kind count as equally long
 # kinds of springs on a grid, with the rows and columns from the first end to the second
 KINDS = ((STRUCTURAL_X, 0, 1), (STRUCTURAL_Y, 1, 0), (SHEAR, 1, 1), (SHEAR, 1, -1), (BEND_X, 0, 2), (BEND_Y, 2, 0))
@@ -86,8 +86,8 @@ class Elements(NamedTuple):
 class Scratch(NamedTuple):
     """Scratch for the forces of elements.  The content of ``rows`` is lost when a call ends.
 
-    rows: (ROWS, lanes), or (ROWS, particles) where particles are adjacent in memory.  kinds: forces of a grid's springs by kind,
-    (3, kinds, ``before`` + particles); the entries before a kind's first spring and after its last are zero, and stay so.
+    rows: (WORK_ROWS, lanes), or (WORK_ROWS, particles) where particles are adjacent in memory.  kinds: forces of a grid's springs
+    by kind, (3, kinds, ``before`` + particles); the entries before a kind's first spring and after its last are zero, and stay so.
     """
 
     rows: NDArray
@@ -251,7 +251,7 @@ def room_for_forces(x, offset):
     for o in offset:
         before = max(before, o)
     row = particles if len(offset) > 0 else lanes
-    return Scratch(np.empty((ROWS, row), x.dtype), np.zeros((3, offset.shape[0], before + particles), x.dtype))
+    return Scratch(np.empty((WORK_ROWS, row), x.dtype), np.zeros((3, offset.shape[0], before + particles), x.dtype))
 
 
 def digest_of(mesh: ClothMesh, hinged: bool, contact: str) -> NDArray[np.uint64]:

@@ -225,7 +225,7 @@ def _moments(angle, rate, weight, rigidity, tau):
 
 
 @disjoint
-def _turn(fx, fy, fz, sx, sy, sz, moment):
+def _subtract_moment(fx, fy, fz, sx, sy, sz, moment):
     """Subtract ``moment s`` from the forces on one corner of each hinge, with the slopes s of the angle there, (count,)."""
     for p in range(moment.shape[0]):
         fx[p] -= sx[p] * moment[p]
@@ -268,7 +268,7 @@ def add_grid_hinge_forces(x, v, f, elements, elastic, scratch):
         # the forces on each corner
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
             fx, fy, fz = _slices(total, at, count)
-            _turn(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
+            _subtract_moment(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
 
 
 @uncounted
@@ -298,14 +298,14 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
         _moments(angle, rate, grid.hinge_weight[family, low : low + count], -bend[0], zero)
         for m, at in ((0, low), (1, low + j), (2, low + k), (3, low + l)):
             fx, fy, fz = _slices(total, at, count)
-            _turn(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
+            _subtract_moment(fx, fy, fz, slopes[3 * m], slopes[3 * m + 1], slopes[3 * m + 2], angle)
 
 
 # --- air ----------------------------------------------------------------------------------------------------------------
 
 
 @inlined
-def _press(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
+def _air_force(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
     """Force on a triangle with sides p and q [m] in a relative wind u [m/s], in N; see ``forces.add_lane_air_forces``."""
     # normal times twice the area
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
@@ -335,7 +335,7 @@ def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, a
         ux = wx - (sa[p] * vx[p] + sb[p] * ub[p] + sc[p] * uc[p] + sd[p] * ud[p])
         uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
         uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
-        fx[p], fy[p], fz[p] = _press(
+        fx[p], fy[p], fz[p] = _air_force(
             xb[p] - x[p], yb[p] - y[p], zb[p] - z[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
         )  # fmt: skip
 
@@ -353,7 +353,7 @@ def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, 
         ux = wx - (sa[p] * vx[p] + sb[p] * ub[p] + sc[p] * uc[p] + sd[p] * ud[p])
         uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
         uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
-        fx[p], fy[p], fz[p] = _press(
+        fx[p], fy[p], fz[p] = _air_force(
             xc[p] - xd[p], yc[p] - yd[p], zc[p] - zd[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
         )  # fmt: skip
 

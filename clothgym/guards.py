@@ -17,6 +17,7 @@ from clothgym.mesh import ClothMesh
 from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
 
+BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
 FASTEST = 1e3  # [m/s]: no cloth moves at a kilometer per second
 
 

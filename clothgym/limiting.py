@@ -82,7 +82,7 @@ def _limit_strain(x, v, w, weave, limit, report):
         for l in range(lanes):
             if largest[l] > enough:
                 report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
-        _sweep(x, v, w, weave.springs, x.dtype.type(limit), enough, largest)
+        _sweep_springs(x, v, w, weave.springs, x.dtype.type(limit), enough, largest)
 
 
 def _measure_strain(x, weave, report):
@@ -141,7 +141,7 @@ def _largest_in_lanes(x, weave, largest):
 
 
 @kernel
-def _sweep(x, v, w, springs, limit, enough, largest):
+def _sweep_springs(x, v, w, springs, limit, enough, largest):
     """Visit each structural and shear spring, in the lanes whose largest strain is beyond ``enough``.
 
     With direction n from i to j and greatest length L, ``x_i <- x_i + s (|d| - L) n`` and ``x_j <- x_j - (1 - s) (|d| - L) n``.

@@ -49,10 +49,10 @@ class Simulation(Observed):
         anchor_speed: largest speed of an anchor [m/s].
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.
-        contact: "sheet": solids touch the whole sheet, and stop hands; or "particles": they touch particles only, and hands go
-            through them.
+        contact: "sheet": solids touch the whole sheet, and stop attachments; or "particles": they touch particles only, and
+            attachments go through them.
         self_collision: False, "fast" or "strict", or a dict with mode, thickness [m] and friction, see ``collisions``.
-        strain_limit: largest strain of threads and diagonals, see ``limiting``; None for none.
+        strain_limit: largest strain of yarns and diagonals, see ``limiting``; None for none.
         on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
         dtype: "float32", or "float64" for reference runs.
         threads: threads to use; all processors by default.  The outcome does not depend on it.
@@ -159,7 +159,7 @@ class Simulation(Observed):
     # --- time -----------------------------------------------------------------------------------------------------------
 
     def step(self, n: int = 1) -> None:
-        """Advance all environments by ``n`` control steps; hands move towards their targets at a bounded speed."""
+        """Advance all environments by ``n`` control steps; attachments move towards their targets at a bounded speed."""
         count("n", n)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()

@@ -40,7 +40,7 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
     across = hinges.particles[:, 2:]
     span = np.linalg.norm(x[across[:, 1]] - x[across[:, 0]], axis=1)
     area = np.bincount(corners.ravel(), weights=np.repeat(twice / 6, 3), minlength=len(x))
-    around = _beside(hinges.particles[:, :2], edges, beside)
+    around = _area_beside(hinges.particles[:, :2], edges, beside)
     springs = colored_springs(
         x,
         np.concatenate([edges, across]),
@@ -172,7 +172,7 @@ def directed_edges(triangles: NDArray) -> NDArray:
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
-def _beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
+def _area_beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
     """Area of the triangles beside the edges with these ends [m^2], (len(ends),); edges and their areas are sorted by ends."""
     size = edges.max() + 1
     ends = np.sort(ends, axis=1).astype(np.int64)

@@ -2,7 +2,7 @@
 
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
 python docs/pictures.py --contact                                  # contact alone
-python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learnt policy
+python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learned policy
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ def main() -> None:
 
     folder = Path(options.run[0])
     config = policies.read_config(folder)
-    policy = policies.learnt(folder, config["env"])
+    policy = policies.learned(folder, config["env"])
     report.film(HERE / options.run[1], config["env"], policy, config["env_kwargs"], episodes=3, stride=2)
 
 

@@ -74,7 +74,7 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
     """Ranges of material properties, as pairs of floats.
 
     Raises:
-        ValueError: an unknown property, or a range that is none of finite numbers that ``Material`` takes.
+        ValueError: an unknown property, or a range whose ends ``Material`` does not take.
     """
     checked = {}
     if not isinstance(ranges, Mapping):

@@ -246,7 +246,7 @@ def finish_one(
     own, rule = episode[e], rules[0]
     # the sheet, gathered from wherever it lies in memory, and its summary
     copy_points(x, v, b, l, points)
-    count_held(holder[b, :, l], holds)
+    count_holds(holder[b, :, l], holds)
     summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
     held = holder[b, :, l], hands[b, :, :, l], openings[b, :, l], holds
     sheet = Sheet(points[0], points[1], *held, pulls, air[e], summary, mesh)
@@ -263,7 +263,7 @@ def finish_one(
     # an environment that is over, or has diverged, keeps its last observation
     if changed:
         observe(own, rule, sheet, seen[e])
-        show(points, mesh.particles, own.origin, rule.per_side, more[e], bound, observation[e])
+        write_observation(points, mesh.particles, own.origin, rule.per_side, more[e], bound, observation[e])
 
 
 @uncounted
@@ -321,7 +321,7 @@ def copy_points(x, v, b, l, points):
 
 
 @inlined
-def count_held(holder, holds):
+def count_holds(holder, holds):
     """Particles that each attachment holds."""
     for k in range(holds.shape[0]):
         holds[k] = 0
@@ -353,7 +353,7 @@ def effort_of(moves):
 
 
 @uncounted
-def show(points, particles, origin, per_side, more, bound, observation):
+def write_observation(points, particles, origin, per_side, more, bound, observation):
     """Write an observation: points of the sheet relative to the origin, in sides, their velocities [m/s], and more."""
     # positions and velocities of the observed particles
     count = particles.shape[0]

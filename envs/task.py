@@ -55,7 +55,7 @@ class Task(TaskDefinition):
         outcome, info, terms: records of what the last step has brought, (num_envs,).
 
     Raises:
-        ValueError: an unknown mode, property, fabric or integrator, or a range that is none; the message says what would do.
+        ValueError: an unknown mode, property, fabric or integrator, or an invalid range; the message says what would do.
         TypeError: the task has neither kernels nor the methods that stand for them.
     """
 

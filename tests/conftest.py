@@ -1,4 +1,4 @@
-"""What several tests share: chains of particles whose behaviour is known in closed form."""
+"""What several tests share: chains of particles whose behavior is known in closed form."""
 
 import numpy as np
 import pytest

@@ -77,10 +77,10 @@ def test_a_group_runs_by_itself(monkeypatch, tmp_path, capsys):
     file = tmp_path / "table.json"
     assert cli.main(["bench", "--table", "--select", "springs", "--json", str(file)]) == 0
     results = json.loads(file.read_text())
-    told = capsys.readouterr().out
+    printed = capsys.readouterr().out
     assert {row["group"] for row in results["rows"]} == {"springs"}
     for row in results["rows"]:
-        assert row["now"] > 0 and np.isfinite(row["now"]) and row["what"] in told
+        assert row["now"] > 0 and np.isfinite(row["now"]) and row["what"] in printed
         assert all(share > 0 for share in row["limits"]["shares"].values())
     bandwidth = results["limits"]["bytes/s"]
     assert results["limits"]["operations/s"] > 1e8 and all(speed > 1e7 for speed in bandwidth.values())

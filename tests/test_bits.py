@@ -175,7 +175,7 @@ def test_core_lanes_of_different_fabrics(name, dtype):
     assert not batch.diverged.any()
     for lane in (0, 9, 16):
         alone = Simulation(mesh, **world)
-        alone.set_parameters(**{figure: values[lane] for figure, values in properties.items()})
+        alone.set_parameters(**{one: values[lane] for one, values in properties.items()})
         alone.reset(positions=positions)
         alone.step(20)
         assert np.array_equal(alone.positions[0], batch.positions[lane])

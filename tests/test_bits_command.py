@@ -27,9 +27,9 @@ def test_what_differs_is_told_row_by_row(bits):
 
 
 def test_digests_tell_bits_shapes_and_parts(bits):
-    def digest(**told):
+    def digest(**parts):
         made = bits.Digest()
-        made.add(**told)
+        made.add(**parts)
         return made.row()
 
     x = np.zeros(6, np.float32)

@@ -195,11 +195,11 @@ def test_bench_says_what_it_is_at(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     results = bench.run(quick=True)
     assert [len(results[section]) for section in ("start", "environments", "core")] == [2, 2, 2]
-    told = [text.split("\r")[-1].rstrip() for text in seen]
-    assert [text.split("  ")[1] for text in told] == [
+    lines = [text.split("\r")[-1].rstrip() for text in seen]
+    assert [text.split("  ")[1] for text in lines] == [
         f"{s}: {n}" for s in ("start", "environments", "core") for n in ("one", "two")
     ]
-    assert [text.split("  ")[0][-6:] for text in told] == ["0 of 2", "1 of 2"] * 3
+    assert [text.split("  ")[0][-6:] for text in lines] == ["0 of 2", "1 of 2"] * 3
 
 
 def test_warmup_says_when_it_is_done(capsys):

@@ -106,7 +106,7 @@ def test_inward_velocity_is_killed_and_nothing_is_inside(name, collider):
 
 
 def slope(name, angle, friction, seconds=1.0):
-    """A small sheet on a tilted plane (the gravity is tilted instead): distance travelled and final speed."""
+    """A small sheet on a tilted plane (the gravity is tilted instead): distance traveled and final speed."""
     mesh = grid(4, 4, 0.06, 0.06)
     simulation = Simulation(
         mesh,

@@ -110,9 +110,9 @@ def test_a_sheet_that_still_moves_is_no_success():
     *_, terminated, _, info = env.step(np.zeros(8))
     assert terminated and info["coverage"] > 0.9 and info["off_center"] < 0.1
     assert info["rms_speed"] > 0.05 and not info["is_success"]
-    calm = 1 / (1 + (info["rms_speed"] / 0.1) ** 2)
+    still = 1 / (1 + (info["rms_speed"] / 0.1) ** 2)
     share = min(info["coverage"] / info["coverage_reference"], 1)
-    assert info["normalized_performance"] == pytest.approx(share * calm / (1 + (info["off_center"] / 0.2) ** 2), rel=1e-6)
+    assert info["normalized_performance"] == pytest.approx(share * still / (1 + (info["off_center"] / 0.2) ** 2), rel=1e-6)
 
 
 def test_the_observation_is_what_the_manual_page_says():

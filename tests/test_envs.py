@@ -50,7 +50,7 @@ def skip(task, env, steps):
 def test_gymnasium_s_checker_passes_without_a_warning(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # rendering is checked too; the checker makes the environment anew for each render mode
+        # rendering is checked too; the checker makes the environment again for each render mode
         check_env(make(env_id).unwrapped)
 
 
@@ -284,10 +284,10 @@ def test_a_diverged_environment_is_contained(env_id):
     assert reward[1] < -0.4 and not truncated.any() and not info["is_success"][1]
     if ends[0]:
         assert np.array_equal(runs[1][ends[0]][0][1], runs[1][ends[0] - 1][0][1])
-    for calm, spoilt in zip(*runs):
+    for sound, spoilt in zip(*runs):
         assert np.isfinite(spoilt[0]).all() and np.isfinite(spoilt[1]).all()
-        assert np.array_equal(calm[0][[0, 2]], spoilt[0][[0, 2]])
-        assert np.array_equal(calm[1][[0, 2]], spoilt[1][[0, 2]])
+        assert np.array_equal(sound[0][[0, 2]], spoilt[0][[0, 2]])
+        assert np.array_equal(sound[1][[0, 2]], spoilt[1][[0, 2]])
 
 
 @every_id

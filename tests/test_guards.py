@@ -1,4 +1,4 @@
-"""What keeps a simulation from going wrong unseen: divergence found in its very step, told, and kept from the neighbors."""
+"""What keeps a simulation from going wrong unseen: divergence found in its very step, reported, and kept from the neighbors."""
 
 import warnings
 
@@ -46,12 +46,12 @@ def test_the_warning_names_environment_step_and_remedy_and_comes_once():
         silent.step()
         step += 1
     loud.step(step - 1) if step > 1 else None
-    with pytest.warns(RuntimeWarning) as told:
+    with pytest.warns(RuntimeWarning) as said:
         loud.step()
-    text = str(told[0].message)
+    text = str(said[0].message)
     assert text.startswith(f"environment 2 diverged in control step {step}: semi_implicit_euler with {loud.substeps} substeps")
     assert "Use more substeps" in text and "reset() restarts them" in text
-    loud.step(5)  # warnings are errors here: it is not told twice
+    loud.step(5)  # warnings are errors here: it is not reported twice
 
 
 def test_several_environments_are_told_in_one_sentence():
@@ -184,19 +184,19 @@ def test_divergence_is_part_of_the_state():
     other = Simulation(MESH, num_envs=5, anchors=[0, 4], on_divergence="raise")
     other.set_state(simulation.get_state())
     assert other.diverged.tolist() == [False, False, True, False, False]
-    other.step()  # what was known before is not told again
+    other.step()  # what was known before is not reported again
 
 
 @pytest.mark.parametrize(
-    ("state", "told"),
+    ("state", "said"),
     [
         (lambda: Simulation(grid(5, 5, 2.0, 2.0), anchors=[0]).get_state(), "another shape or size"),
         (lambda: Simulation(MESH, anchors=[0], bending="hinge").get_state(), "another bending model"),
         (lambda: None, "state=None: give what get_state"),
     ],
 )
-def test_a_state_of_another_sheet_is_refused(state, told):
-    with pytest.raises(ValueError, match=told):
+def test_a_state_of_another_sheet_is_refused(state, said):
+    with pytest.raises(ValueError, match=said):
         Simulation(MESH, anchors=[0]).set_state(state())
 
 

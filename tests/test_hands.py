@@ -11,8 +11,8 @@ MESH = grid(5, 5, 0.2, 0.2)
 STEP = 1 / 30
 REST = MESH.rest_positions
 G = 9.81
-# calms a hanging sheet in a second or two
-CALM = Material.preset("cotton", air_drag=1.5)
+# damps a hanging sheet in a second or two
+DAMPED = Material.preset("cotton", air_drag=1.5)
 
 
 def simulation(**kwargs):
@@ -81,8 +81,8 @@ def test_fingers_take_their_time_to_close_and_to_open(closing_time):
         s.grippers.move(here, goal)
         for step in range(1, 12):
             s.step()
-            travelled = min(1, step * STEP / closing_time)
-            assert s.grippers.openings[0, 0] == pytest.approx((1 - travelled) if sign > 0 else travelled, abs=1e-5)
+            traveled = min(1, step * STEP / closing_time)
+            assert s.grippers.openings[0, 0] == pytest.approx((1 - traveled) if sign > 0 else traveled, abs=1e-5)
 
 
 def test_fingers_stop_where_they_are_told():
@@ -220,7 +220,7 @@ def hang_from_a_gripper(s, steps=300):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("anchors", [[24], [20, 24], [[20, 21], [24, 23]]])
 def test_a_sheet_at_rest_pulls_with_its_weight(anchors, dtype):
-    s = simulation(anchors=anchors, material=CALM, dtype=dtype)
+    s = simulation(anchors=anchors, material=DAMPED, dtype=dtype)
     s.step(400)
     total = s.pulls()[0].sum(axis=0)
     assert total == pytest.approx([0, 0, -weight(s)[0]], abs=0.01 * weight(s)[0])
@@ -233,7 +233,7 @@ def test_a_sheet_at_rest_pulls_with_its_weight(anchors, dtype):
 
 @pytest.mark.parametrize("name", CONSISTENT)
 def test_a_gripper_feels_the_weight_that_it_took_over(name):
-    s = simulation(integrator=name, anchors=[24], grippers=[gripper(24, closing_time=0.03)], material=CALM, dtype="float64")
+    s = simulation(integrator=name, anchors=[24], grippers=[gripper(24, closing_time=0.03)], material=DAMPED, dtype="float64")
     s.step(300)
     anchored = s.pulls()[0, 0]
     hang_from_a_gripper(s, 1)
@@ -262,11 +262,11 @@ def test_the_wind_s_force_on_held_particles_is_part_of_the_pull():
 @pytest.mark.parametrize(("share", "stays"), [(0.9, False), (1.1, True)])
 @pytest.mark.parametrize("name", CONSISTENT)
 def test_cloth_slips_out_of_a_gripper_that_is_too_weak_for_its_weight(name, share, stays):
-    total = CALM.density * 0.04 * G
+    total = DAMPED.density * 0.04 * G
     s = simulation(
         integrator=name,
         num_envs=2,
-        material=CALM,
+        material=DAMPED,
         anchors=[24],
         grippers=[gripper(24, closing_time=0.03, slip_force=share * total)],
     )

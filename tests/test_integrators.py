@@ -65,16 +65,18 @@ def test_another_method_s_option_is_ignored_with_a_warning():
 # --- what they refuse -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("figure", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"])
-def test_projective_dynamics_refuses_figures_that_differ(figure):
+@pytest.mark.parametrize("changed_property", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"])
+def test_projective_dynamics_refuses_properties_that_differ(changed_property):
     """One matrix for all: a property may change for all environments, and then it does."""
     simulation = Simulation(SHEET, num_envs=3, integrator="projective_dynamics", anchors=[0], substeps=40, dtype="float64")
     simulation.step()
     before, properties = simulation.positions, simulation.parameters
-    with pytest.raises(ValueError, match=f"factorizes one matrix for all environments: {figure} cannot differ between them"):
-        simulation.set_parameters(envs=[1], **{figure: 1.5 * getattr(simulation.material, figure)})
+    with pytest.raises(
+        ValueError, match=f"factorizes one matrix for all environments: {changed_property} cannot differ between them"
+    ):
+        simulation.set_parameters(envs=[1], **{changed_property: 1.5 * getattr(simulation.material, changed_property)})
     assert np.array_equal(simulation.parameters, properties)
-    changed = {figure: 1.5 * getattr(simulation.material, figure)}
+    changed = {changed_property: 1.5 * getattr(simulation.material, changed_property)}
     simulation.set_parameters(**changed)
     simulation.reset()
     simulation.step()
@@ -84,7 +86,7 @@ def test_projective_dynamics_refuses_figures_that_differ(figure):
     )  # fmt: skip
     fresh.step()
     assert np.array_equal(simulation.positions[2], fresh.positions[0])
-    assert (figure == "bend_rigidity") or not np.array_equal(simulation.positions, before)
+    assert (changed_property == "bend_rigidity") or not np.array_equal(simulation.positions, before)
 
 
 def test_projective_dynamics_takes_what_its_matrix_does_not_know():
@@ -97,13 +99,13 @@ def test_projective_dynamics_takes_what_its_matrix_does_not_know():
     assert fallen[1] == pytest.approx(5.0 / b * (1 - np.exp(-b * 0.1)), rel=5e-3)
 
 
-@pytest.mark.parametrize("figure", ["stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"])
-def test_pbd_refuses_figures_that_mean_nothing_to_it(figure):
+@pytest.mark.parametrize("changed_property", ["stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"])
+def test_pbd_refuses_properties_that_mean_nothing_to_it(changed_property):
     simulation = Simulation(SHEET, num_envs=2, integrator="pbd")
     with pytest.raises(
-        ValueError, match=rf"pbd does not use {figure}: its options \(iterations, stretch, bend\) set its stiffness"
+        ValueError, match=rf"pbd does not use {changed_property}: its options \(iterations, stretch, bend\) set its stiffness"
     ):
-        simulation.set_parameters(**{figure: 1.5 * getattr(simulation.material, figure)})
+        simulation.set_parameters(**{changed_property: 1.5 * getattr(simulation.material, changed_property)})
     simulation.set_parameters(density=[0.1, 0.2])
 
 

@@ -16,7 +16,7 @@ BANDS = {"silk": (20, 40), "wool": (40, 70), "denim": (70, 90), "polyester": (20
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_s_figures_are_those_of_its_source(name):
+def test_a_preset_s_properties_are_those_of_its_source(name):
     """Density, E t, E t/(2 (1 + nu)) and E t^3/(12 (1 - nu^2)) of the numbers that the source names."""
     fabric = PRESETS[name]
     density, thickness, modulus, nu = map(

@@ -114,7 +114,7 @@ def test_impossible_moduli_are_refused_with_a_remedy():
     "field", ["density", "stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "drag_coefficient", "air_drag"]
 )
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
-def test_bad_material_figures_are_named(field, value):
+def test_bad_material_properties_are_named(field, value):
     with pytest.raises(ValueError, match=field):
         Material(**{field: value})
 

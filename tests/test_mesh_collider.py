@@ -111,7 +111,7 @@ def test_meshes_that_are_no_solids_are_refused(make, message):
         ({"vertices": box_mesh()[0], "triangles": box_mesh()[1], "friction": -1}, "friction"),
     ],
 )
-def test_bad_figures_are_named(arguments, message):
+def test_bad_numbers_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         MeshCollider(**arguments)
 

@@ -1,7 +1,5 @@
 """The playground's stages: scenes, comparisons, environments and recordings, without a page."""
 
-import json
-import zipfile
 from dataclasses import replace
 
 import gymnasium as gym
@@ -11,8 +9,8 @@ from stages import advanced, page
 
 from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.playground import server
-from clothgym.playground.episode import EpisodeStage, Replay
-from clothgym.playground.recording import Recording, strains, tensions, yarns
+from clothgym.playground.episode import EpisodeStage
+from clothgym.playground.recording import strains, tensions, yarns
 from clothgym.playground.scenes import SCENES, scene_named, turned_on_a_lathe
 from clothgym.playground.show import RAMP, linear, ramp
 from clothgym.playground.stage import SceneStage, Stability, why_it_burst
@@ -343,7 +341,7 @@ def test_an_environments_own_wind_is_on_the_sliders_and_can_be_stilled():
     assert not stage.simulation.get_state().wind.any() and "air" not in stage.notes
 
 
-def test_a_learnt_policy_acts_in_the_environment_that_it_was_trained_in():
+def test_a_learned_policy_acts_in_the_environment_that_it_was_trained_in():
     still = server.Learnt(lambda env, x: np.zeros((1, *env.action_space.shape), np.float32), {"wind": {"speed": [2.0, 2.0]}})
     stage = EpisodeStage("ClothReach-v0", {"run": still}, "run")
     advanced(stage, 1)
@@ -360,7 +358,7 @@ def test_a_learnt_policy_acts_in_the_environment_that_it_was_trained_in():
 def test_runs_of_the_same_name_are_told_apart(monkeypatch, tmp_path):
     runs = pytest.importorskip("clothgym.adapters.runs")
     monkeypatch.setattr(runs, "read_config", lambda folder: {"env": "ClothReach-v0", "env_kwargs": {"seen": str(folder)}})
-    monkeypatch.setattr(runs, "learnt", lambda folder, env_id: None)
+    monkeypatch.setattr(runs, "learned", lambda folder, env_id: None)
     folders = [str(tmp_path / "a" / "run"), str(tmp_path / "b" / "run")]
     start, policies = server.policies_of(folders, "")
     assert start == "ClothReach-v0"
@@ -396,61 +394,3 @@ def test_names_that_are_none_are_told_with_the_nearest():
         EpisodeStage("ClothReach-v0", policy="exprt")
     with pytest.raises(ValueError, match="no scene 'pach'; did you mean 'patch'"):
         SceneStage("pach")
-
-
-@pytest.mark.parametrize(
-    "make", [lambda: SceneStage("pawn"), lambda: EpisodeStage("ClothDrapeGripper-v0")], ids=["scene", "episode"]
-)
-def test_a_replay_equals_the_recording_to_the_bit(make, tmp_path):
-    stage = advanced(make(), 12)
-    stage.recording.save(tmp_path / "it.npz")
-    replay = Replay(Recording.load(tmp_path / "it.npz"))
-    frames = replay.recording.frames
-    assert len(frames) == 13 and replay.over and replay.advance() is frames[-1]
-    for mine, theirs in zip(frames, stage.recording.frames):
-        assert np.array_equal(mine.positions, theirs.positions) and mine.positions.dtype == np.float32
-        assert mine.solids == theirs.solids and mine.terms == theirs.terms
-        assert np.array_equal(mine.touching, theirs.touching)
-        assert all(np.array_equal(mine.readings[name], theirs.readings[name]) for name in theirs.readings)
-    mesh, given = replay.recording.mesh, stage.recording.mesh
-    assert np.array_equal(mesh.springs.particles, given.springs.particles) and mesh.shape == given.shape
-    with pytest.raises(ValueError, match="cannot be changed"):
-        replay.change(gravity=1.0)
-
-
-def test_solids_of_older_recordings_are_read(tmp_path):
-    """They had the sizes of all kinds, and yaw and rotation of their own."""
-    stage = SceneStage("box")
-    stage.recording.save(tmp_path / "new.npz")
-    with np.load(tmp_path / "new.npz") as file:
-        arrays = dict(file)
-    about = json.loads(str(arrays["about"]))
-    none = {"radius": None, "half_sides": None, "height": None, "vertices": None, "triangles": None}
-    older = none | {"center": [0, 0, 0], "color": [1, 2, 3], "yaw": 0.5, "rotation": [1, 0, 0, 0]}
-    solids = {"sphere": {"radius": 0.2}, "capsule": {"radius": 0.1, "height": 0.3}, "box": {"half_sides": [0.1, 0.2, 0.3]}}
-    for kind, sizes in solids.items():
-        about["shapes"] = [json.dumps(older | {"kind": kind} | sizes)]
-        np.savez(tmp_path / "old.npz", **(arrays | {"about": json.dumps(about)}))
-        ((collider, color),) = Recording.load(tmp_path / "old.npz").frames[0].solids
-        assert type(collider).__name__.lower() == kind and color == (1, 2, 3)
-        assert collider.center == pytest.approx((0, 0, 0.18)) and getattr(collider, "yaw", 0.5) == 0.5
-        assert all(getattr(collider, name) == (tuple(size) if name == "half_sides" else size) for name, size in sizes.items())
-
-
-def test_files_that_are_no_recordings_are_refused_and_nothing_is_unpickled(tmp_path):
-    np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    np.savez(tmp_path / "pickle.npz", about=np.array([{"a": 1}], dtype=object))
-    (tmp_path / "text.npz").write_text("cloth")
-    stage = advanced(SceneStage("patch"), 2)
-    stage.recording.save(tmp_path / "good.npz")
-    with np.load(tmp_path / "good.npz") as file:
-        arrays = dict(file)
-    np.savez(tmp_path / "broken.npz", **(arrays | {"positions": arrays["positions"][:, :, :5]}))
-    np.savez(tmp_path / "twice.npz", **(arrays | {"positions": np.repeat(arrays["positions"], 2, axis=1)}))
-    for name in ("other", "pickle", "text", "broken", "twice"):
-        with pytest.raises(ValueError, match="is no recording") as caught:
-            Recording.load(tmp_path / f"{name}.npz")
-        assert "unsafely" not in str(caught.value)
-    with pytest.raises(FileNotFoundError):
-        Recording.load(tmp_path / "nowhere.npz")
-    assert zipfile.is_zipfile(tmp_path / "good.npz") and json.loads(str(arrays["about"]))["title"] == "Pinned patch"

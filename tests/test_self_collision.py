@@ -168,7 +168,7 @@ def test_a_thin_sheet_that_is_wrung_does_not_intersect_with_it():
 
 def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
     """What may not move at all stays to the bit: if it crept by rounding, it would come through in time."""
-    monkeypatch.setitem(contact_memory.ROWS, "constraints", 0)
+    monkeypatch.setitem(contact_memory.MOST_PER_VERTEX, "constraints", 0)
     mesh = sheet(9)
     option = {"mode": "strict", "thickness": 0.012}
     wring = MANEUVERS["impossible wring"](mesh, seeds=[0, 1], thickness=0.012, time_step=1 / 60, self_collision=option)
@@ -177,7 +177,7 @@ def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
         wring.step()
         gap = min(gap, wring.simulation.self_contacts.gap.min())
     assert wring.simulation.self_contacts.clamped.min() > 100
-    assert wring.simulation.self_contacts.dropped.min() > 100  # told
+    assert wring.simulation.self_contacts.dropped.min() > 100
     # pairs move while their distance is above 1e-5 m, and what rounding takes from that is less than a hundredth
     assert 0.99e-5 < gap < 1.01e-5
     assert not wring.simulation.intersections().any()

@@ -33,7 +33,7 @@ def test_front_and_back_differ_in_color(smooth):
 def test_pattern_follows_the_material():
     draw = renderer(FACING, width=240, height=240, check=SIDE / 4, front=(200, 40, 40))
     image = draw.rgb(upright()).astype(float)
-    # the sheet's edge is about 67 pixels from the middle: stripes of about 33, in both directions, of 20 threads each
+    # the sheet's edge is about 67 pixels from the middle: stripes of about 33, in both directions, of 20 yarns each
     one_stripe = image[120 - 30 : 120 - 4, 60:180, 2].mean(axis=0)
     jumps = np.flatnonzero(np.abs(np.diff(one_stripe)) > 15) + 60
     assert np.all(np.min(np.abs(jumps[:, None] - 120 - 33.6 * np.arange(-2, 3)), axis=1) < 3)
@@ -41,19 +41,19 @@ def test_pattern_follows_the_material():
 
 
 def test_threads_lie_over_and_under_each_other():
-    """Where a colored stripe crosses a light one, up close, threads of the one and of the other alternate both ways."""
+    """Where a colored stripe crosses a light one, up close, yarns of the one and of the other alternate both ways."""
     near = Camera(eye=(0, -0.1, 0.5), target=(0, 0, 0.5), vertical_fov=60)
     image = renderer(near, width=200, height=200, check=SIDE / 12, front=(200, 40, 40)).rgb(upright()).astype(float)
-    # the picture shows 0.1155 m: a stripe is 86.6 pixels wide, and has 20 threads of 4.3
-    stripe, thread = 0.05 / 0.1155 * 200, 0.05 / 20 / 0.1155 * 200
+    # the picture shows 0.1155 m: a stripe is 86.6 pixels wide, and has 20 yarns of 4.3
+    stripe, yarn = 0.05 / 0.1155 * 200, 0.05 / 20 / 0.1155 * 200
     along, up = ((np.arange(200) - 99.5) / stripe, (99.5 - np.arange(200)) / stripe)
     warp, weft = np.floor(along) % 2, np.floor(up) % 2
-    over = (np.floor(along[None] * stripe / thread) + np.floor(up[:, None] * stripe / thread)) % 2 == 0
+    over = (np.floor(along[None] * stripe / yarn) + np.floor(up[:, None] * stripe / yarn)) % 2 == 0
     mixed = warp[None] != weft[:, None]
     light = np.where(over, warp[None], weft[:, None])
     blue = image[..., 2]
     assert np.corrcoef(light[mixed], blue[mixed])[0, 1] > 0.7
-    assert np.corrcoef(light[mixed], np.roll(blue, round(thread), axis=1)[mixed])[0, 1] < 0
+    assert np.corrcoef(light[mixed], np.roll(blue, round(yarn), axis=1)[mixed])[0, 1] < 0
 
 
 def test_cloth_and_solids_darken_the_floor():

@@ -132,15 +132,15 @@ def test_stiffness_beyond_the_bound_warns_when_it_is_set():
 
 
 def test_a_diverging_lane_leaves_its_neighbors_bits_alone():
-    s, calm = (simulation(num_envs=3, on_divergence="ignore") for _ in range(2))
+    s, sound = (simulation(num_envs=3, on_divergence="ignore") for _ in range(2))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         s.set_parameters([1], stretch_stiffness=261e3)
-    for each in (s, calm):
+    for each in (s, sound):
         each.reset(positions=MESH.rest_positions + np.random.default_rng(0).normal(scale=1e-3, size=(25, 3)))
         each.step(20)
     assert not np.isfinite(s.positions[1]).all()
-    assert np.array_equal(s.positions[[0, 2]], calm.positions[[0, 2]])
+    assert np.array_equal(s.positions[[0, 2]], sound.positions[[0, 2]])
 
 
 def test_strain_energy_and_contacts_of_a_stretched_sheet():

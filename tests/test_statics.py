@@ -211,7 +211,7 @@ def distance_at_rest(name, case, h):
     return np.linalg.norm(simulation.positions[0] - shape, axis=1).max()
 
 
-# of explicit Euler, drag alone calms what moves across the springs: its rate must exceed h w^2 of that
+# of explicit Euler, drag alone damps what moves across the springs: its rate must exceed h w^2 of that
 SUBSTEP = {"explicit_euler": 2e-4, "implicit_euler": 5e-3, "projective_dynamics": 5e-3}
 
 

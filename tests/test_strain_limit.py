@@ -89,14 +89,14 @@ def test_limiting_a_free_sheet_keeps_its_momentum():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_one_sweep_is_not_enough_and_more_are_reported(seed):
-    """Each correction stretches the neighbors: sweeps go on until the largest strain of threads and diagonals, worked out here
+    """Each correction stretches the neighbors: sweeps go on until the largest strain of yarns and diagonals, worked out here
     from the positions, is within the tolerance."""
     mesh, x, v, w = stretched(seed)
     x[[0, 5]] = mesh.rest_positions[[0, 5]]
     after, _, report = limited(mesh, x, v, w)
-    threads = mesh.springs.kind <= SHEAR
-    i, j = mesh.springs.particles[threads].T
-    left = (np.linalg.norm(after[j] - after[i], axis=1) / mesh.springs.rest_length[threads]).max() - 1
+    yarns = mesh.springs.kind <= SHEAR
+    i, j = mesh.springs.particles[yarns].T
+    left = (np.linalg.norm(after[j] - after[i], axis=1) / mesh.springs.rest_length[yarns]).max() - 1
     assert report[AFTER] == pytest.approx(left, abs=1e-12)
     assert 1 < report[USED] < 100
     assert left <= LIMIT + TOLERANCE

@@ -131,7 +131,7 @@ WRONG = {
     "evaluate --policy noop chance": "no policy 'chance'",
     "evaluate --policy .": "'.' is not the folder of a training run",
     "evaluate --policy careless": "careless: only ClothStrain-v0 has a careless expert",
-    "evaluate --policy learnt --env ClothReach-v0": "'learnt' was trained on ClothDrape-v0, not on ClothReach-v0",
+    "evaluate --policy learned --env ClothReach-v0": "'learned' was trained on ClothDrape-v0, not on ClothReach-v0",
     "evaluate --policy old": "'old' was trained with clothgym 0.0.1",
     "evaluate --episodes 0": "--episodes 0: must be at least 1",
     "evaluate --seed -1": "--seed -1: must be zero or positive",
@@ -144,7 +144,7 @@ WRONG = {
 def wrong(tmp_path, monkeypatch, scripts):
     """A folder with files to name, and no environment and no learner to be had in it."""
     (tmp_path / "thin.yml").write_text("ClothDrape-v0: {n_timesteps: 100}")
-    for name, version in (("learnt", clothgym.__version__), ("old", "0.0.1")):
+    for name, version in (("learned", clothgym.__version__), ("old", "0.0.1")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "checkpoint.pt").touch()
         (tmp_path / name / "config.json").write_text(json.dumps({"env": "ClothDrape-v0", "clothgym": version, "env_kwargs": {}}))
@@ -184,7 +184,7 @@ def test_what_an_environment_does_not_take_is_a_sentence(tmp_path):
 
 
 def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, capsys):
-    """What has been learnt is saved first."""
+    """What has been learned is saved first."""
     import endings
     import learning
 

@@ -270,23 +270,23 @@ def winds(env, steps):
 
 @every_id
 def test_wind_blows_in_every_environment(env_id):
-    calm, own, windy = (
+    windless, own, windy = (
         make_vec(env_id, 2, wind=wind) for wind in ({}, None, {"speed": [3, 3], "direction": [np.pi / 2, np.pi / 2]})
     )
-    for env in (calm, own, windy):
+    for env in (windless, own, windy):
         env.reset(seed=0)
     start = windy.get_state().simulation.positions
-    assert np.array_equal(start, calm.get_state().simulation.positions)
-    still, moved = winds(calm, 8), winds(windy, 8)
+    assert np.array_equal(start, windless.get_state().simulation.positions)
+    still, moved = winds(windless, 8), winds(windy, 8)
     assert not still[:, :, :3].any()
     assert moved[:, :, :3] == pytest.approx(np.broadcast_to([0, 3, 0], (8, 2, 3)), abs=1e-6)
-    drift = windy.get_state().simulation.positions - calm.get_state().simulation.positions
+    drift = windy.get_state().simulation.positions - windless.get_state().simulation.positions
     # a sheet that lies on the floor stays there: skin friction is less than the floor's
     lies = start[:, :, 2].max() < 0.1
     along = drift[:, :, 1].mean(axis=1)
     assert np.all(np.abs(along) < 1e-3) if lies else np.all(along > 2e-3)
     # with the keyword there is air about; without it, as the id says
-    assert calm.unwrapped.task.simulation.air_density == RHO
+    assert windless.unwrapped.task.simulation.air_density == RHO
     assert own.unwrapped.task.simulation.air_density == own.unwrapped.task.physics.air_density
 
 
@@ -313,7 +313,7 @@ def test_winds_differ_within_a_batch_and_are_the_same_for_the_same_seed(env_id):
 
 @every_id
 def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
-    """Through the end of the episode into the next one, whose wind is drawn anew."""
+    """Through the end of the episode into the next one, whose wind is drawn again."""
     env, other = make_vec(env_id, 2), make_vec(env_id, 2)
     env.reset(seed=0)
     winds(env, 5)

@@ -1,6 +1,6 @@
-"""Behaviour cloning: teach a policy what the scripted expert does, before PPO, or instead of it.
+"""Behavior cloning: teach a policy what the scripted expert does, before PPO, or instead of it.
 
-The expert is disturbed while it shows its way, each episode by a noise of its own strength, and what is learnt is what it would
+The expert is disturbed while it shows its way, each episode by a noise of its own strength, and what is learned is what it would
 do undisturbed (Laskey et al. 2017, DART): so the learner also sees how to come back.
 """
 

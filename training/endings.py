@@ -1,4 +1,4 @@
-"""How a script ends that cannot go on: with a line on stderr, without a traceback."""
+"""How a script ends on an error: with a line on stderr, without a traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Score policies on held-out episodes: one table for noop, random, the scripted expert and what was learnt.
+"""Score policies on held-out episodes: one table for noop, random, the scripted expert and what was learned.
 
     python training/evaluate.py --env ClothDrape-v0 --policy noop random expert runs/ClothDrape-v0_0 --episodes 500
 

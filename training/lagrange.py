@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 FILE = "multiplier.json"
-CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learnt to move
+CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learned to move
 
 
 class LagrangeMultiplier(BaseCallback):

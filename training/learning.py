@@ -130,7 +130,7 @@ def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, in
     """The learner of a new run, or of one that goes on, and the environment steps that it has done.
 
     Raises:
-        ValueError, TypeError: the environment or the learner does not take one of its options, or the checkpoint is none.
+        ValueError, TypeError: the environment or the learner does not take one of its options, or the checkpoint is invalid.
     """
     done = int(load_tensors(folder)["num_timesteps"]) if resume else 0
     model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
@@ -141,7 +141,7 @@ def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, in
 
 
 def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_episodes: int, final_episodes: int) -> None:
-    """Learn, with held-out evaluations on the way, and score what was learnt."""
+    """Learn, with held-out evaluations on the way, and score what was learned."""
     per_rollout = config["num_envs"] * model.n_steps
     watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), eval_episodes)
     if config["clone"] and done == 0:
@@ -187,8 +187,8 @@ def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) 
         seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + episodes))
         scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))
     print(f"{config['env']}, {episodes} held-out episodes\n{evaluate.table(scores)}")
-    learnt = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
-    evaluate.write_json(folder / "evaluation.json", learnt | {"timesteps": config["timesteps"], "references": scores})
+    learned = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
+    evaluate.write_json(folder / "evaluation.json", learned | {"timesteps": config["timesteps"], "references": scores})
     draw_learning_curve(folder, _lines(folder), {name: scores[name]["success_rate"] for name in ("noop", "expert")})
-    film(folder / "policy.gif", config["env"], policies.learnt(folder, config["env"]), config["env_kwargs"])
+    film(folder / "policy.gif", config["env"], policies.learned(folder, config["env"]), config["env_kwargs"])
     print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")

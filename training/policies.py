@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, learnt, load_tensors, read_config
+from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, learned, load_tensors, read_config
 from clothgym.registration import ACTORS, actor_named
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
-__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "learnt", "read_config"]
+__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "learned", "read_config"]
 
 
 def noop(env: Any, observations: NDArray) -> NDArray:
@@ -44,7 +44,7 @@ SCRIPTED: dict[str, Policy] = {"noop": noop, "expert": expert, "careless": carel
 
 
 def named(name: str, env_id: str, seed: int) -> Policy:
-    """The policy called noop, random, expert or careless, or the learnt one in the run's folder of that path.
+    """The policy called noop, random, expert or careless, or the learned one in the run's folder of that path.
 
     Raises:
         ValueError: no such policy, or a checkpoint of another environment or version.
@@ -54,7 +54,7 @@ def named(name: str, env_id: str, seed: int) -> Policy:
         return SCRIPTED[name]
     if name == "random":
         return random(seed)
-    return learnt(Path(name), env_id)
+    return learned(Path(name), env_id)
 
 
 def checked(name: str, env_id: str) -> None:
@@ -73,7 +73,7 @@ def checked(name: str, env_id: str) -> None:
 
 
 def env_kwargs(name: str) -> dict[str, Any]:
-    """Keyword arguments of the environment that a learnt policy was trained on; none for the others."""
+    """Keyword arguments of the environment that a learned policy was trained on; none for the others."""
     return {} if name in (*ACTORS, "careless") else dict(read_config(Path(name))["env_kwargs"])
 
 

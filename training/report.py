@@ -1,4 +1,4 @@
-"""The pictures that a run leaves: a learning curve, and a film of what was learnt."""
+"""The pictures that a run leaves: a learning curve, and a film of what was learned."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class Args:
         """Folder and configuration of the run to go on with."""
         config = policies.read_config(folder)
         if self.run is not None:
-            raise ValueError("--resume goes on in the run's own folder: leave --run away")
+            raise ValueError("--resume goes on in the run's own folder: drop --run")
         if self.timesteps is not None:
             config["timesteps"] = self.timesteps
         return folder, config

@@ -41,7 +41,7 @@ def read_config(folder: Path, env_id: str | None = None) -> dict[str, Any]:
     return {"algo": "ppo", "lagrange": {}, "clone": {}} | config
 
 
-def learnt(folder: Path, env_id: str) -> Policy:
+def learned(folder: Path, env_id: str) -> Policy:
     """The deterministic policy of a run: the best of its held-out evaluations, or the last while there is none.
 
     Raises:

@@ -1,6 +1,6 @@
 """Floor 4: what the cloth touches, solids and itself.
 
-The contact work of one substep, in the order of the main loop (``clothgym/simulation.py``):
+The contact work of one substep, in the order of the main loop (``clothgym/main_loop.py``):
 
 1. ``press`` (``self/step.py``): contacts of the sheet with itself press as at the end of the substep before.
 2. ``resolve`` (``solids/particle_contact.py``, for a grid ``solids/grid_contact.py``): solids move on and push out what is in them:

@@ -79,14 +79,14 @@ def _apart(p, q, work):
     sides_of_p = 1 if p.shape[0] == 2 else 3
     for n in range(planes):
         for e in range(3 + sides_of_p):
-            _side(p, q, e, edges[0])
+            _side_vector(p, q, e, edges[0])
             _cross(normals[n], edges[0], axis)
             if _separates(axis, p, q, size):
                 return True
     for e in range(3):
-        _side(p, q, e, edges[0])
+        _side_vector(p, q, e, edges[0])
         for f in range(3, 3 + sides_of_p):
-            _side(p, q, f, edges[1])
+            _side_vector(p, q, f, edges[1])
             _cross(edges[0], edges[1], axis)
             if _separates(axis, p, q, size):
                 return True
@@ -94,7 +94,7 @@ def _apart(p, q, work):
 
 
 @kernel
-def _side(p, q, e, out):
+def _side_vector(p, q, e, out):
     """The vector along side e of q, or side e - 3 of p: ``out``, (3,)."""
     corners = q if e < 3 else p
     start = e % 3
@@ -255,13 +255,15 @@ def _divides(t, others, i, j):
     answer = 0
     for n in range(3 if t.shape[0] == 3 else 1):
         m = (n + 1) % 3
-        inner = _turn(t[n], t[m], t[3 - n - m], i, j) if t.shape[0] == 3 else -_turn(t[n], t[m], others[0], i, j)
+        inner = (
+            _turn_of_corner(t[n], t[m], t[3 - n - m], i, j) if t.shape[0] == 3 else -_turn_of_corner(t[n], t[m], others[0], i, j)
+        )
         if inner != 1 and inner != -1:
             answer = UNSURE
             continue
         beyond, within = 0, 0
         for o in range(others.shape[0]):
-            side = _turn(t[n], t[m], others[o], i, j)
+            side = _turn_of_corner(t[n], t[m], others[o], i, j)
             beyond += side == -inner
             within += side == inner
         if beyond == others.shape[0]:
@@ -272,7 +274,7 @@ def _divides(t, others, i, j):
 
 
 @kernel
-def _turn(a, b, c, i, j):
+def _turn_of_corner(a, b, c, i, j):
     """Sign of the turn from a via b to c in the plane of axes i and j, or UNSURE."""
     left, right = (a[i] - c[i]) * (b[j] - c[j]), (a[j] - c[j]) * (b[i] - c[i])
     error = ORIENTATION * (abs(left) + abs(right)) + TINY

@@ -52,7 +52,7 @@ def surely_allowed(o: Oscillators) -> float:
 
 @disjoint
 def _turn_all(w, r, p, q, share):
-    """One component of ``_turn`` for one sheet: arrays (particles,)."""
+    """One component of ``_next_direction`` for one sheet: arrays (particles,)."""
     one, zero = p.dtype.type(1), p.dtype.type(0)
     for i in range(p.shape[0]):
         p[i] = w[i] * r[i] + share * p[i]
@@ -60,7 +60,7 @@ def _turn_all(w, r, p, q, share):
 
 
 @kernel
-def _turn(w, r, p, q, share):
+def _next_direction(w, r, p, q, share):
     """The next search direction, ``p <- M^-1 r + share p``, and the masses' part of the product with it, ``q <- M p``, in one pass.
 
     For a held particle both are zero.  r, p, q: (3, particles, lanes).  share: (lanes,).
@@ -215,7 +215,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
             if not going:
                 break
             # the search direction p, and q = (M + h D + h^2 K) p
-            _turn(w, r, p, q, step)
+            _next_direction(w, r, p, q, step)
             add_spring_products(x, p, q, elements, along, across, bend, scratch)
             add_bend_products(x, p, q, elements, bend, scratch)
             # the step length rho / (p . q), zero for lanes that are done

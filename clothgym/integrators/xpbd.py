@@ -236,7 +236,7 @@ def predict(x, v, w, start, gravity, push, drag_rate, h):
 
 
 @disjoint
-def _take(x, v, w, start, h, per_step):
+def _take_component(x, v, w, start, h, per_step):
     """One component of ``take_velocities``, on flat arrays.  per_step: ``1/h`` [1/s]."""
     zero = x.dtype.type(0)
     for e in range(x.shape[0]):
@@ -252,7 +252,9 @@ def take_velocities(x, v, w, start, h):
     gravity's ``g h^2`` to a multiple of the last bit of the position, and more so with smaller substeps.
     """
     for c in range(3):
-        _take(x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), start[c].reshape(w.size), h, x.dtype.type(1) / h)
+        _take_component(
+            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), start[c].reshape(w.size), h, x.dtype.type(1) / h
+        )
 
 
 @kernel

@@ -1,1 +1,1 @@
-"""Floor 8: what people run and other modules do not import: laboratory tests, comparisons of integrators, benchmarks."""
+"""Floor 8: what people run, and nothing below imports: laboratory tests, comparisons of integrators, benchmarks."""

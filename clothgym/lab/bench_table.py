@@ -55,7 +55,7 @@ class Case:
     springs: int = 0
     size: int = 0
 
-    def figure(self, seconds: dict[Case, float]) -> float:
+    def value(self, seconds: dict[Case, float]) -> float:
         if self.over is not None:
             return seconds[self] * self.scale / (seconds[self.over] * self.over.scale)
         less = seconds[self.beyond] * self.beyond.scale if self.beyond is not None else 0.0
@@ -65,9 +65,9 @@ class Case:
         goal, wanted = self.goal, self.wanted
         if isinstance(goal, tuple):
             factor, other = goal
-            goal = factor * other.figure(seconds)
+            goal = factor * other.value(seconds)
             wanted = f"{goal:.3g}: {factor:g} times {other.what}"
-        row = row_of(self.group, self.what, self.figure(seconds), self.unit, goal, wanted)
+        row = row_of(self.group, self.what, self.value(seconds), self.unit, goal, wanted)
         if self.visits:
             row["ns a spring"] = 1e9 * (seconds[self] - (seconds[self.beyond] if self.beyond else 0.0)) / self.visits
         if self.work is not None:

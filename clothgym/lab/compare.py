@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import progress
+from clothgym.guards import BURST
 from clothgym.lab import compare_pictures
 from clothgym.lab.bench import machine
 from clothgym.lab.compare_plan import LANES, Plan, Row, Setting, described, sheet_name
@@ -26,7 +27,6 @@ from clothgym.lab.compare_plan import plan as plan
 from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 from clothgym.simulation import Simulation
 
-BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
 VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; fewer, but so many, once they have taken so long [s]
 
 

@@ -62,7 +62,7 @@ def plan(scene: str, names: Sequence[str] | None = None, quick: bool = False) ->
     """What is to be measured; all integrators if no names are given.
 
     Raises:
-        ValueError: no such scene or integrator; the message lists those that there are.
+        ValueError: an unknown scene or integrator; the message lists the known ones.
     """
     names = tuple(dict.fromkeys(names or integrators.INTEGRATORS))
     return Plan(scene_named(scene), tuple(integrators.get(name).name for name in names), quick)

@@ -240,7 +240,7 @@ def scene_named(name: str) -> Scene:
     """The scene of that name.
 
     Raises:
-        ValueError: there is none; the message lists those that there are.
+        ValueError: an unknown name; the message lists the known ones.
     """
     known("scene", name, SCENES)
     return SCENES[name]

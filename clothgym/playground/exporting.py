@@ -44,15 +44,15 @@ def stage_named(name: str, seed: int = 0, policy: str = "expert", settings: Mapp
     scene = scene_named(bare) if bare in SCENES else None
     (scene.settings if scene else Settings()).changed(**changes)
     runs = [] if actor_named(policy) in ACTORS else [policy]
-    _, learnt = policies_of(runs, name)
+    _, learned = policies_of(runs, name)
     if bare in SCENES:
         stage: Stage = SceneStage(bare, seed=seed)
         if stage.settings.gravity == 0:
             changes = {"gravity": GRAVITY} | changes
     else:
-        own = learnt.get(bare, {})
+        own = learned.get(bare, {})
         if runs and not own:
-            raise ValueError(f"policy={policy!r}: was trained on {next(iter(learnt))}, not on {bare}")
+            raise ValueError(f"policy={policy!r}: was trained on {next(iter(learned))}, not on {bare}")
         stage = EpisodeStage(bare, own, next(iter(own), policy), seed)
     if changes:
         stage.change(**changes)

@@ -168,7 +168,7 @@ def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[s
     policies: dict[str, dict[str, Policy]] = {}
     for run, config in configs.items():
         env_id = config["env"]
-        act = runs.learnt(Path(run), env_id)
+        act = runs.learned(Path(run), env_id)
         own = policies.setdefault(env_id, {})
         name = Path(run).resolve().name
         # runs of the same name are distinguished by their full paths
@@ -205,7 +205,7 @@ def free_port(host: str, port: int, tries: int = 20) -> int:
     """The first port from this one on that nobody listens at; 0 takes any.
 
     Raises:
-        ValueError: a host that is none of this machine's, a port that is none, or no free one.
+        ValueError: an address that this machine does not have, an invalid port, or no free one.
     """
     if not 0 <= port <= 65535:
         raise ValueError(f"port={port}: must be from 0 to 65535, 0 for any that is free")

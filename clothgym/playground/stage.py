@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym import integrators
 from clothgym.checks import indices, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.guards import refusal
-from clothgym.lab.compare import BURST
+from clothgym.guards import BURST, refusal
 from clothgym.parameters import PROPERTIES, of_material
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.scenes import scene_named

@@ -53,14 +53,14 @@ def press_again(x, v, w, sheet, block, carried):
     # adding -0 changes no bit; selecting x and v instead would keep the loop from being vectorized
     negative_zero = -zero
     for c in range(3):
-        _press(
+        _apply_impulses(
             x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried,
             negative_zero
         )  # fmt: skip
 
 
 @disjoint
-def _press(x, v, w, pressed, carried, negative_zero):
+def _apply_impulses(x, v, w, pressed, carried, negative_zero):
     """Add one component of the impulses: v += change, x += carried change; each array (particles times lanes,)."""
     zero = x.dtype.type(0)
     for e in range(x.shape[0]):
@@ -85,15 +85,15 @@ def repel(x, v, w, sheet, block, h, carried):
         if memory.waited[block, l] < memory.span[block, l]:
             continue
         if lanes == 1:
-            _sweep(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
+            _sweep_contacts(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
         else:  # contacts read each particle many times, so a lane, whose values lie far apart, is copied
             own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
-            _sweep(own_x, own_v, own_w, sheet, block, l, h, carried)
+            _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, carried)
             x[:, :, l], v[:, :, l] = own_x, own_v
 
 
 @kernel
-def _sweep(x, v, w, sheet, block, l, h, carried):
+def _sweep_contacts(x, v, w, sheet, block, l, h, carried):
     """One sweep over the contacts of one lane; x, v: [m], [m/s], (3, particles), w: [1/kg], (particles,)."""
     memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]
     particles, coefficients, impulses = memory.particles[block, l], memory.coefficients[block, l], memory.impulses[block, l]

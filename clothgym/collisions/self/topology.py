@@ -119,7 +119,7 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     # what belongs to each leaf, and which leaves are not searched
     counted = [_ranges(np.bincount(of, minlength=len(leaves))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
-    begins, beside_nodes, beside_leaves = _beside(np.array(nodes), beside)
+    begins, beside_nodes, beside_leaves = _adjacent_nodes(np.array(nodes), beside)
     return Pairs(
         triangles=_int(triangles),
         edges=_int(edges),
@@ -214,7 +214,7 @@ def _compact(centers: NDArray) -> tuple[list[int], list[list[int]]]:
     return order, nodes
 
 
-def _beside(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
+def _adjacent_nodes(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
     """Adjacent nodes without children, and the pairs of their leaves not to be searched, as bits: see ``Pairs.beside``."""
     # nodes without children, and the node of each leaf
     childless = np.flatnonzero(nodes[:, NODE_NEXT] == np.arange(len(nodes)) + 1).tolist()

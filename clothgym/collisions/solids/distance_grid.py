@@ -121,7 +121,7 @@ def sweep_all(x, triangles, distance, nearest):
 
 
 @kernel
-def _side(ax, ay, bx, by):
+def _sign_of_cross(ax, ay, bx, by):
     """Sign of the cross product of two vectors; an infinitesimal shear makes it nonzero unless they are equal."""
     area = ay * bx - ax * by
     if area != 0:
@@ -146,7 +146,7 @@ def count_crossings(x, triangles, winding):
             for k in range(max(int(np.floor(min(a[2], min(b[2], c[2])))), 0), min(int(max(a[2], max(b[2], c[2]))) + 1, nz - 1) + 1):
                 # whether the line lies within the projection of the triangle: it is on the same side of all three sides
                 ay, az, by, bz, cy, cz = a[1] - j, a[2] - k, b[1] - j, b[2] - k, c[1] - j, c[2] - k
-                one, two, three = _side(by, bz, cy, cz), _side(cy, cz, ay, az), _side(ay, az, by, bz)
+                one, two, three = _sign_of_cross(by, bz, cy, cz), _sign_of_cross(cy, cz, ay, az), _sign_of_cross(ay, az, by, bz)
                 if one == 0 or one != two or two != three:
                     continue
                 # the first node beyond the crossing
