@@ -52,7 +52,7 @@ def watch(simulation: Simulation, steps: int, before: Callable[[int], None] = la
     for step in range(steps):
         before(step)
         simulation.step()
-        seen = {"limiting": simulation.limiting, "contacts": simulation.self_contacts, "hands": simulation.hand_positions}
+        seen = {"limiting": simulation.limiting, "contacts": simulation.self_contacts, "hands": simulation.attachment_positions}
         seen |= {"penetration": simulation.penetration(), "solids": simulation.collider_positions}
         digest.add(positions=simulation.positions, velocities=simulation.velocities, infos=seen)
     row = digest.row()
@@ -77,7 +77,7 @@ def in_the_wind(mesh: ClothMesh, held: tuple[int, int], integrator: str, options
     simulation.set_parameters(warn=False, wind=wind, gravity=np.outer(8 + 2 * even, (0.1, 0, -1)), **allowed)
 
     def before(step: int) -> None:
-        simulation.move_anchors(simulation.hand_positions[:, :2] + (0.002, 0, 0.004))
+        simulation.move_anchors(simulation.attachment_positions[:, :2] + (0.002, 0, 0.004))
         if step == 6:
             simulation.release([1, 3], [0, 1])
 
@@ -107,7 +107,7 @@ def folding(mesh: ClothMesh, held: tuple[int, int], mode: str, **world: Any) -> 
     simulation = Simulation(mesh, num_envs=2, **world)
     ripple = np.random.default_rng(0).normal(scale=2e-4, size=(2, mesh.num_particles, 3))
     simulation.reset(positions=mesh.rest_positions + ripple + (0, 0, 0.003))
-    start = simulation.hand_positions
+    start = simulation.attachment_positions
 
     def before(step: int) -> None:
         if step < 45:

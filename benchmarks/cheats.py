@@ -2,8 +2,8 @@
 
     python benchmarks/cheats.py            # prints, and writes benchmarks/results/cheats.json; about two minutes
 
-never: do nothing.  hold: the scripted expert, but it never lets go.  apart: pull the hands apart as fast as they go.  away: push
-the sheet against the arena's wall.  shake: full speed to and fro, to pump a reward for change.  Where the sheet has to be taken
+never: do nothing. hold: the scripted expert, but it never lets go. apart: pull the attachments apart as fast as they go. away:
+push the sheet against the arena's wall. shake: full speed to and fro, to pump a reward for change. Where the sheet has to be taken
 first, the expert does that.
 """
 
@@ -26,9 +26,9 @@ EPISODES, SEED = 100, 1_000_000
 
 
 def moves(env: Any, velocity: NDArray) -> NDArray:
-    """An action that moves each hand at a velocity, (hands, 3), and keeps hold."""
+    """An action that moves each attachment at a velocity, (attachments, 3), and keeps hold."""
     task = env.unwrapped.task
-    each = np.full((env.num_envs, task.num_hands, task.hand_actions), -1.0)
+    each = np.full((env.num_envs, task.num_attachments, task.actions_per_attachment), -1.0)
     each[:, :, :3] = velocity
     return each.reshape(env.num_envs, -1)
 
@@ -44,18 +44,18 @@ def never(env: Any, step: int) -> NDArray:
 
 def hold(env: Any, step: int) -> NDArray:
     task = env.unwrapped.task
-    actions = task.expert_actions().reshape(env.num_envs, task.num_hands, task.hand_actions).copy()
-    if task.hand_actions == 4:
+    actions = task.expert_actions().reshape(env.num_envs, task.num_attachments, task.actions_per_attachment).copy()
+    if task.actions_per_attachment == 4:
         # a gripper must open first to take anything
-        ever_held = task.episode["picked"] if _picks(task) else np.ones((env.num_envs, task.num_hands), bool)
+        ever_held = task.episode["picked"] if _picks(task) else np.ones((env.num_envs, task.num_attachments), bool)
         actions[:, :, 3] = np.where(ever_held, -1.0, actions[:, :, 3])
     return actions.reshape(env.num_envs, -1)
 
 
 def apart(env: Any, step: int) -> NDArray:
     task = env.unwrapped.task
-    hands = task.simulation.hand_positions
-    away = hands - hands.mean(axis=1, keepdims=True) if task.num_hands > 1 else hands
+    attachments = task.simulation.attachment_positions
+    away = attachments - attachments.mean(axis=1, keepdims=True) if task.num_attachments > 1 else attachments
     return moves(env, away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-9))
 
 

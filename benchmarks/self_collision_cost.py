@@ -134,7 +134,7 @@ def of_a_state(mesh: ClothMesh, x: NDArray, envs: int, anchors: list[int], frame
 
 
 def of_an_episode(make: Callable[[str], Maneuver], seconds: float = np.inf) -> dict[str, float]:
-    """Mean seconds of a frame, by mode; of each frame the faster of several runs counts, and the hands' scripts do not."""
+    """Mean seconds of a frame, by mode; of each frame the faster of several runs counts, and the attachments' scripts do not."""
     best: dict[str, NDArray] = {}
     for _ in range(ROUNDS):
         maneuvers = {mode: make(mode) for mode in MODES}

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 from clothgym.registration import register
 
 if TYPE_CHECKING:
+    from clothgym.attachments import Gripper as Gripper
     from clothgym.collisions import Box as Box
     from clothgym.collisions import Capsule as Capsule
     from clothgym.collisions import MeshCollider as MeshCollider
     from clothgym.collisions import Plane as Plane
     from clothgym.collisions import Sphere as Sphere
-    from clothgym.hands import Gripper as Gripper
     from clothgym.integrators import INTEGRATORS as INTEGRATORS
     from clothgym.material import Material as Material
     from clothgym.mesh import ClothMesh as ClothMesh
@@ -34,7 +34,7 @@ _HOMES = {
     "Box": "clothgym.collisions",
     "Capsule": "clothgym.collisions",
     "ClothMesh": "clothgym.mesh",
-    "Gripper": "clothgym.hands",
+    "Gripper": "clothgym.attachments",
     "INTEGRATORS": "clothgym.integrators",
     "Material": "clothgym.material",
     "MeshCollider": "clothgym.collisions",

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clothgym.attachments import Attachments
 from clothgym.bending import Bending
 from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids
 from clothgym.elements import Elements, SurfaceArrays, Weave
 from clothgym.forces import Energy, energy, structural_strain
 from clothgym.geometry.intersections import count_intersections
-from clothgym.hands import Hands
 from clothgym.limiting import Limiting
 from clothgym.mesh import ClothMesh
 from clothgym.state import Fabric, Layout, Orders, State, View
@@ -24,7 +24,7 @@ class Observed:
     bending: Bending
     strain_limit: float | None
     threads: int
-    _hands: Hands
+    _attachments: Attachments
     _solids: Solids
     _contact: SelfCollision
     _x: NDArray
@@ -56,8 +56,8 @@ class Observed:
     @property
     def view(self) -> View:
         """Positions, velocities, springs and attachments in the memory of the kernels.  It is not a copy, and is read only."""
-        hands = self._hands
-        return View(self._x, self._v, self._elements.springs, hands.x, hands.opening, hands.holder)
+        attachments = self._attachments
+        return View(self._x, self._v, self._elements.springs, attachments.x, attachments.opening, attachments.holder)
 
     @property
     def orders(self) -> Orders:
@@ -65,7 +65,7 @@ class Observed:
 
         ``move_anchors``, ``grippers.move`` and ``set_wind`` write to them after checking their arguments.
         """
-        return Orders(self._hands.targets, self._hands.wanted, self._fabric.wind)
+        return Orders(self._attachments.targets, self._attachments.wanted, self._fabric.wind)
 
     @property
     def parameters(self) -> NDArray:
@@ -85,17 +85,17 @@ class Observed:
     @property
     def attached(self) -> NDArray:
         """Whether each anchor holds its particle, (num_envs, anchors); a fresh copy."""
-        return self._hands.attached()
+        return self._attachments.attached()
 
     @property
-    def hand_positions(self) -> NDArray:
+    def attachment_positions(self) -> NDArray:
         """Positions of the attachments, anchors and then grippers [m], (num_envs, attachments, 3); a fresh copy."""
-        return self.layout.to_public(self._hands.x)
+        return self.layout.to_public(self._attachments.x)
 
     @property
     def blocked(self) -> NDArray:
         """Whether solids stopped or deflected an attachment in the last control step, (num_envs, attachments)."""
-        return self.layout.to_public(self._hands.blocked)
+        return self.layout.to_public(self._attachments.blocked)
 
     def pulls(self, envs: ArrayLike | None = None) -> NDArray:
         """Force of the cloth on each attachment, anchors and then grippers [N], (len(envs), attachments, 3).
@@ -108,7 +108,9 @@ class Observed:
         return self.layout.to_public(self._pulls(self.layout.at(chosen)[0]))[chosen]
 
     def _pulls(self, blocks: NDArray | None = None) -> NDArray:
-        return self._hands.pulls(self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks)
+        return self._attachments.pulls(
+            self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks
+        )
 
     def strain(self) -> NDArray:
         """Length over rest length, minus one, of the structural springs or edges, (num_envs, those springs)."""

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, guards, integrators
+from clothgym.attachments import FREE, Attachments, Gripper, Grippers
 from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
 from clothgym.collisions.solids.particle_contact import needed
 from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
 from clothgym.forces import Oscillators
-from clothgym.hands import FREE, Gripper, Grippers, Hands
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
 from clothgym.limiting import checked_limit
@@ -111,9 +111,11 @@ class Simulation(Observed):
         self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
         # what holds the sheet
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
-        self._hands = Hands(self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype)
-        self.anchors = self._hands.anchors
-        self.grippers = Grippers(self._hands)
+        self._attachments = Attachments(
+            self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype
+        )
+        self.anchors = self._attachments.anchors
+        self.grippers = Grippers(self._attachments)
         # what it touches: solids, and itself; attachments are stopped by solids with contact="sheet" alone
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self._barriers = self._solids if contact == "sheet" else Solids(self.layout, (), self.time_step, self.dtype)
@@ -137,8 +139,8 @@ class Simulation(Observed):
             at_rest(
                 mesh,
                 self.num_envs,
-                anchors=self._hands.members,
-                hands=self._hands.count,
+                anchors=self._attachments.members,
+                attachments=self._attachments.count,
                 parameters=of_material(self.material),
                 gravity=vector("gravity", gravity),
                 wind=vector("wind", wind),
@@ -170,19 +172,19 @@ class Simulation(Observed):
             held, blocks = None, slice(first, last)
             if self._contact.strict:
                 memory = self._contact.sheet.memory
-                self._hands.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
-                held = self._hands.holder[blocks].copy() if len(self.grippers) and memory.behind[blocks].any() else None
-            self._hands.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
+                self._attachments.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
+                held = self._attachments.holder[blocks].copy() if len(self.grippers) and memory.behind[blocks].any() else None
+            self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
             if held is not None:
-                self._contact.forgive(self._hands.holder[blocks] != held, blocks)
+                self._contact.forgive(self._attachments.holder[blocks] != held, blocks)
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
         for _ in range(n):
             _jit.run_spans(work, self.layout.blocks, self.threads)
             if self.colliders:
                 self._solids.end_step()
-            if self._hands.can_slip:
-                self._hands.slip(self._pulls(), self._w, self._free_w)
+            if self._attachments.can_slip:
+                self._attachments.slip(self._pulls(), self._w, self._free_w)
                 self._forgive_lag()
             self._steps += 1
             self._contact.warn(self._steps)
@@ -198,7 +200,7 @@ class Simulation(Observed):
         self._planned_substeps = self.substeps
         method, h = self.integrator, self.time_step / self.substeps
         if method.prepare is not None:
-            holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._hands.members
+            holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._attachments.members
             plan = method.prepare(Preparation(self._oscillators(0), h, holdable, self.layout.by_particle))
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
         # a share of a substep more, or rounding would make three of them two
@@ -232,25 +234,25 @@ class Simulation(Observed):
     def move_anchors(self, targets: ArrayLike) -> None:
         """Where the anchors are to be at the end of the next step [m], (num_envs, anchors, 3), as far as their speed allows."""
         shape = (self.num_envs, self.anchors.size, 3)
-        self._hands.move(slice(0, self.anchors.size), spread("targets", finite("targets", targets), shape))
+        self._attachments.move(slice(0, self.anchors.size), spread("targets", finite("targets", targets), shape))
 
     def release(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Let go: pairs of environment and anchor (its place in ``anchors``), or all anchors, or all environments."""
         block, lane, which = self._pairs(envs, anchors)
-        self._hands.let_go(block, which, lane)
+        self._attachments.let_go(block, which, lane)
         self._forgive_lag()
         self._apply_masses(block, lane)
 
     def attach(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Take hold again, where the particle now is; arguments as for ``release``."""
         block, lane, which = self._pairs(envs, anchors)
-        self._hands.hold(block, which, lane, self._x)
+        self._attachments.hold(block, which, lane, self._x)
         self._apply_masses(block, lane)
 
     def _forgive_lag(self) -> None:
-        """What has been let go no longer lags behind a hand."""
+        """What has been let go no longer lags behind an attachment."""
         if self._contact.strict and self._contact.sheet.memory.behind.any():
-            self._contact.forgive(self._hands.holder == FREE)
+            self._contact.forgive(self._attachments.holder == FREE)
 
     def _pairs(self, envs: ArrayLike | None, anchors: ArrayLike | None) -> tuple[NDArray, NDArray, NDArray]:
         """Block, lane and anchor of each pair."""
@@ -282,7 +284,7 @@ class Simulation(Observed):
         self._x[block, :, :, lane] = np.swapaxes(np.broadcast_to(x, shape), 1, 2)
         self._v[block, :, :, lane] = np.swapaxes(np.broadcast_to(v, shape), 1, 2)
         self._solids.begin(block, lane)
-        self._hands.begin(block, lane, np.broadcast_to(x, shape))
+        self._attachments.begin(block, lane, np.broadcast_to(x, shape))
         self._steps[env] = 0
         self._diverged[block, lane] = False
         self._limited[block, :, lane] = 0
@@ -340,7 +342,7 @@ class Simulation(Observed):
             positions=self.positions,
             velocities=self.velocities,
             free_inverse_mass=public(self._free_w),
-            **self._hands.public(),
+            **self._attachments.public(),
             **{name: public(value) for name, value in self._fabric._asdict().items()},
             parameters=self._parameters.copy(),
             **self._solids.public(),
@@ -369,7 +371,7 @@ class Simulation(Observed):
         self._x = self.layout.vectors_to_blocks(state.positions, dtype)
         self._v = self.layout.vectors_to_blocks(state.velocities, dtype)
         self._free_w = blocks(state.free_inverse_mass, dtype)
-        self._hands.restore(state)
+        self._attachments.restore(state)
         self._solids.restore(state)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))
         self._parameters = np.array(state.parameters, np.float64)
@@ -395,5 +397,5 @@ class Simulation(Observed):
         self._apply_masses(block, lane)
 
     def _apply_masses(self, block: NDArray, lane: NDArray) -> None:
-        """A held particle has no inverse mass: nothing but its hand moves it."""
-        self._w[block, :, lane] = np.where(self._hands.holder[block, :, lane] >= 0, 0, self._free_w[block, :, lane])
+        """A held particle has no inverse mass: nothing but its attachment moves it."""
+        self._w[block, :, lane] = np.where(self._attachments.holder[block, :, lane] >= 0, 0, self._free_w[block, :, lane])

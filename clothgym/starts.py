@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import checks
+from clothgym.attachments import Gripper
 from clothgym.checks import one_of, positive
 from clothgym.collisions import Plane
 from clothgym.geometry.intersections import find_intersections
-from clothgym.hands import Gripper
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.simulation import Simulation

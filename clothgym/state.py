@@ -52,14 +52,15 @@ class View(NamedTuple):
     """The live memory of a simulation, for kernels that read it: see the module.
 
     x, v: [m], [m/s], (block, 3, particles, lane).
-    hands: where anchors and then grippers are [m], (block, hands, 3, lane).  openings: of their fingers, (block, hands, lane).
+    attachments: where anchors and then grippers are [m], (block, attachments, 3, lane).  openings: of their fingers, (block,
+    attachments, lane).
     holder: which of them holds each particle, or -1, (block, particles, lane).
     """
 
     x: NDArray
     v: NDArray
     springs: SpringArrays
-    hands: NDArray
+    attachments: NDArray
     openings: NDArray
     holder: NDArray
 
@@ -67,8 +68,8 @@ class View(NamedTuple):
 class Orders(NamedTuple):
     """Targets for the next step, live: kernels write here what has been checked before.
 
-    targets: where hands are to be [m], (block, hands, 3, lane).  openings: how far their fingers are to open, from 0 to 1,
-    (block, hands, lane).  wind: velocity of the air [m/s], (block, 3, lane).
+    targets: where attachments are to be [m], (block, attachments, 3, lane).  openings: how far their fingers are to open, from 0 to
+    1, (block, attachments, lane).  wind: velocity of the air [m/s], (block, 3, lane).
     """
 
     targets: NDArray
@@ -156,9 +157,9 @@ class State:
         positions, velocities: [m], [m/s], (num_envs, particles, 3).
         free_inverse_mass: inverse masses were nothing held [1/kg], (num_envs, particles).
         anchors: the anchored particles, (num_envs, anchors).
-        holder: which hand holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
-        hand_positions, hand_targets: where each hand is and is going [m], (num_envs, hands, 3).
-        openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, hands).
+        holder: which attachment holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
+        attachment_positions, attachment_targets: where each attachment is and is going [m], (num_envs, attachments, 3).
+        openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, attachments).
         stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
         parameters: the material properties they came from, (num_envs, properties).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
@@ -174,8 +175,8 @@ class State:
     free_inverse_mass: NDArray
     anchors: NDArray
     holder: NDArray
-    hand_positions: NDArray
-    hand_targets: NDArray
+    attachment_positions: NDArray
+    attachment_targets: NDArray
     openings: NDArray
     wanted_openings: NDArray
     stiffness: NDArray
@@ -244,7 +245,7 @@ def check_fits(state: State, own: State) -> None:
         raise ValueError(f"the state holds positions of shape {state.positions.shape}, {here}")
     if not np.array_equal(state.anchors, own.anchors):
         raise ValueError(f"the state has anchors {state.anchors[:1].tolist()}, this simulation {own.anchors[:1].tolist()}")
-    for name, what in (("hand_positions", "hands (anchors, then grippers)"), ("colliders", "colliders")):
+    for name, what in (("attachment_positions", "attachments (anchors, then grippers)"), ("colliders", "colliders")):
         here, there = getattr(own, name).shape, getattr(state, name).shape
         if len(there) == 3 and there[1] != here[1]:
             raise ValueError(f"the state has {there[1]} {what}, this simulation {here[1]}")
@@ -263,18 +264,16 @@ def check_fits(state: State, own: State) -> None:
             raise ValueError(f"the state's {name} holds a value that is not finite: {advice}")
     if state.free_inverse_mass.min() < 0:
         raise ValueError(f"the state's free_inverse_mass holds {state.free_inverse_mass.min():g}: {advice}")
-    hands = own.hand_positions.shape[1]
-    if state.holder.min() < -1 or state.holder.max() >= hands:
-        raise ValueError(
-            f"the state's holder names hands from {state.holder.min()} to {state.holder.max()}, there are {hands}: {advice}"
-        )
+    low, high, count = state.holder.min(), state.holder.max(), own.attachment_positions.shape[1]
+    if low < -1 or high >= count:
+        raise ValueError(f"the state's holder names attachments from {low} to {high}, there are {count}: {advice}")
 
 
 def at_rest(
     mesh: ClothMesh,
     num_envs: int,
     anchors: NDArray,
-    hands: int,
+    attachments: int,
     parameters: NDArray,
     gravity: NDArray,
     wind: NDArray,
@@ -284,8 +283,8 @@ def at_rest(
 ) -> State:
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
-    anchors: particles, (anchors,).  hands: how many.  parameters: (properties,).  gravity, wind: (3,).  colliders: (colliders,
-    rows).  contact: of self-collision, see ``contact_memory.blank``.
+    anchors: particles, (anchors,).  attachments: how many.  parameters: (properties,).  gravity, wind: (3,).  colliders:
+    (colliders, rows).  contact: of self-collision, see ``contact_memory.blank``.
     """
 
     def each(value: NDArray) -> NDArray:
@@ -297,10 +296,10 @@ def at_rest(
         free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
         anchors=each(anchors),
         holder=np.full((num_envs, mesh.num_particles), -1, np.int16),
-        hand_positions=np.zeros((num_envs, hands, 3)),
-        hand_targets=np.zeros((num_envs, hands, 3)),
-        openings=np.zeros((num_envs, hands)),
-        wanted_openings=np.zeros((num_envs, hands)),
+        attachment_positions=np.zeros((num_envs, attachments, 3)),
+        attachment_targets=np.zeros((num_envs, attachments, 3)),
+        openings=np.zeros((num_envs, attachments)),
+        wanted_openings=np.zeros((num_envs, attachments)),
         stiffness=np.zeros((num_envs, NUM_KINDS)),
         rigidity=np.zeros(num_envs),
         damping_time=np.zeros(num_envs),

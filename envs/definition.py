@@ -55,7 +55,7 @@ class TaskDefinition:
     Attributes:
         physics: the sheet, its fabric, what holds it, and how time is stepped.
         acting_steps: steps after which the agent's time is up; settling_steps: those that follow, in which actions are ignored.
-        hand_actions: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
+        actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
         observations: what is observed beside the points of the sheet, in that order.
         points_relative_to: what the observed points of the sheet are relative to, ``episode["origin"]``, for the page.
         position_bound: of these points, in sides.
@@ -71,7 +71,7 @@ class TaskDefinition:
     physics: ClassVar[Physics]
     acting_steps: ClassVar[int]
     settling_steps: ClassVar[int] = 0
-    hand_actions: ClassVar[int] = 3
+    actions_per_attachment: ClassVar[int] = 3
     kernels: ClassVar[Kernels] = IN_NUMPY
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
     observations: ClassVar[tuple[Observation, ...]] = (Observation("time_left", "share of the time left", function=time_left),)
@@ -87,7 +87,7 @@ class TaskDefinition:
 
     # what ``Task`` keeps, and these methods read and write
     num_envs: int
-    num_hands: int
+    num_attachments: int
     simulation: Simulation
     episode: NDArray
     info: NDArray
@@ -163,7 +163,7 @@ class TaskDefinition:
 
     def expert_actions(self) -> NDArray:
         """What a scripted expert does now, (num_envs, numbers); it sees the whole state.  By default it keeps still."""
-        return np.zeros((self.num_envs, self.hand_actions * self.num_hands))
+        return np.zeros((self.num_envs, self.actions_per_attachment * self.num_attachments))
 
     # --- picture --------------------------------------------------------------------------------------------------------
 
@@ -181,8 +181,8 @@ class TaskDefinition:
 
     def markers(self, env: int) -> list[Any]:
         """What is drawn and casts no shadow: by default the anchors that hold the sheet."""
-        hands, attached = self.simulation.hand_positions[env], self.simulation.attached[env]
-        return [(x, HELD) for x, held in zip(hands, attached) if held]
+        attachments, attached = self.simulation.attachment_positions[env], self.simulation.attached[env]
+        return [(x, HELD) for x, held in zip(attachments, attached) if held]
 
     def camera(self) -> Camera:
         """Where the scene is seen from; by default the whole arena from the front and right."""

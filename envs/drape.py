@@ -61,7 +61,7 @@ class DrapeTask(Task):
     )  # fmt: skip
     acting_steps = 60
     settling_steps = 40
-    hand_actions = 4
+    actions_per_attachment = 4
     observations = draping.observations(2, "whether each corner is held")
     points_relative_to = draping.RELATIVE_TO
     evaluation = draping.EVALUATION
@@ -110,11 +110,11 @@ class DrapeTask(Task):
         low = np.maximum(tops[:, 2] - EXPERT_DROP * SIDE, 0.02)
         goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * SIDE)], axis=1)
         # half of the way in each step, as far as the speed goes
-        move = (goal - middle) / (2 * self.physics.time_step * self.physics.hand_speed)
+        move = (goal - middle) / (2 * self.physics.time_step * self.physics.attachment_speed)
         length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
         move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[:, None]
         release = arrived & (np.abs(middle[:, 2] - low) < 0.02)
-        actions = np.empty((self.num_envs, self.num_hands, 4))
+        actions = np.empty((self.num_envs, self.num_attachments, 4))
         actions[:, :, :3] = move[:, None]
         actions[:, :, 3] = np.where(release, 1.0, -1.0)[:, None]
         return actions.reshape(self.num_envs, -1)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
+from clothgym.attachments import Gripper
 from clothgym.collisions import Collider
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
@@ -23,7 +24,6 @@ from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import Target
 from clothgym.envs.vector import ClothVectorEnv
-from clothgym.hands import Gripper
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
@@ -59,7 +59,7 @@ def _potential(own, rules, sheet):
     taken = 0.0
     for k in range(rules.places.shape[0]):
         place = rules.places[k]
-        away = distance(sheet.x[:, place], sheet.hands[k]) / (PICK_SCALE * rules.side)
+        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
         taken += 1.0 if sheet.holder[place] >= 0 else 0.5 / (1 + away**2)
     return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * covering(own, rules, sheet)
 
@@ -69,10 +69,10 @@ def _observe(own, rules, sheet, seen):
     """What is observed in both draping tasks, and each gripper: its tip, the way to its place, its fingers."""
     observe_target(own, rules, sheet, seen)
     for k in range(rules.places.shape[0]):
-        hand, place = sheet.hands[k], rules.places[k]
+        attachment, place = sheet.attachments[k], rules.places[k]
         for c in range(3):
-            seen.grippers[k, c] = (hand[c] - own.top[c]) / rules.side
-            seen.grippers[k, 3 + c] = (sheet.x[c, place] - hand[c]) * (10 / rules.side)
+            seen.grippers[k, c] = (attachment[c] - own.top[c]) / rules.side
+            seen.grippers[k, 3 + c] = (sheet.x[c, place] - attachment[c]) * (10 / rules.side)
         seen.grippers[k, 6] = sheet.openings[k]
 
 
@@ -90,7 +90,7 @@ def _observations(grippers: int) -> tuple[Observation, ...]:
 class DrapeGripperTask(GripperTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
-    physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.hand_speed, reach=REACH),) * 2)
+    physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.attachment_speed, reach=REACH),) * 2)
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
         _potential, draping.evaluate_cover, _observe, act=_take, account=draping.account_reference, fingers=close_or_open
@@ -164,8 +164,8 @@ class DrapeGripperTask(GripperTask):
         Without memory: where the grippers are, and what they hold, says which part of the way they are on.
         """
         episode, grippers = self.episode, self.simulation.grippers
-        hands, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
-        to_place = self.simulation.positions[:, self.places] - hands
+        attachments, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
+        to_place = self.simulation.positions[:, self.places] - attachments
         own = grippers.holder[:, self.places] >= 0
         ready = np.logical_and.reduce(own, axis=1, keepdims=True)
         begun = np.logical_and.reduce(episode["picked"], axis=1, keepdims=True)
@@ -173,20 +173,20 @@ class DrapeGripperTask(GripperTask):
         # over the target, both at the height of the lower one's way, as far apart as the corners are at rest
         beyond = tops[..., 1] + EXPERT_BEYOND * SIDE
         low = np.maximum(tops[..., 2] - EXPERT_DROP * SIDE, 0.02)
-        arrived = np.abs(hands[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
+        arrived = np.abs(attachments[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
         lift = tops[..., 2] + EXPERT_LIFT * SIDE
-        high = hands[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * SIDE
-        goal = np.empty_like(hands)
+        high = attachments[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * SIDE
+        goal = np.empty_like(attachments)
         goal[..., 0] = tops[..., 0] + SHEET.rest_positions[self.places, 0]
-        goal[..., 1] = np.where(high | arrived, beyond, hands[..., 1])
+        goal[..., 1] = np.where(high | arrived, beyond, attachments[..., 1])
         goal[..., 2] = np.where(arrived, low, lift)
-        carry = (goal - hands) / 2
-        down = arrived & (np.abs(hands[..., 2] - low) < 0.03)
+        carry = (goal - attachments) / 2
+        down = arrived & (np.abs(attachments[..., 2] - low) < 0.03)
 
         # half of the way in each step, as far as the speed goes
         move = np.where(ready[..., None], carry, np.where((begun & ~ready)[..., None], (0.0, 0.0, 0.1), to_place / 2))
         move = np.where((own & ~ready)[..., None], 0.0, move)
-        move /= self.physics.time_step * self.physics.hand_speed
+        move /= self.physics.time_step * self.physics.attachment_speed
         move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
         near = length(to_place) < REACH / 2
         grip = np.where(begun & (down | ~ready), 1.0, np.where(near | own, -1.0, 1.0))

@@ -30,7 +30,7 @@ PHYSICS = Physics(
     time_step=1 / 30,
     integrator="semi_implicit_euler",
     substeps=50,
-    hand_speed=1.0,
+    attachment_speed=1.0,
     air_density=0.0,
 )
 

@@ -35,7 +35,7 @@ class GripperTask(Task):
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
     """
 
-    hand_actions = 4
+    actions_per_attachment = 4
     kernels = IN_NUMPY._replace(fingers=close_or_open)
     arguments: ClassVar = {"slip_force": "pull at which the cloth slips out of a gripper [N]"}
 

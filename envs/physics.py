@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.attachments import Gripper
 from clothgym.checks import number
 from clothgym.guards import refusal
-from clothgym.hands import Gripper
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
 from clothgym.mesh import ClothMesh
@@ -31,7 +31,7 @@ class Physics:
         mesh, material: the sheet and its fabric.
         time_step: control step [s].
         integrator, substeps: how it is advanced.
-        hand_speed: speed limit of anchors and grippers [m/s].
+        attachment_speed: speed limit of anchors and grippers [m/s].
         anchors, grippers: see ``Simulation``.
         air_density: [kg/m^3]; 0 where the linear drag alone stands for the air.
         wind: what the air does, unless the environment's keyword says otherwise.
@@ -42,7 +42,7 @@ class Physics:
     time_step: float
     integrator: str
     substeps: int
-    hand_speed: float
+    attachment_speed: float
     anchors: tuple[int | tuple[int, ...], ...] = ()
     grippers: tuple[Gripper, ...] = ()
     air_density: float = AIR_DENSITY

@@ -76,7 +76,7 @@ def _evaluate(own, rules, sheet, info):
 def _observe(own, rules, sheet, seen):
     """The way that is left to the driven corner, and the time."""
     for c in range(3):
-        seen.way[c] = (own.goal[c] - rules.hangs[c] - sheet.hands[0, c]) * (10 / rules.side)
+        seen.way[c] = (own.goal[c] - rules.hangs[c] - sheet.attachments[0, c]) * (10 / rules.side)
     seen.time_left = 1 - own.step / rules.acting_steps
 
 
@@ -89,7 +89,7 @@ class ReachTask(Task):
         time_step=1 / 15,
         integrator="semi_implicit_euler",
         substeps=50,
-        hand_speed=0.5,
+        attachment_speed=0.5,
         anchors=(DRIVEN,),
         air_density=0.0,
     )
@@ -145,11 +145,11 @@ class ReachTask(Task):
 
     def expert_actions(self) -> NDArray:
         """To the place from which the corner hangs in the goal, ever slower: the air brings the sheet to rest."""
-        return EXPERT_GAIN * self._way() / self.physics.hand_speed
+        return EXPERT_GAIN * self._way() / self.physics.attachment_speed
 
     def _way(self) -> NDArray:
         """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
-        return self.episode["goal"] - hanging()[FREE] - self.simulation.hand_positions[:, 0]
+        return self.episode["goal"] - hanging()[FREE] - self.simulation.attachment_positions[:, 0]
 
     def markers(self, env: int) -> list[Any]:
         goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE)

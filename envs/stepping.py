@@ -157,7 +157,7 @@ class Sheet(NamedTuple):
     """One environment as a task's kernels see it, wherever it lies in memory.
 
     x, v: [m], [m/s], (3, particles), contiguous.  holder: which attachment holds each particle, or -1, (particles,).
-    hands: where the attachments are, anchors first, then grippers [m], (attachments, 3).  openings: of their fingers,
+    attachments: where the attachments are, anchors first, then grippers [m], (attachments, 3).  openings: of their fingers,
     (attachments,).  holds: particles that each holds, (attachments,).
     pulls: of the sheet at the attachments [N], (attachments, 3), for tasks that ask for them.  air: the wind of each step [m/s],
     (steps, 3).  summary: see ``measures.summarize``.
@@ -166,7 +166,7 @@ class Sheet(NamedTuple):
     x: NDArray
     v: NDArray
     holder: NDArray
-    hands: NDArray
+    attachments: NDArray
     openings: NDArray
     holds: NDArray
     pulls: NDArray
@@ -219,27 +219,27 @@ def apply_actions(actions, block, lane, rules, episode, air, outcome, targets, w
 
 
 def finish_step(
-    first, last, envs, block, lane, begins, x, v, holder, hands, openings, pulls, mesh, rules, episode, air, outcome, info, terms,
-    seen, more, bound, observation,
+    first, last, envs, block, lane, begins, x, v, holder, attachments, openings, pulls, mesh, rules, episode, air, outcome, info,
+    terms, seen, more, bound, observation,
 ):  # fmt: skip
     """Score and observe environments ``envs[first:last]`` after a control step; or as their episodes begin, if it ``begins``.
 
-    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, holder, hands, openings: a simulation's, see ``state.View``.
+    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, holder, attachments, openings: a simulation's, see ``state.View``.
     pulls: (len(envs), attachments, 3).  more: ``seen`` as numbers.
     """
     # room for one environment's ``Sheet``, used for one after the other
     points, summary = np.empty((2, 3, holder.shape[1]), x.dtype), np.empty(SUMMARY, x.dtype)
-    holds = np.empty(hands.shape[1], np.int64)
+    holds = np.empty(attachments.shape[1], np.int64)
     for i in range(first, last):
         finish_one(
-            envs[i], block[i], lane[i], begins, x, v, holder, hands, openings, pulls[i], mesh, rules, episode, air, outcome, info,
-            terms, seen, more, bound, observation, points, summary, holds,
+            envs[i], block[i], lane[i], begins, x, v, holder, attachments, openings, pulls[i], mesh, rules, episode, air, outcome,
+            info, terms, seen, more, bound, observation, points, summary, holds,
         )  # fmt: skip
 
 
 @uncounted
 def finish_one(
-    e, b, l, begins, x, v, holder, hands, openings, pulls, mesh, rules, episode, air, outcome, info, terms, seen, more, bound,
+    e, b, l, begins, x, v, holder, attachments, openings, pulls, mesh, rules, episode, air, outcome, info, terms, seen, more, bound,
     observation, points, summary, holds,
 ):  # fmt: skip
     """The same for environment ``e`` in block ``b`` and lane ``l``; points, summary, holds: room for its ``Sheet``."""
@@ -248,13 +248,13 @@ def finish_one(
     copy_points(x, v, b, l, points)
     count_holds(holder[b, :, l], holds)
     summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
-    held = holder[b, :, l], hands[b, :, :, l], openings[b, :, l], holds
+    held = holder[b, :, l], attachments[b, :, :, l], openings[b, :, l], holds
     sheet = Sheet(points[0], points[1], *held, pulls, air[e], summary, mesh)
     if begins:
         # an episode's start: attachments stay where they are, and the potential has its first value
-        for k in range(hands.shape[1]):
+        for k in range(attachments.shape[1]):
             for c in range(3):
-                own.targets[k, c] = sheet.hands[k, c]
+                own.targets[k, c] = sheet.attachments[k, c]
         measure(own, rule, sheet)
         own.potential = potential(own, rule, sheet)
         changed = True

@@ -64,7 +64,7 @@ WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colors of the markers
 def _to_places(own, sheet):
     """Distance of each clip from its place at the next way-point [m]."""
     places = own.places[own.next]
-    return distance(places[0], sheet.hands[0]), distance(places[1], sheet.hands[1])
+    return distance(places[0], sheet.attachments[0]), distance(places[1], sheet.attachments[1])
 
 
 @inlined
@@ -135,13 +135,13 @@ def _observe(own, rules, sheet, seen):
     following = min(own.next + 1, WAYPOINTS - 1)
     for k in range(2):
         for c in range(3):
-            seen.to_next[k, c] = (own.places[own.next, k, c] - sheet.hands[k, c]) * (5 / rules.side)
-            seen.to_following[k, c] = (own.places[following, k, c] - sheet.hands[k, c]) / rules.side
+            seen.to_next[k, c] = (own.places[own.next, k, c] - sheet.attachments[k, c]) * (5 / rules.side)
+            seen.to_following[k, c] = (own.places[following, k, c] - sheet.attachments[k, c]) / rules.side
         seen.pulls[k] = own.tension[k] / rules.weight
     # where on the way the pair is
     seen.at_goal = own.next == WAYPOINTS - 1
     for c in range(2):
-        seen.post[c] = (own.post[c] - (sheet.hands[0, c] + sheet.hands[1, c]) / 2) / rules.side
+        seen.post[c] = (own.post[c] - (sheet.attachments[0, c] + sheet.attachments[1, c]) / 2) / rules.side
     # the air, the strain over the threshold, and the time
     for c in range(3):
         seen.wind[c] = sheet.air[min(own.step, sheet.air.shape[0] - 1), c]
@@ -160,7 +160,7 @@ class StrainTask(Task):
         time_step=1 / 30,
         integrator="semi_implicit_euler",
         substeps=35,
-        hand_speed=1.0,
+        attachment_speed=1.0,
         anchors=CLIPS,
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
     )
@@ -286,14 +286,14 @@ class StrainTask(Task):
 
     def careless_actions(self) -> NDArray:
         """Each clip straight to its place, as fast as it can."""
-        return self._as_actions(carriers.careless(*self._clips_and_places(), self.physics.hand_speed, self.physics.time_step))
+        return self._as_actions(carriers.careless(*self._clips_and_places(), self.physics.attachment_speed, self.physics.time_step))
 
     def _clips_and_places(self) -> tuple[NDArray, NDArray]:
-        clips = self.simulation.hand_positions.astype(np.float64)
+        clips = self.simulation.attachment_positions.astype(np.float64)
         return clips, self.episode["places"][np.arange(self.num_envs), self.episode["next"]]
 
     def _as_actions(self, velocities: NDArray) -> NDArray:
-        return (velocities / self.physics.hand_speed).reshape(self.num_envs, 6)
+        return (velocities / self.physics.attachment_speed).reshape(self.num_envs, 6)
 
     def markers(self, env: int) -> list[Any]:
         ahead = [

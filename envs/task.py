@@ -105,7 +105,7 @@ class Task(TaskDefinition):
             contact=contact,
             air_density=not_negative("air_density", air_density),
             anchors=physics.anchors,  # type: ignore[arg-type]
-            anchor_speed=2 * physics.hand_speed,
+            anchor_speed=2 * physics.attachment_speed,
             grippers=physics.grippers,
             bending=bending,
             strain_limit=strain_limit,
@@ -115,8 +115,8 @@ class Task(TaskDefinition):
         )
         self.num_envs = num_envs
         self.threads = self.simulation.threads
-        self.num_hands = len(physics.anchors) + len(physics.grippers)
-        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.hand_actions * self.num_hands,), np.float32)
+        self.num_attachments = len(physics.anchors) + len(physics.grippers)
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)
         self._prepare_observation()
         self._prepare_records()
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
@@ -150,9 +150,14 @@ class Task(TaskDefinition):
     def _prepare_records(self) -> None:
         """Records of the episodes and their steps, and the kernels that go through them."""
         physics, count = self.physics, self.num_envs
-        hand, (low, high) = (self.num_hands, 3), self.arena()
+        attachment, (low, high) = (self.num_attachments, 3), self.arena()
         # what an episode remembers
-        memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool), ("targets", float, hand)]
+        memory: list[tuple[Any, ...]] = [
+            ("step", np.int64),
+            ("settling_since", np.int64),
+            ("over", bool),
+            ("targets", float, attachment),
+        ]
         memory += [("potential", float)]
         memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES)), *self.remembers()]
         if self._in_numpy:
@@ -163,13 +168,13 @@ class Task(TaskDefinition):
         self.air = np.zeros((count, steps, 3))
         # what all environments share
         self.rules = record_of(
-            low=low, high=high, reach=physics.hand_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
+            low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
             side=max(physics.mesh.size), **self.constants(),
         )  # fmt: skip
         # what a step brings
         brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
-        brought += [("moves", float, (self.num_hands, self.hand_actions)), ("free", np.uint8, self.num_hands)]
+        brought += [("moves", float, (self.num_attachments, self.actions_per_attachment)), ("free", np.uint8, self.num_attachments)]
         self.outcome = records(count, brought)
         always = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
         self.info = records(
@@ -178,7 +183,7 @@ class Task(TaskDefinition):
         self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
         # what the kernels need beside these
         self._mesh = mesh_arrays(physics.mesh, self.particles)
-        self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *hand))
+        self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *attachment))
         self._place = self.simulation.layout.at(self._everyone)
         self._apply_actions, self._finish_step = compiled(type(self).__name__, self.kernels)
 
@@ -286,7 +291,7 @@ class Task(TaskDefinition):
 
         def work(first: int, last: int) -> None:
             self._finish_step(
-                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.hands, view.openings, pulls, mesh,
+                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.attachments, view.openings, pulls, mesh,
                 self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more, self._bound,
                 self.observation,
             )  # fmt: skip

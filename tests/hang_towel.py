@@ -10,7 +10,9 @@ TOWEL, START, NEAR = grid(9, 9, 0.4, 0.4), 0.3, 0.05  # heights in [m]
 
 
 class HangTowel(Task):
-    physics = Physics(TOWEL, Material.preset("wool"), 1 / 30, "semi_implicit_euler", 60, hand_speed=0.5, anchors=TOWEL.corners[2:])
+    physics = Physics(
+        TOWEL, Material.preset("wool"), 1 / 30, "semi_implicit_euler", 60, attachment_speed=0.5, anchors=TOWEL.corners[2:]
+    )
     acting_steps = 40
     observations = (Observation("goal", "its height", (), "m"), Observation("way", "up to it", (), "m", function=lambda t: t.way()))
 

@@ -123,15 +123,15 @@ def fetched(place):
         ([-1, 1, -1, 0], [2 / 3, 1, 2 / 3, 1 / 3]),
     ],
 )
-@pytest.mark.parametrize("hand", [0, 1])
-def test_fingers_close_below_a_half_open_above_and_else_go_on(orders, openings, hand):
+@pytest.mark.parametrize("attachment", [0, 1])
+def test_fingers_close_below_a_half_open_above_and_else_go_on(orders, openings, attachment):
     env, _ = start()
     for order, opening in zip(orders, openings):
         action = np.zeros((2, 4))
-        action[hand, 3], action[1 - hand, 3] = order, 0.0
+        action[attachment, 3], action[1 - attachment, 3] = order, 0.0
         env.step(action.ravel())
         seen = env.task.simulation.grippers.openings[0]
-        assert seen[hand] == pytest.approx(opening, abs=1e-5) and seen[1 - hand] == 1
+        assert seen[attachment] == pytest.approx(opening, abs=1e-5) and seen[1 - attachment] == 1
 
 
 def test_a_new_episode_begins_with_open_fingers_that_were_told_nothing():
@@ -167,13 +167,15 @@ def test_a_gripper_takes_what_lies_within_3_cm_of_its_tip_and_moves_no_faster_th
     for _ in range(40):
         x, here = positions(env)[0], tips(env)[0]
         env.step(env.expert_action())
-        for hand in np.flatnonzero(env.task.simulation.grippers.held[0]):
+        for attachment in np.flatnonzero(env.task.simulation.grippers.held[0]):
             # what was near when the fingers had closed, as the step began
-            taken.setdefault(hand, (env.get_state().simulation.holder[0] == hand, np.linalg.norm(x - here[hand], axis=1)))
+            taken.setdefault(
+                attachment, (env.get_state().simulation.holder[0] == attachment, np.linalg.norm(x - here[attachment], axis=1))
+            )
         if len(taken) == 2:
             break
-    for hand, (held, distance) in taken.items():
-        assert held[CORNERS[hand]] and held.sum() < 8
+    for attachment, (held, distance) in taken.items():
+        assert held[CORNERS[attachment]] and held.sum() < 8
         assert held[distance < 0.999 * REACH].all() and not held[distance > 1.001 * REACH].any()
     for action in ([1, 1, 1], [0, -1, 0], [0.3, 0, 0.4]):
         before = tips(env)[0], positions(env)[0, CORNERS]
@@ -282,11 +284,11 @@ def test_the_observation_is_what_the_manual_page_says(shape):
     assert observation[59:62].tolist() == [shape == "sphere", shape == "box", shape == "post"]
     assert observation[62:65] == pytest.approx([target.radius / SIDE, target.height / SIDE, target.yaw * 4 / np.pi], abs=1e-6)
     assert observation[65:68] == pytest.approx([0, 125 / 140, 85 / 100], abs=1e-6)
-    for hand, first in ((0, 68), (1, 75)):
-        tip = state.hand_positions[0, hand].astype(float)
+    for attachment, first in ((0, 68), (1, 75)):
+        tip = state.attachment_positions[0, attachment].astype(float)
         assert observation[first : first + 3] == pytest.approx((tip - origin) / SIDE, abs=2e-5)
-        assert observation[first + 3 : first + 6] == pytest.approx((x[CORNERS[hand]] - tip) * 10 / SIDE, abs=2e-4)
-        assert observation[first + 6] == pytest.approx([0, 1 / 3][hand], abs=1e-5)
+        assert observation[first + 3 : first + 6] == pytest.approx((x[CORNERS[attachment]] - tip) * 10 / SIDE, abs=2e-4)
+        assert observation[first + 6] == pytest.approx([0, 1 / 3][attachment], abs=1e-5)
     for _ in range(ACTING - 15):
         observation, *_ = env.step(np.zeros(8))
     assert observation[65:68] == pytest.approx([1, 40 / 140, 0], abs=1e-6)

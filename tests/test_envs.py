@@ -22,7 +22,7 @@ def make_vec(env_id, num_envs, **kwargs):
 
 
 def still(env):
-    """Hands that stay where they are."""
+    """Attachments that stay where they are."""
     return np.zeros(env.action_space.shape, np.float32)
 
 
@@ -218,7 +218,7 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
             each.step(action)
         after = each.get_state()
         assert np.array_equal(before.simulation.positions, after.simulation.positions)
-        assert np.array_equal(before.simulation.hand_targets, after.simulation.hand_targets)
+        assert np.array_equal(before.simulation.attachment_targets, after.simulation.attachment_targets)
         assert np.array_equal(before.episode["step"], after.episode["step"])
 
 

@@ -63,7 +63,7 @@ def test_belt_around_a_cylinder(angle, friction):
     simulation = Simulation(mesh, fabric, gravity=(0, 0, 0), air_density=0, colliders=[cylinder], anchors=ends, dtype="float64")
     simulation.reset(positions=x)
     out = np.array([[0, side * np.cos(angle / 2), -np.sin(angle / 2)] for side in (-1, 1)])
-    start, tensions = simulation.hand_positions[0], []
+    start, tensions = simulation.attachment_positions[0], []
     for step in range(75):
         gone = 0.04 * (step + 1) / 60
         simulation.move_anchors((start + gone * np.array([[-1], [1]]) * out)[None])

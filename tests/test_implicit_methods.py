@@ -114,7 +114,7 @@ def test_the_fixed_point_is_backward_euler_s(method, bending):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_held_particles_are_exact_after_one_iteration_as_after_a_hundred(dtype):
-    """Bit for bit on the line of their hand, as particles without cloth would be: x <- x + h v."""
+    """Bit for bit on the line of their attachment, as particles without cloth would be: x <- x + h v."""
     mesh = grid(5, 5, 0.3, 0.3)
     paths = []
     for iterations in (1, 100):
@@ -165,7 +165,7 @@ def test_projective_dynamics_lets_go_and_takes_hold_in_each_environment():
             if step == 6:
                 simulation.release(envs=[0], anchors=[2])
                 simulation.attach(envs=[2, 1], anchors=[1, 0])
-            simulation.move_anchors(simulation.hand_positions[:, :3] + (1e-3, 0, 2e-3))
+            simulation.move_anchors(simulation.attachment_positions[:, :3] + (1e-3, 0, 2e-3))
             simulation.step()
             path.append(simulation.positions)
         batches.append(np.array(path))

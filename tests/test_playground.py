@@ -189,18 +189,18 @@ def test_seeds_give_the_same_bits_and_different_ones_do_not():
     assert np.array_equal(runs[0][0, held], stage.scene.start[held].astype(np.float32))
 
 
-def test_hands_hold_let_go_and_go_where_they_are_dragged():
+def test_attachments_hold_let_go_and_go_where_they_are_dragged():
     stage = advanced(SceneStage("sphere"), 3)
-    assert not any(hand.holds for hand in stage.hands())
+    assert not any(attachment.holds for attachment in stage.attachments())
     stage.drag(2, (-0.4, 0.4, 0.9))
     advanced(stage, 20)
     particle = stage.scene.anchors[2]
-    assert np.allclose(stage.frame.positions[0, particle], (-0.4, 0.4, 0.9), atol=1e-5) and stage.hands()[2].holds
+    assert np.allclose(stage.frame.positions[0, particle], (-0.4, 0.4, 0.9), atol=1e-5) and stage.attachments()[2].holds
     stage.drag(2, None)
     stage.hold(2, False)
     advanced(stage, 20)
     assert stage.frame.positions[0, particle, 2] < 0.8
-    with pytest.raises(ValueError, match="the hands of this scene are 0 to 3"):
+    with pytest.raises(ValueError, match="the attachments of this scene are 0 to 3"):
         stage.drag(4, (0, 0, 0))
 
 
@@ -300,12 +300,12 @@ def test_an_environment_is_played_by_its_expert_and_its_frames_are_the_environme
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_a_dragged_hand_goes_to_the_visitor(env_id):
+def test_a_dragged_attachment_goes_to_the_visitor(env_id):
     stage = EpisodeStage(env_id, policy="noop")
-    place = stage.hands()[0].position + (0.0, 0.0, 0.1)
+    place = stage.attachments()[0].position + (0.0, 0.0, 0.1)
     stage.drag(0, place)
     advanced(stage, 12)
-    assert np.allclose(stage.hands()[0].position, place, atol=0.02)
+    assert np.allclose(stage.attachments()[0].position, place, atol=0.02)
 
 
 def test_settings_reach_an_episode_and_stay_through_a_reset():

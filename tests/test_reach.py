@@ -36,7 +36,7 @@ def potential(env, d0):
 def evaluated(env, distance, velocity=(0.0, 0.0, 0.0)):
     """The evaluation of an episode at whose end the free corner is this far from the goal, in sides, and moves like that [m/s].
 
-    The sheet hangs at rest in a frame that moves with its hand; without drag nothing tells it so.
+    The sheet hangs at rest in a frame that moves with its attachment; without drag nothing tells it so.
     """
     env.reset(seed=3)
     task, velocity = env.task, np.asarray(velocity, float)
@@ -165,7 +165,7 @@ def test_the_observation_is_what_the_manual_page_says():
 
 
 def test_the_sheet_hangs_at_rest_by_one_corner():
-    """Its weight pulls straight down through the hand, the free corner is lowest, and nothing moves but the ripple."""
+    """Its weight pulls straight down through the attachment, the free corner is lowest, and nothing moves but the ripple."""
     env, _ = start()
     s = env.task.simulation
     shape, area = hanging(), env.task.physics.mesh.area
@@ -185,7 +185,7 @@ def test_starts_and_goals_are_drawn_from_the_ranges_of_the_manual_page():
     env.reset(seed=0)
     task = env.unwrapped.task
     middle = np.array([0.0, 0.0, 1.3])
-    driven = task.simulation.hand_positions[:, 0] - middle
+    driven = task.simulation.attachment_positions[:, 0] - middle
     goals = task.episode["goal"] - hanging()[FREE] - middle
     for places in (driven, goals):
         assert np.all(np.abs(places) <= np.array([0.3, 0.3, 0.15]) + 5e-3)

@@ -183,13 +183,15 @@ def test_a_jam_without_room_for_constraints_does_not_creep(monkeypatch):
     assert not wring.simulation.intersections().any()
 
 
-def test_a_jam_does_not_carry_hands_away():
-    """Cloth that may not move stays between the hands that pull at it, which cannot go on: none of it gets out of their reach."""
+def test_a_jam_does_not_carry_attachments_away():
+    """Cloth that may not move stays between the anchors that pull at it, which cannot go on: none of it gets out of their reach."""
     option = {"mode": "strict", "thickness": 0.012}
     wring = MANEUVERS["impossible wring"](sheet(9), seeds=[1, 2], thickness=0.012, time_step=1 / 60, self_collision=option)
     for _ in range(200):
         wring.step()
-        assert np.abs(wring.simulation.positions).max() < 0.8  # the hands' way is within 0.75 m; 20 m where a jam carried them
+        assert (
+            np.abs(wring.simulation.positions).max() < 0.8
+        )  # the attachments' way is within 0.75 m; 20 m where a jam carried them
     assert wring.simulation.self_contacts.clamped.min() > 100
     assert not wring.simulation.intersections().any()
 
@@ -315,7 +317,7 @@ def test_friction_between_layers(friction, slides):
     assert (moved > 1e-2) == slides
 
 
-# --- hands ------------------------------------------------------------------------------------------------------------------
+# --- attachments ------------------------------------------------------------------------------------------------------------
 
 
 def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
@@ -324,7 +326,7 @@ def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
     away = np.abs(mesh.rest_positions[:, :2] - mesh.rest_positions[0, :2]).max(axis=1)
     fixed = [int(p) for p in np.flatnonzero(away > 0.3)]
     simulation = clothgym.Simulation(mesh, anchors=[0, *fixed], anchor_speed=2.0, self_collision="strict", gravity=(0, 0, 0))
-    targets = simulation.hand_positions
+    targets = simulation.attachment_positions
     lags = []
     for place in [(0.0, 0.0, 0.15), (0.12, 0.12, 0.1), (0.12, 0.12, -0.1)]:
         targets[0, 0] = place

@@ -40,7 +40,7 @@ def test_a_restored_state_goes_on_to_the_bit(tmp_path):
         ("self_contact planes", lambda a: a * np.nan, "planes.* holds a value that is not finite"),
         ("self_contact span", lambda a: a - 100, "span.* holds -"),
         ("self_contact lag", lambda a: None, "lag is no array"),
-        ("holder", lambda a: a + 32000, "names hands from 31999 to 31999, there are 0"),
+        ("holder", lambda a: a + 32000, "names attachments from 31999 to 31999, there are 0"),
         ("free_inverse_mass", lambda a: -a, "free_inverse_mass holds -"),
         ("gravity", lambda a: a * np.nan, "gravity holds a value that is not finite"),
         ("gravity", lambda a: a[0, 0], r"gravity has shape \(\), this simulation's \(1, 3\)"),
@@ -94,7 +94,7 @@ def test_a_state_of_a_sheet_beyond_what_can_be_certified_is_taken_too():
         simulation.set_state(state)
 
 
-def test_what_changes_hands_owes_the_new_one_nothing():
+def test_what_another_attachment_takes_does_not_lag():
     """A corner lags behind the gripper that pulls it at the sheet; another takes it there, and carries it as far as it goes."""
     mesh = sheet(13)
     away = np.abs(mesh.rest_positions[:, :2] - mesh.rest_positions[0, :2]).max(axis=1)

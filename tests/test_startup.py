@@ -41,7 +41,7 @@ def test_ten_processes_on_a_cold_cache_compile_each_kernel_once_between_them(fil
     compiled = [int(out.split()[0]) for out, _ in outputs]
     assert sum(compiled) == 1
     assert len({out.split()[1] for out, _ in outputs}) == 1
-    # a step has two kernels, of the hands and of the main loop: one process may have compiled both, or two one each
+    # a step has two kernels, of the attachments and of the main loop: one process may have compiled both, or two one each
     announced = [err for _, err in outputs if err]
     assert 1 <= len(announced) <= 2 and all(err.count("\n") == 1 and "compiling kernels" in err for err in announced)
 

@@ -140,7 +140,7 @@ def test_bits_do_not_depend_on_who_else_touches():
         assert np.array_equal(alone.positions[0], both.positions[env])
 
 
-def test_hand_slides_along_a_solid_and_says_so():
+def test_attachment_slides_along_a_solid_and_says_so():
     """It goes round a ball onto the floor, stops at a wall at 10 m/s, and is free again on the way back."""
     mesh = grid(2, 2, 0.02, 0.02)
     solids = [Plane(), Sphere(center=(0, 0, 0.1), radius=0.1), Box(center=(0.4, 0, 0.5), half_sides=(0.02, 1, 0.5))]
@@ -177,7 +177,7 @@ def test_held_particles_are_not_dragged_into_a_solid():
     assert np.isfinite(simulation.positions).all()
 
 
-def test_rising_table_lifts_the_hand():
+def test_rising_table_lifts_the_attachment():
     simulation = Simulation(
         grid(2, 2, 0.02, 0.02), colliders=[Plane(velocity=(0, 0, 0.3))], grippers=[Gripper(position=(0, 0, 0.05))]
     )

@@ -172,14 +172,14 @@ class Counting(Task):
         self.calls.append(("before", float(actions[0, 2]), self.simulation.get_state().steps[0]))
 
     def after_step(self):
-        self.calls.append(("after", float(self.simulation.hand_positions[0, 0, 2]), self.simulation.get_state().steps[0]))
+        self.calls.append(("after", float(self.simulation.attachment_positions[0, 0, 2]), self.simulation.get_state().steps[0]))
         self.info["calls"] = len(self.calls)
 
     def performance(self):
-        return 5 * self.simulation.hand_positions[:, 0, 2] - 3.0  # beyond [0, 1] on both sides
+        return 5 * self.simulation.attachment_positions[:, 0, 2] - 3.0  # beyond [0, 1] on both sides
 
     def success(self):
-        return self.simulation.hand_positions[:, 0, 2] > 10
+        return self.simulation.attachment_positions[:, 0, 2] > 10
 
     def done(self):
         return self.episode["step"] == 4

@@ -12,7 +12,7 @@ from test_envs import drawn, every_id, length, make, make_vec, skip, still
 
 
 def run_to_an_end(env):
-    """Still hands until an episode ends, environment 1 three steps before the others: its step, and what that gave."""
+    """Still attachments until an episode ends, environment 1 three steps before the others: its step, and what that gave."""
     env.reset(seed=0)
     for step in range(200):
         if step == 2:

@@ -259,7 +259,7 @@ def make_vec(env_id, num_envs, **kwargs):
 
 
 def winds(env, steps):
-    """Wind and positions of each environment in successive steps of still hands."""
+    """Wind and positions of each environment in successive steps of still attachments."""
     seen = []
     for _ in range(steps):
         env.step(np.zeros(env.action_space.shape))

@@ -15,7 +15,7 @@ from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.envs.episode import within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
-from clothgym.playground.stage import Hand, Stability, Stage, set_in_place, stability, visible
+from clothgym.playground.stage import Attachment, Stability, Stage, set_in_place, stability, visible
 from clothgym.playground.world import SLIDERS, Settings
 from clothgym.registration import checked_id
 from clothgym.render.solids import drawn
@@ -35,7 +35,7 @@ def expert(env: Any, observation: NDArray) -> NDArray:
 
 
 def noop(env: Any, observation: NDArray) -> NDArray:
-    """What keeps the hands where they are."""
+    """What keeps the attachments where they are."""
     return np.zeros(env.action_space.shape, np.float32)
 
 
@@ -112,7 +112,9 @@ class EpisodeStage(Stage):
         # an episode starts with the task's own parameters
         set_in_place(self.simulation, self._own, self.settings)
         self._dragged: dict[int, NDArray] = {}
-        self._closed = np.full(len(self.hands()), self.env.task.hand_actions > 3 and not len(self.simulation.grippers))
+        self._closed = np.full(
+            len(self.attachments()), self.env.task.actions_per_attachment > 3 and not len(self.simulation.grippers)
+        )
         self._over, self._time, self._cost, self.total = False, 0.0, 0.0, 0.0
         self.notes.pop("evaluation", None)
         wind = self.env.task.wind
@@ -202,38 +204,39 @@ class EpisodeStage(Stage):
     def stabilities(self) -> list[Stability]:
         return [stability(self.simulation)]
 
-    # --- hands ----------------------------------------------------------------------------------------------------------
+    # --- attachments ----------------------------------------------------------------------------------------------------
 
-    def hands(self) -> list[Hand]:
+    def attachments(self) -> list[Attachment]:
         s = self.simulation
         anchors, grippers = len(s.anchors), len(s.grippers)
         holds = [*s.attached[0], *(s.grippers.held[0] > 0 if grippers else [])]
         names = [f"clip {k + 1}" for k in range(anchors)] + [f"gripper {k + 1}" for k in range(grippers)]
         return [
-            Hand(name, x, bool(h), k >= anchors or bool(h)) for k, (name, x, h) in enumerate(zip(names, s.hand_positions[0], holds))
+            Attachment(name, x, bool(h), k >= anchors or bool(h))
+            for k, (name, x, h) in enumerate(zip(names, s.attachment_positions[0], holds))
         ]
 
-    def drag(self, hand: int, place: ArrayLike | None) -> None:
-        indices("hand", [hand], self.env.task.num_hands, "the hands of this task")
+    def drag(self, attachment: int, place: ArrayLike | None) -> None:
+        indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")
         if place is None:
-            self._dragged.pop(hand, None)
+            self._dragged.pop(attachment, None)
         else:
-            self._dragged[hand] = vector("place", place)
+            self._dragged[attachment] = vector("place", place)
 
-    def hold(self, hand: int, holds: bool) -> None:
-        indices("hand", [hand], self.env.task.num_hands, "the hands of this task")
-        self._closed[hand] = holds
-        self._dragged.setdefault(hand, self.simulation.hand_positions[0, hand])
+    def hold(self, attachment: int, holds: bool) -> None:
+        indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")
+        self._closed[attachment] = holds
+        self._dragged.setdefault(attachment, self.simulation.attachment_positions[0, attachment])
 
     def _steered(self, action: NDArray) -> NDArray:
-        """The action with dragged hands moving to the visitor's positions, as fast as the task allows."""
+        """The action with dragged attachments moving to the visitor's positions, as fast as the task allows."""
         task = self.env.task
-        moves = action.reshape(task.num_hands, task.hand_actions).copy()
-        for hand, place in self._dragged.items():
-            away = place - task.episode["targets"][0, hand]
-            moves[hand, :3] = within_ball(away / (task.physics.hand_speed * task.physics.time_step))
-            if task.hand_actions > 3:
-                moves[hand, 3] = -1.0 if self._closed[hand] else 1.0
+        moves = action.reshape(task.num_attachments, task.actions_per_attachment).copy()
+        for attachment, place in self._dragged.items():
+            away = place - task.episode["targets"][0, attachment]
+            moves[attachment, :3] = within_ball(away / (task.physics.attachment_speed * task.physics.time_step))
+            if task.actions_per_attachment > 3:
+                moves[attachment, 3] = -1.0 if self._closed[attachment] else 1.0
         return moves.ravel().astype(np.float32)
 
 

@@ -26,7 +26,7 @@ NONE = "none"
 SIDE_BY_SIDE = 0.55  # share of its distance by which the eye moves back for each further sheet
 NARROWER = 0.35  # and for each further sheet whose readings make the view narrower
 ROOM = 1.25  # distance of the page's eye relative to that of a picture, since panels make the view narrower
-HANDS = 4  # anchors and grippers that a visitor can close and open
+ATTACHMENTS = 4  # anchors and grippers that a visitor can close and open
 MOST_SUBSTEPS = 400
 LEFT, COLUMN = 290, 75  # width of the left panel, and added to it for the readings of a third and a fourth sheet [pixels]
 READ_EVERY = 0.2  # between two updates of numbers and plots [s]
@@ -205,9 +205,9 @@ class Page:
             self._see()
 
     def _hold(self, value: tuple[int, bool]) -> None:
-        hand, holds = value
-        if self.stage.hands()[hand].holds != holds:
-            self.stage.hold(hand, holds)
+        attachment, holds = value
+        if self.stage.attachments()[attachment].holds != holds:
+            self.stage.hold(attachment, holds)
 
     def _look(self, _: Any = None) -> None:
         """Draw again: only the view has changed."""
@@ -277,14 +277,14 @@ class Page:
         if policies:
             controls["policy"].options = policies
             controls["policy"].value = stage.policy  # type: ignore[attr-defined]
-        hands = dict(enumerate(hand for hand in stage.hands()[:HANDS] if hand.draggable))
-        controls["handles"].visible = bool(hands)
-        controls["handles"].value = any(hand.holds for hand in hands.values()) and isinstance(stage, SceneStage)
-        for number in range(HANDS):
-            controls[f"hand {number}"].visible = number in hands
-            if number in hands:
-                controls[f"hand {number}"].label = f"{hands[number].name} holds"
-                controls[f"hand {number}"].value = hands[number].holds
+        attachments = dict(enumerate(attachment for attachment in stage.attachments()[:ATTACHMENTS] if attachment.draggable))
+        controls["handles"].visible = bool(attachments)
+        controls["handles"].value = any(attachment.holds for attachment in attachments.values()) and isinstance(stage, SceneStage)
+        for number in range(ATTACHMENTS):
+            controls[f"attachment {number}"].visible = number in attachments
+            if number in attachments:
+                controls[f"attachment {number}"].label = f"{attachments[number].name} holds"
+                controls[f"attachment {number}"].value = attachments[number].holds
         controls["show"].value = "strain" if stage.name == "patch" else "fabric"
         self.panel.set_width(LEFT)
         self._stand_back(1.0)
@@ -360,15 +360,15 @@ class Page:
         self._add("handles", gui.add_checkbox("handles to drag", False))
         for name in ("show", "diagonals", "handles"):
             self._ordered(self.controls[name], "look")
-        for number in range(HANDS):
-            box = self._add(f"hand {number}", gui.add_checkbox("holds", False))
+        for number in range(ATTACHMENTS):
+            box = self._add(f"attachment {number}", gui.add_checkbox("holds", False))
             self._ordered(box, "hold", lambda holds, number=number: (number, bool(holds)))  # type: ignore[misc]
 
     # --- what is shown --------------------------------------------------------------------------------------------------
 
     def _see(self) -> None:
         """Create the nodes of the stage's recording."""
-        self.show = Show(self.client.scene, self.stage.recording, lambda hand, place: self.order("drag", (hand, place)))
+        self.show = Show(self.client.scene, self.stage.recording, lambda attachment, place: self.order("drag", (attachment, place)))
         self.plots.begin(self.stage.recording)
         self._stale, self._read_at = True, -READ_EVERY
         self._fill()
@@ -400,7 +400,7 @@ class Page:
         with self.client.atomic():
             self.show.draw(frames[self.moment], mode, bool(self.controls["diagonals"].value))
             if self.moment == len(frames) - 1:
-                self.show.draw_hands(self.stage.hands(), bool(self.controls["handles"].value))
+                self.show.draw_attachments(self.stage.attachments(), bool(self.controls["handles"].value))
         state = "■ over: reset to start again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
         if self.controls["state"].content != state:
             self.controls["state"].content = state
@@ -418,6 +418,6 @@ class Page:
         controls["notes"].content = "\n\n".join(f"> {note}" for note in self.stage.notes.values())
         controls["readings"].content = readings_table(self.stage.recording, frame, self.stage.stabilities())
         controls["legend"].content = legend(self.stage.recording, frame, mode)
-        for number, hand in enumerate(self.stage.hands()[:HANDS]):
-            controls[f"hand {number}"].value = hand.holds
+        for number, attachment in enumerate(self.stage.attachments()[:ATTACHMENTS]):
+            controls[f"attachment {number}"].value = attachment.holds
         self.plots.draw(frames[: self.moment + 1])

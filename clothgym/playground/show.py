@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clothgym.integrators import INTEGRATORS
 from clothgym.mesh import EDGE, STRUCTURAL_X
 from clothgym.playground.recording import Frame, Recording, strains, tensions, yarns
-from clothgym.playground.stage import UNLIMITED, Hand
+from clothgym.playground.stage import UNLIMITED, Attachment
 from clothgym.render import Drawn
 from clothgym.render.shading import CORAL, INDIGO
 from clothgym.render.solids import linear_color
@@ -75,12 +75,12 @@ class Show:
 
     Args:
         scene: viser's, or a null viewer's.
-        dragged: called with a hand and its position [m], (3,), while it is dragged, and with None at the end.
+        dragged: called with an attachment and its position [m], (3,), while it is dragged, and with None at the end.
     """
 
     def __init__(self, scene: Any, recording: Recording, dragged: Callable[[int, NDArray | None], None]) -> None:
         self.scene, self.recording, self._dragged = scene, recording, dragged
-        self._held: set[int] = set()  # hands that the visitor drags now
+        self._held: set[int] = set()  # attachments that the visitor drags now
         scene.reset()
         scene.set_background_image(sky(), format="png")  # for each visitor: a reset removes the shared one
         scene.add_grid(
@@ -162,22 +162,22 @@ class Show:
             for node in nodes[used[shape] :]:
                 node.visible = False
 
-    def draw_hands(self, hands: Sequence[Hand], draggable: bool) -> None:
-        """Mark what is held, and show a handle at each hand that can be dragged, if wanted."""
-        self._dot("held", np.array([hand.position for hand in hands if hand.holds]).reshape(-1, 3))
-        for number, hand in enumerate(hands):
-            wanted = draggable and hand.draggable
+    def draw_attachments(self, attachments: Sequence[Attachment], draggable: bool) -> None:
+        """Mark what is held, and show a handle at each attachment that can be dragged, if wanted."""
+        self._dot("held", np.array([attachment.position for attachment in attachments if attachment.holds]).reshape(-1, 3))
+        for number, attachment in enumerate(attachments):
+            wanted = draggable and attachment.draggable
             if wanted and number not in self._handles:
-                self._handles[number] = self._made_handle(number, hand)
+                self._handles[number] = self._made_handle(number, attachment)
             if number in self._handles:
                 self._handles[number].visible = wanted
                 if number not in self._held:
-                    self._handles[number].position = tuple(float(c) for c in hand.position)
+                    self._handles[number].position = tuple(float(c) for c in attachment.position)
 
-    def _made_handle(self, number: int, hand: Hand) -> Any:
+    def _made_handle(self, number: int, attachment: Attachment) -> Any:
         handle = self.scene.add_transform_controls(
-            f"/hands/{number}", scale=0.09, line_width=3.0, disable_rotations=True, depth_test=False, opacity=0.85,
-            position=tuple(float(c) for c in hand.position),
+            f"/attachments/{number}", scale=0.09, line_width=3.0, disable_rotations=True, depth_test=False, opacity=0.85,
+            position=tuple(float(c) for c in attachment.position),
         )  # fmt: skip
 
         @handle.on_update

@@ -34,7 +34,7 @@ EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond 
 REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
 
 
-class Hand(NamedTuple):
+class Attachment(NamedTuple):
     """An anchor or gripper as a visitor sees it: name, position [m], whether it holds anything, and whether it can be dragged."""
 
     name: str
@@ -125,16 +125,16 @@ class Stage:
         """
         raise NotImplementedError
 
-    def hands(self) -> list[Hand]:
+    def attachments(self) -> list[Attachment]:
         """The anchors and grippers."""
         return []
 
-    def drag(self, hand: int, place: ArrayLike | None) -> None:
-        """Move a hand to a position [m], (3,), or stop moving it with None."""
+    def drag(self, attachment: int, place: ArrayLike | None) -> None:
+        """Move an attachment to a position [m], (3,), or stop moving it with None."""
         raise NotImplementedError
 
-    def hold(self, hand: int, holds: bool) -> None:
-        """Close or open a hand."""
+    def hold(self, attachment: int, holds: bool) -> None:
+        """Close or open an attachment."""
         raise NotImplementedError
 
     def stabilities(self) -> list[Stability]:
@@ -335,39 +335,39 @@ class SceneStage(Stage):
             self._bounds = [stability(sheet.simulation) for sheet in self.sheets]
         return self._bounds
 
-    # --- hands ----------------------------------------------------------------------------------------------------------
+    # --- attachments ----------------------------------------------------------------------------------------------------
 
-    def hands(self) -> list[Hand]:
+    def attachments(self) -> list[Attachment]:
         s = self.sheets[0].simulation
-        held, places = s.attached[0], s.hand_positions[0]
+        held, places = s.attached[0], s.attachment_positions[0]
         # an open anchor is shown at its particle
-        for hand in np.flatnonzero(~held):
-            places[hand] = s.positions[0, s.anchors[hand]]
+        for attachment in np.flatnonzero(~held):
+            places[attachment] = s.positions[0, s.anchors[attachment]]
         return [
-            Hand(name, visible(place) + self.offsets[0], bool(holds), hand in self.scene.handles)
-            for hand, (name, place, holds) in enumerate(zip(self.scene.names, places, held))
+            Attachment(name, visible(place) + self.offsets[0], bool(holds), attachment in self.scene.handles)
+            for attachment, (name, place, holds) in enumerate(zip(self.scene.names, places, held))
         ]
 
-    def drag(self, hand: int, place: ArrayLike | None) -> None:
-        self._checked(hand)
+    def drag(self, attachment: int, place: ArrayLike | None) -> None:
+        self._checked(attachment)
         if place is None:
-            self._dragged.pop(hand, None)
+            self._dragged.pop(attachment, None)
             return
-        self._dragged[hand] = vector("place", place) - self.offsets[0]
-        self.hold(hand, True)
+        self._dragged[attachment] = vector("place", place) - self.offsets[0]
+        self.hold(attachment, True)
 
-    def hold(self, hand: int, holds: bool) -> None:
-        self._checked(hand)
+    def hold(self, attachment: int, holds: bool) -> None:
+        self._checked(attachment)
         for sheet in self.sheets:
-            if holds and not sheet.simulation.attached[0, hand]:
-                sheet.simulation.attach([0], [hand])
+            if holds and not sheet.simulation.attached[0, attachment]:
+                sheet.simulation.attach([0], [attachment])
             elif not holds:
-                sheet.simulation.release([0], [hand])
+                sheet.simulation.release([0], [attachment])
         if not holds:
-            self._dragged.pop(hand, None)
+            self._dragged.pop(attachment, None)
 
-    def _checked(self, hand: int) -> None:
-        indices("hand", [hand], len(self.scene.anchors), "the hands of this scene")
+    def _checked(self, attachment: int) -> None:
+        indices("attachment", [attachment], len(self.scene.anchors), "the attachments of this scene")
 
     def _targets(self) -> Targets:
         return self._dragged
@@ -417,7 +417,7 @@ def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Si
         return new
     new.reset(positions=old.positions, velocities=old.velocities)
     state = new.get_state()
-    for name in ("holder", "hand_positions", "hand_targets", "colliders", "collider_homes", "steps", "diverged"):
+    for name in ("holder", "attachment_positions", "attachment_targets", "colliders", "collider_homes", "steps", "diverged"):
         setattr(state, name, getattr(old, name))
     state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = settings.friction
     new.set_state(state)

@@ -182,7 +182,7 @@ def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None
 
 def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | None = None) -> None:
     """Move a scene's anchors and solids to their targets for a time [s]; others: targets of dragged anchors, by number [m]."""
-    targets = simulation.hand_positions
+    targets = simulation.attachment_positions
     if scene.motion is not None and time <= scene.rests:
         targets[0], solids = scene.motion(time)
         for number, place in solids.items():

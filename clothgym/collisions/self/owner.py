@@ -58,8 +58,8 @@ class SelfContacts(NamedTuple):
     (what they have left is shared out with each query, and less of it each time).
     gap: smallest certified distance at a query [m], 0 where the directions that were tried certify none, inf if nothing was within
     reach or no query made.
-    lag: how far the slowest held particle is behind its hand [m].  uncertified: whether the sheet went farther from the origin than
-    rounding allows.
+    lag: how far the slowest held particle is behind its attachment [m].  uncertified: whether the sheet went farther from
+    the origin than rounding allows.
     """
 
     rows: NDArray

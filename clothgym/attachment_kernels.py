@@ -1,7 +1,4 @@
-"""Floor 4: the kernels of attachments: what they do at the start of a control step, and the cloth's pull on them at its end.
-
-An attachment is a hand here, as in ``hands``.
-"""
+"""Floor 4: the kernels of attachments: what they do at the start of a control step, and the cloth's pull on them at its end."""
 
 from __future__ import annotations
 
@@ -17,8 +14,8 @@ from clothgym.elements import Elastic, room_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
 
-# columns of ``Hands.limits``: speed limit [m/s], change of the opening in a control step, and the squares of the reach [m^2] and of
-# the slip force [N^2]
+# columns of ``Attachments.limits``: speed limit [m/s], change of the opening in a control step, and the squares of the reach [m^2]
+# and of the slip force [N^2]
 SPEED, FINGER_STEP, REACH2, SLIP2 = 0, 1, 2, 3
 FREE = -1  # the holder of a particle that nothing holds
 
@@ -36,24 +33,24 @@ def count_held(holder, anchors, out):
 
 
 @apart
-def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+def steer(x, v, w, free_w, tips, targets, opening, wanted, holder, limits, anchors, time_step):
     """Begin a control step of one block: move fingers, grip or release, and set the velocity of held particles.
 
-    ``v = (target - hand)/time_step``, shortened to the speed limit.  hand: positions [m], (hands, 3, lanes), advanced to the end of
-    the control step.  holder: (particles, lanes).  opening, wanted: (hands, lanes).  limits: (hands, 4).  anchors: the first
-    particle of each anchor, (anchors,).
+    ``v = (target - tip)/time_step``, shortened to the speed limit.  tips: positions of the attachments [m], (attachments, 3,
+    lanes), advanced to the end of the control step.  holder: (particles, lanes).  opening, wanted: (attachments, lanes).  limits:
+    (attachments, 4).  anchors: the first particle of each anchor, (anchors,).
     """
     one = x.dtype.type(1)
     zero = x.dtype.type(0)
     lanes = x.shape[2]
     move = np.empty((3, lanes), x.dtype)
-    for k in range(hand.shape[0]):
+    for k in range(tips.shape[0]):
         # an anchor starts from its particle, so that rounding in the substeps does not accumulate
         if k < anchors.shape[0]:
             p = anchors[k]
             for c in range(3):
                 for l in range(lanes):
-                    hand[k, c, l] = x[c, p, l] if holder[p, l] == k else hand[k, c, l]
+                    tips[k, c, l] = x[c, p, l] if holder[p, l] == k else tips[k, c, l]
         # the fingers of a gripper move
         else:
             step = limits[k, FINGER_STEP]
@@ -70,21 +67,25 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
                 # they grip free particles within reach as soon as they have closed
                 elif now <= zero and before > zero:
                     for p in range(x.shape[1]):
-                        dx, dy, dz = x[0, p, l] - hand[k, 0, l], x[1, p, l] - hand[k, 1, l], x[2, p, l] - hand[k, 2, l]
+                        dx, dy, dz = x[0, p, l] - tips[k, 0, l], x[1, p, l] - tips[k, 1, l], x[2, p, l] - tips[k, 2, l]
                         near = dx * dx + dy * dy + dz * dz <= limits[k, REACH2]
                         if near and holder[p, l] == FREE:
                             holder[p, l] = k
                             w[p, l] = zero
         # velocity towards the target, up to the speed limit
         for l in range(lanes):
-            dx, dy, dz = targets[k, 0, l] - hand[k, 0, l], targets[k, 1, l] - hand[k, 1, l], targets[k, 2, l] - hand[k, 2, l]
+            dx, dy, dz = (
+                targets[k, 0, l] - tips[k, 0, l],
+                targets[k, 1, l] - tips[k, 1, l],
+                targets[k, 2, l] - tips[k, 2, l],
+            )
             speed = np.sqrt(dx * dx + dy * dy + dz * dz) / time_step
             slow = one / (max(speed / limits[k, SPEED], one) * time_step)
             move[0, l], move[1, l], move[2, l] = dx * slow, dy * slow, dz * slow
         # the attachment moves on at once, and the held particles in the course of the substeps
         for c in range(3):
             for l in range(lanes):
-                hand[k, c, l] += move[c, l] * time_step
+                tips[k, c, l] += move[c, l] * time_step
         for p in range(x.shape[1]):
             for l in range(lanes):
                 if holder[p, l] == k:
@@ -93,25 +94,26 @@ def steer(x, v, w, free_w, hand, targets, opening, wanted, holder, limits, ancho
 
 
 @kernel
-def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step, colliders, shapes, allowed, blocked):
+def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step, colliders, shapes, allowed, blocked):
     """Write to ``allowed`` where each attachment may go in this control step without entering a solid, or carrying particles into
     it.
 
-    If nothing is in its way this is its target.  hand, targets, allowed: [m], (blocks, hands, 3, lanes).  blocked: (blocks, hands,
-    lanes).  colliders, shapes: see ``collisions.Solids``.  (A part of ``steer`` would be compiled again with each of its callers.)
+    If nothing is in its way this is its target.  tips, targets, allowed: [m], (blocks, attachments, 3, lanes).  blocked: (blocks,
+    attachments, lanes).  colliders, shapes: see ``collisions.Solids``.  (A part of ``steer`` would be compiled again with each of
+    its callers.)
     """
     # scratch: a point and a collider in a single lane; position and displacement of the attachment
     one = x.dtype.type(1)
     point, rows, scratch = np.empty((3, 1, 1), x.dtype), np.empty((COLLIDER_ROWS, 1), x.dtype), np.empty((SCRATCH_ROWS, 1), x.dtype)
     tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
     for b in range(first, last):
-        for k in range(hand.shape[1]):
+        for k in range(tips.shape[1]):
             for l in range(x.shape[3]):
                 # the way to the target, up to the speed limit
                 held = k < anchors.shape[0] and holder[b, anchors[k], l] == k
                 length2 = one - one
                 for c in range(3):
-                    tip[c] = x[b, c, anchors[k], l] if held else hand[b, k, c, l]
+                    tip[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
                     way[c] = targets[b, k, c, l] - tip[c]
                     length2 += way[c] * way[c]
                     allowed[b, k, c, l] = targets[b, k, c, l]
@@ -129,18 +131,18 @@ def bar_blocks(first, last, x, hand, targets, holder, limits, anchors, time_step
                 blocked[b, k, l] = changed
                 if changed:
                     for c in range(3):
-                        allowed[b, k, c, l] = (x[b, c, anchors[k], l] if held else hand[b, k, c, l]) + way[c]
+                        allowed[b, k, c, l] = (x[b, c, anchors[k], l] if held else tips[b, k, c, l]) + way[c]
 
 
 @kernel
-def steer_blocks(first, last, x, v, w, free_w, hand, targets, opening, wanted, holder, limits, anchors, time_step):
+def steer_blocks(first, last, x, v, w, free_w, tips, targets, opening, wanted, holder, limits, anchors, time_step):
     """``steer`` in blocks ``first`` to ``last``."""
     for b in range(first, last):
-        steer(x[b], v[b], w[b], free_w[b], hand[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
+        steer(x[b], v[b], w[b], free_w[b], tips[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
 
 
 def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):
-    """``out <- sum_p (f_p + m_p g)`` over the particles p that each attachment holds [N], (blocks, hands, 3, lanes).
+    """``out <- sum_p (f_p + m_p g)`` over the particles p that each attachment holds [N], (blocks, attachments, 3, lanes).
 
     f: the forces of springs, bending and air.  Blocks ``first`` to ``last``.
     """
@@ -173,7 +175,7 @@ def pulls_with(bending: Bending, by_particle: bool) -> Any:
 def let_slip(pull, holder, w, free_w, limits):
     """Release the particles of attachments on which the cloth pulls with more than their slip force.
 
-    pull: [N], (blocks, hands, 3, lanes).  holder, w, free_w: (blocks, particles, lanes).  limits: (hands, 4).
+    pull: [N], (blocks, attachments, 3, lanes).  holder, w, free_w: (blocks, particles, lanes).  limits: (attachments, 4).
     """
     for b in range(holder.shape[0]):
         for p in range(holder.shape[1]):
@@ -194,7 +196,7 @@ def settle_lag(first, last, lag, behind, holder, anchors, reach2, w, free_w):
     the reach of its gripper has slipped out.
 
     lag: [m], (blocks, 3, particles, lanes).  behind: positive where a lane has any lag, (blocks, lanes).  holder: (blocks,
-    particles, lanes).  anchors: first particle of each anchor, (anchors,).  reach2: square of the reach [m^2], (hands,).
+    particles, lanes).  anchors: first particle of each anchor, (anchors,).  reach2: square of the reach [m^2], (attachments,).
     """
     for b in range(first, last):
         for l in range(behind.shape[1]):

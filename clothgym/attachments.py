@@ -1,7 +1,7 @@
 """Floor 4: attachments, which hold the cloth from outside: anchors and grippers.
 
-An attachment is a point that moves at a bounded speed and carries the particles that it holds; in the code it is a hand.  An anchor
-is bound to one particle or to a patch of particles, like a clip.  A gripper takes the particles between its fingers when they
+An attachment is a point that moves at a bounded speed and carries the particles that it holds.  An anchor is bound to one
+particle or to a patch of particles, like a clip.  A gripper takes the particles between its fingers when they
 close.  Held particles have inverse mass zero: only their attachment moves them.  An attachment does not enter solids, and does not
 carry particles into them: it stops at the surface, and slides along it.
 """
@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym._jit import run_spans
+from clothgym.attachment_kernels import FREE, REACH2, SLIP2, bar_blocks, count_held, let_slip, pulls_with, settle_lag, steer_blocks
 from clothgym.bending import Bending
 from clothgym.checks import finite, indices, number, spread, vector
 from clothgym.collisions import Solids
 from clothgym.elements import Weave
-from clothgym.hand_kernels import FREE, REACH2, SLIP2, bar_blocks, count_held, let_slip, pulls_with, settle_lag, steer_blocks
 from clothgym.state import Fabric, Layout, State
 
 
@@ -57,15 +57,16 @@ class Gripper:
                 raise ValueError(f"Gripper {field.name}={value!r}: must be positive")
 
 
-class Hands:
+class Attachments:
     """The attachments of a batch, anchors and then grippers, in the memory layout of the kernels.
 
     Attributes:
-        x, targets: positions, and targets for the end of the next control step [m], (block, hands, 3, lane).
-        opening, wanted: present and commanded opening of the fingers, from 0 (closed) to 1, (block, hands, lane); 0 for anchors.
+        x, targets: positions, and targets for the end of the next control step [m], (block, attachments, 3, lane).
+        opening, wanted: present and commanded opening of the fingers, from 0 (closed) to 1, 0 for anchors,
+            (block, attachments, lane).
         holder: index of the attachment that holds each particle, or FREE, (block, particles, lane).
-        allowed: targets that solids permit in this control step [m], (block, hands, 3, lane).
-        blocked: whether solids stopped or deflected the attachment in the last control step, (block, hands, lane).
+        allowed: targets that solids permit in this control step [m], (block, attachments, 3, lane).
+        blocked: whether solids stopped or deflected the attachment in the last control step, (block, attachments, lane).
     """
 
     def __init__(
@@ -100,7 +101,7 @@ class Hands:
     def restore(self, state: State) -> None:
         """Copy the attachments of a state."""
         blocks, dtype = self.layout.to_blocks, self.limits.dtype
-        self.x, self.targets = blocks(state.hand_positions, dtype), blocks(state.hand_targets, dtype)
+        self.x, self.targets = blocks(state.attachment_positions, dtype), blocks(state.attachment_targets, dtype)
         self.opening, self.wanted = blocks(state.openings, dtype), blocks(state.wanted_openings, dtype)
         self.holder = blocks(state.holder, np.dtype(np.int16))
 
@@ -110,8 +111,8 @@ class Hands:
         return {
             "anchors": np.repeat(self.members[None], self.layout.num_envs, axis=0),
             "holder": public(self.holder),
-            "hand_positions": public(self.x),
-            "hand_targets": public(self.targets),
+            "attachment_positions": public(self.x),
+            "attachment_targets": public(self.targets),
             "openings": public(self.opening),
             "wanted_openings": public(self.wanted),
         }
@@ -136,7 +137,7 @@ class Hands:
             array[block, len(self.anchors) :, :, lane] = positions
 
     def move(self, which: slice, targets: NDArray) -> None:
-        """Set targets of some attachments for the end of the next control step [m], (num_envs, hands, 3)."""
+        """Set targets of some attachments for the end of the next control step [m], (num_envs, attachments, 3)."""
         self.targets[:, which] = self.layout.to_blocks(targets, self.x.dtype)
 
     def hold(self, block: NDArray, anchor: NDArray, lane: NDArray, x: NDArray) -> None:
@@ -194,7 +195,7 @@ class Hands:
         threads: int,
         blocks: NDArray | None = None,
     ) -> NDArray:
-        """Force of the cloth on each attachment [N], (blocks, hands, 3, lanes), computed in these blocks, or in all of them."""
+        """Force of the cloth on each attachment [N], (blocks, attachments, 3, lanes), in these blocks, or in all of them."""
         out, add = np.empty_like(self.x), pulls_with(bending, self.layout.by_particle)
 
         def work(first: int, last: int) -> None:
@@ -215,41 +216,41 @@ class Hands:
 class Grippers:
     """The grippers of a simulation, as ``simulation.grippers``: commands and measurements."""
 
-    def __init__(self, hands: Hands) -> None:
-        self._hands = hands
-        self._first = len(hands.anchors)
+    def __init__(self, attachments: Attachments) -> None:
+        self._attachments = attachments
+        self._first = len(attachments.anchors)
 
     def __len__(self) -> int:
-        return len(self._hands.grippers)
+        return len(self._attachments.grippers)
 
     @property
     def positions(self) -> NDArray:
         """Positions of the tips [m], (num_envs, grippers, 3); a fresh copy."""
-        return self._hands.layout.to_public(self._hands.x)[:, self._first :]
+        return self._attachments.layout.to_public(self._attachments.x)[:, self._first :]
 
     @property
     def openings(self) -> NDArray:
         """Opening of the fingers, from 0 (closed) to 1, (num_envs, grippers); a fresh copy."""
-        return self._hands.layout.to_public(self._hands.opening)[:, self._first :]
+        return self._attachments.layout.to_public(self._attachments.opening)[:, self._first :]
 
     @property
     def wanted(self) -> NDArray:
         """Commanded opening of the fingers, from 0 (closed) to 1, (num_envs, grippers); a fresh copy."""
-        return self._hands.layout.to_public(self._hands.wanted)[:, self._first :]
+        return self._attachments.layout.to_public(self._attachments.wanted)[:, self._first :]
 
     @property
     def holder(self) -> NDArray:
         """Index of the gripper that holds each particle, -1 if none does, (num_envs, particles)."""
-        holder = self._hands.layout.to_public(self._hands.holder)
+        holder = self._attachments.layout.to_public(self._attachments.holder)
         return np.where(holder >= self._first, holder - self._first, -1)
 
     @property
     def held(self) -> NDArray:
         """Number of particles that each gripper holds, (num_envs, grippers)."""
-        holder = self._hands.holder
+        holder = self._attachments.holder
         count = np.empty((holder.shape[0], len(self), holder.shape[2]), np.int64)
         count_held(holder, self._first, count)
-        return self._hands.layout.to_public(count)
+        return self._attachments.layout.to_public(count)
 
     def move(self, targets: ArrayLike, openings: ArrayLike) -> None:
         """Command the positions of the tips and the openings of the fingers for the end of the next control step.
@@ -261,13 +262,13 @@ class Grippers:
         Raises:
             ValueError: a wrong shape, a value that is not finite, or an opening that is not from 0 to 1.
         """
-        hands, num_envs = self._hands, self._hands.layout.num_envs
+        attachments, num_envs = self._attachments, self._attachments.layout.num_envs
         x = spread("targets", finite("targets", targets), (num_envs, len(self), 3))
         wanted = spread("openings", finite("openings", openings), (num_envs, len(self)))
         if np.any((wanted < 0) | (wanted > 1)):
             raise ValueError(f"openings hold {wanted[(wanted < 0) | (wanted > 1)][0]}: must be from 0 to 1")
-        hands.move(slice(self._first, None), x)
-        hands.wanted[:, self._first :] = hands.layout.to_blocks(wanted, hands.x.dtype)
+        attachments.move(slice(self._first, None), x)
+        attachments.wanted[:, self._first :] = attachments.layout.to_blocks(wanted, attachments.x.dtype)
 
     def place(self, positions: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Place the tips at these positions, with no motion in between [m], (len(envs), grippers, 3).
@@ -277,7 +278,7 @@ class Grippers:
         Raises:
             ValueError: a wrong shape, or a value that is not finite.
         """
-        layout = self._hands.layout
+        layout = self._attachments.layout
         env = np.arange(layout.num_envs) if envs is None else indices("envs", envs, layout.num_envs, "this batch's environments")
         x = spread("positions", finite("positions", positions), (len(env), len(self), 3))
-        self._hands.place(*layout.at(env), x)
+        self._attachments.place(*layout.at(env), x)

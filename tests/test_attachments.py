@@ -1,4 +1,4 @@
-"""Hands: patches that move as one, grippers that take hold and let go, slip, and what the cloth pulls with."""
+"""Attachments: patches that move as one, grippers that take hold and let go, slip, and what the cloth pulls with."""
 
 import numpy as np
 import pytest
@@ -37,16 +37,16 @@ def test_a_patch_moves_as_one_and_no_faster_than_its_limit(name):
     patch = [0, 1, 5, 6]
     s = simulation(integrator=name, anchors=[patch, 24], anchor_speed=0.6, dtype="float64")
     way = np.array([0.6, 0.0, 0.8])
-    targets = s.hand_positions + 0.5 * way
+    targets = s.attachment_positions + 0.5 * way
     s.move_anchors(targets)
     for step in range(1, 6):
         s.step()
         moved = s.positions[0] - REST
         assert moved[patch] == pytest.approx(np.tile(way * 0.6 * STEP * step, (4, 1)), abs=1e-12)
         assert moved[24] == pytest.approx(way * 0.6 * STEP * step, abs=1e-12)
-        assert s.hand_positions[0] == pytest.approx(s.positions[0, [0, 24]], abs=1e-12)
+        assert s.attachment_positions[0] == pytest.approx(s.positions[0, [0, 24]], abs=1e-12)
     s.step(30)
-    assert s.hand_positions == pytest.approx(targets, abs=1e-12)
+    assert s.attachment_positions == pytest.approx(targets, abs=1e-12)
     assert s.positions[0, patch] - s.positions[0, 0] == pytest.approx(REST[patch] - REST[0], abs=1e-12)
 
 
@@ -63,7 +63,7 @@ def test_a_patch_is_released_and_attached_as_one():
     assert np.array_equal(s.positions[1, [23, 24]], REST[[23, 24]].astype(np.float32))
     s.attach(envs=[1], anchors=[0])
     taken = s.positions[1]
-    assert s.hand_positions[1, 0] == pytest.approx(taken[20], abs=0)
+    assert s.attachment_positions[1, 0] == pytest.approx(taken[20], abs=0)
     assert s.get_state().holder[1].tolist() == s.get_state().holder[0].tolist()
     s.step(4)
     assert np.array_equal(s.positions[1, 20:25], taken[20:25])
@@ -146,7 +146,7 @@ def test_what_is_held_by_a_gripper_cannot_be_attached():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_held_particles_keep_their_places_in_the_hand_at_its_speed_limit(name):
+def test_held_particles_keep_their_places_in_the_attachment_at_its_speed_limit(name):
     s = simulation(integrator=name, gravity=(0, 0, 0), grippers=[gripper(12, reach=0.051, speed=0.5)], dtype="float64")
     s.grippers.move(s.grippers.positions, 0)
     s.step(4)
@@ -166,13 +166,13 @@ def test_held_particles_keep_their_places_in_the_hand_at_its_speed_limit(name):
     assert s.positions[0, held] - s.grippers.positions[0] == pytest.approx(offsets, abs=1e-12)
 
 
-def test_every_hand_has_its_own_speed_limit():
+def test_every_attachment_has_its_own_speed_limit():
     s = simulation(anchors=[0], anchor_speed=1.5, grippers=[Gripper(speed=0.25), Gripper(speed=0.75)])
-    before = s.hand_positions
+    before = s.attachment_positions
     s.move_anchors(before[:, :1] + (0, 9, 0))
     s.grippers.move(before[:, 1:] + (0, 9, 0), 1)
     s.step(3)
-    moved = s.hand_positions - before
+    moved = s.attachment_positions - before
     assert moved[0, :, 1] == pytest.approx([1.5 * 3 * STEP, 0.25 * 3 * STEP, 0.75 * 3 * STEP], rel=1e-5)
     assert not moved[0, :, [0, 2]].any()
 
@@ -211,8 +211,8 @@ def test_placing_a_gripper_leaves_what_it_holds():
 def hang_from_a_gripper(s, steps=300):
     """Let the sheet hang calmly from its anchor, corner 24, then hand it over to a gripper whose fingers close at once."""
     s.step(steps)
-    s.grippers.place(s.hand_positions[:, :1])
-    s.grippers.move(s.hand_positions[:, :1], 0)
+    s.grippers.place(s.attachment_positions[:, :1])
+    s.grippers.move(s.attachment_positions[:, :1], 0)
     s.release()
     s.step()
 
@@ -302,13 +302,13 @@ def test_a_lane_among_seventeen_does_what_it_does_alone(name):
     targets = np.concatenate([REST[[20, 24]][None].repeat(17, 0), REST[[6, 2]][None].repeat(17, 0)], axis=1)
     targets[:, 2:] += rng.normal(scale=0.03, size=(17, 2, 3))
     lift, openings = rng.uniform(0, 0.2, (17, 1, 1)), rng.choice([0.0, 0.3, 1.0], (3, 17, 2))
-    hands = {
+    attachments = {
         "anchors": [[20, 15], 24],
         "grippers": [gripper(6, reach=0.08, closing_time=0.07), gripper(2, reach=0.06, slip_force=0.02)],
     }
 
     def run(lanes):
-        s = simulation(integrator=name, num_envs=len(lanes), substeps=450 if name == "explicit_euler" else 160, **hands)
+        s = simulation(integrator=name, num_envs=len(lanes), substeps=450 if name == "explicit_euler" else 160, **attachments)
         seen = []
         for phase in range(3):
             if phase == 1 and 3 in lanes:
@@ -351,12 +351,12 @@ def test_a_saved_state_with_grippers_goes_on_bit_for_bit(tmp_path):
     for _ in range(8):
         s.step()
         other.step()
-        for name in ("positions", "velocities", "holder", "hand_positions", "openings"):
+        for name in ("positions", "velocities", "holder", "attachment_positions", "openings"):
             assert np.array_equal(getattr(s.get_state(), name), getattr(other.get_state(), name)), name
     assert np.array_equal(s.pulls(), other.pulls())
-    # the orders to the hands are part of it: the fingers went on closing, the tips on their way
+    # the orders to the attachments are part of it: the fingers went on closing, the tips on their way
     assert np.all(other.grippers.openings == 0) and other.grippers.positions[0, 0, 2] > 0.15
-    with pytest.raises(ValueError, match="4 hands .anchors, then grippers., this simulation 3"):
+    with pytest.raises(ValueError, match="4 attachments .anchors, then grippers., this simulation 3"):
         simulation(num_envs=3, anchors=[[20, 21], 24], grippers=[gripper(6)]).set_state(s.get_state())
 
 
@@ -393,7 +393,7 @@ def test_bad_grippers_are_named(kwargs, name):
         ({"anchors": [[0, 0.5]]}, "anchors"),
     ],
 )
-def test_bad_hands_are_named(kwargs, name):
+def test_bad_attachments_are_named(kwargs, name):
     with pytest.raises(ValueError, match=name):
         simulation(**kwargs)
 
@@ -419,5 +419,5 @@ def test_bad_orders_are_named_and_change_nothing(call, name):
     with pytest.raises(ValueError, match=name):
         call(s.grippers)
     after = s.get_state()
-    for field in ("hand_positions", "hand_targets", "openings", "wanted_openings"):
+    for field in ("attachment_positions", "attachment_targets", "openings", "wanted_openings"):
         assert np.array_equal(getattr(before, field), getattr(after, field))
