@@ -1,11 +1,12 @@
 """The rumpled sheets with which ClothDrapeGripper-v0 may begin.
 
-    python benchmarks/rumpled_sheets.py            # writes envs/rumpled.npz, in a few seconds
+    python benchmarks/rumpled_sheets.py            # writes envs/rumpled.npz, in some minutes
 
-Sheets that lie flat are picked up at a random particle, carried some way and dropped, twice, and settle.  Kept are the most
-rumpled ones, by mean height, of those whose two corners at the target can be taken: they lie half a side apart, and no cloth
-from elsewhere is within a gripper's reach of them.  What is written is in tenths of a millimeter, relative to the middle of the
-sheet on the floor.
+Sheets that lie flat are lifted a little at a random particle, carried some way and dropped, twice, and come to rest, in strict
+self-collision (``starts.make``).  Kept are the most rumpled ones, by mean height, of those whose two corners at the target can be
+taken: they lie half a side apart, and no cloth from elsewhere is within a gripper's reach of them.  Layers of a kept sheet are so
+far apart that neither rounding nor the unevenness of a task's start makes it intersect itself.  What is written is in tenths of a
+millimeter, relative to the middle of the sheet on the floor.
 """
 
 from __future__ import annotations
@@ -14,28 +15,18 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
-from clothgym import Gripper, Plane, Simulation
-from clothgym.envs.drape import DrapeTask
-from clothgym.envs.drape_gripper import REACH
-from clothgym.envs.draping import FRICTION, SHEET, SIDE, THICKNESS
+from clothgym import starts
+from clothgym.envs.drape_gripper import REACH, UNEVEN
+from clothgym.envs.draping import PHYSICS, SHEET, SIDE, THICKNESS
+from clothgym.geometry.intersections import find_intersections
 
-KEPT, COUNT, SEED = 64, 256, 0
+KEPT, COUNT, AT_ONCE = 64, 256, 32
+UNIT = 1e-4  # [m]: of what is written
+TRIALS = 20  # uneven starts of each sheet that must be free of intersections
 CORNERS = SHEET.corners[2:]
 BANK = Path(__file__).parent.parent / "envs" / "rumpled.npz"
-
-
-def pick_and_drop(simulation: Simulation, rng: np.random.Generator) -> None:
-    """Lift a particle of each sheet by 0.1 to 0.4 sides, carry it by up to 0.4 sides, and let go."""
-    x = simulation.positions
-    start = x[np.arange(COUNT), rng.integers(SHEET.num_particles, size=COUNT)]
-    simulation.grippers.place(start[:, None])
-    way = np.concatenate([rng.uniform(-0.4, 0.4, (COUNT, 2)), rng.uniform(0.1, 0.4, (COUNT, 1))], axis=1) * SIDE
-    for share, opening in ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)):
-        for _ in range(20):
-            simulation.grippers.move((start + share * way)[:, None], np.full((COUNT, 1), opening))
-            simulation.step()
-    simulation.step(40)
 
 
 def graspable(x: NDArray) -> NDArray:
@@ -49,32 +40,32 @@ def graspable(x: NDArray) -> NDArray:
     return free
 
 
+def robust(x: NDArray) -> NDArray:
+    """Whether each sheet, (sheets, particles, 3), stays free of intersections when its particles are raised unevenly."""
+    fine, rng = np.ones(len(x), bool), np.random.default_rng(0)
+    for _ in range(TRIALS):
+        uneven = x + np.abs(rng.normal(scale=3 * UNEVEN, size=x.shape)) * (0, 0, 1)
+        fine[np.unique(find_intersections(SHEET.triangles, uneven)[:, 0])] = False
+    return fine
+
+
 def main() -> None:
-    rng = np.random.default_rng(SEED)
-    physics = DrapeTask.physics
-    simulation = Simulation(
-        SHEET,
-        physics.material,
-        num_envs=COUNT,
-        time_step=physics.time_step,
-        substeps=physics.substeps,
-        air_density=physics.air_density,
-        colliders=[Plane(friction=FRICTION, thickness=THICKNESS)],
-        grippers=[Gripper(speed=0.5)],
-    )
-    simulation.reset(positions=SHEET.rest_positions + (0, 0, THICKNESS))
-    for _ in range(2):
-        pick_and_drop(simulation, rng)
-    x = simulation.positions
-    x = x[graspable(x)]
-    print(f"{len(x)} of {COUNT} can be taken by their corners")
-    x = x[np.argsort(-x[:, :, 2].mean(axis=1), kind="stable")[:KEPT]]
+    options = {"time_step": PHYSICS.time_step, "substeps": PHYSICS.substeps, "air_density": PHYSICS.air_density}
+    made = [
+        starts.make(SHEET, PHYSICS.material, "rumpled", AT_ONCE, seed=seed, thickness=3 * THICKNESS, **options)
+        for seed in tqdm(range(0, COUNT, AT_ONCE), unit="batch")
+    ]
+    x = np.concatenate(made).astype(np.float64)
     x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
+    x[:, :, 2] += THICKNESS - x[:, :, 2].min(axis=1, keepdims=True)
+    x = np.round(x / UNIT) * UNIT
+    can_be_taken, free = graspable(x), robust(x)
+    print(f"of {COUNT} sheets {can_be_taken.sum()} can be taken by their corners, {free.sum()} bear unevenness")
+    x = x[can_be_taken & free]
+    x = x[np.argsort(-x[:, :, 2].mean(axis=1), kind="stable")[:KEPT]]
     heights = x[:, :, 2].mean(axis=1) * 1000
-    print(
-        f"mean heights {heights.min():.1f} to {heights.max():.1f} mm, largest speed: {np.abs(simulation.velocities).max():.2f} m/s"
-    )
-    np.savez_compressed(BANK, positions=np.round(x * 1e4).astype(np.int16))
+    print(f"{len(x)} are kept, of mean heights {heights.min():.1f} to {heights.max():.1f} mm")
+    np.savez_compressed(BANK, positions=np.round(x / UNIT).astype(np.int16))
     print(f"{BANK}: {BANK.stat().st_size / 1024:.0f} KiB")
 
 

@@ -154,7 +154,7 @@ def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):
         elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
         add_spring_forces(x[b], v[b], f, weave.elements, elastic, scratch)
         add_bend_forces(x[b], v[b], f, weave.elements, elastic, scratch)
-        add_air_forces(x[b], v[b], f, weave.air, resistance[b], wind[b], scratch)
+        add_air_forces(x[b], v[b], f, weave.air, resistance[b], wind[b], x.dtype.type(0), scratch)
         # their sum, with the weights, for each attachment
         out[b] = 0
         for p in range(x.shape[2]):

@@ -55,12 +55,14 @@ class GridSurface(NamedTuple):
     """A grid's triangles by cells; a cell has the index of the particle at its first corner.
 
     cell: offsets of the corners, (4,).  even: 1.0 for cells that are cut from their first corner to their last, (particles,).
-    shares: the corners' shares of the first triangle, then of the second, (8, particles); zero where there is no cell.
+    shares: the corners' shares of the first triangle, then of the second, (8, particles); zero where there is no cell.  area: of
+    each triangle at rest [m^2], (1,).
     """
 
     cell: NDArray
     even: NDArray
     shares: NDArray
+    area: NDArray
 
 
 class BendArrays(NamedTuple):
@@ -106,10 +108,11 @@ class Elastic(NamedTuple):
 
 
 class SurfaceArrays(NamedTuple):
-    """The mesh's triangles, (triangles, 3), and the corners' shares of the force on each, (triangles, 3)."""
+    """The mesh's triangles, (triangles, 3), the corners' shares of the force on each, (triangles, 3), and areas at rest [m^2]."""
 
     triangles: NDArray
     shares: NDArray
+    area: NDArray
 
 
 class Weave(NamedTuple):
@@ -220,7 +223,9 @@ def grid_surface_of(mesh: ClothMesh, dtype: np.dtype) -> GridSurface:
     for corner in range(3):
         place = np.searchsorted(cell, surface.triangles[:, corner] - first)
         shares[np.arange(len(place)) % 2, place, first] = surface.shares[:, corner]
-    return GridSurface(cell, ((row + column) % 2 == 0).astype(dtype), shares.reshape(8, n).astype(dtype))
+    return GridSurface(
+        cell, ((row + column) % 2 == 0).astype(dtype), shares.reshape(8, n).astype(dtype), surface.area[:1].astype(dtype)
+    )
 
 
 def _kind_of(first: NDArray, second: NDArray, columns: int) -> NDArray[np.int64]:
@@ -271,4 +276,6 @@ def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
     triangles = mesh.triangles
     around = np.bincount(triangles.ravel(), minlength=mesh.num_particles)
     shares = mesh.area[triangles] / np.maximum(around, 1)[triangles]
-    return SurfaceArrays(triangles, (shares / shares.sum(axis=1, keepdims=True)).astype(dtype))
+    a, b, c = (mesh.rest_positions[triangles[:, corner]] for corner in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    return SurfaceArrays(triangles, (shares / shares.sum(axis=1, keepdims=True)).astype(dtype), area.astype(dtype))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, placeholder, uncounted
+from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
 from clothgym.bending import Bending
 from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
@@ -29,7 +29,7 @@ add_spring_products = placeholder(
     "of (x, p, y, elements, along, across, bend, scratch): adds the springs' stiffness matrix times p to y",
 )
 add_air_forces = placeholder(
-    "add_air_forces", "of (x, v, f, surface, resistance, wind, scratch): adds the air's force on each triangle to f [N]"
+    "add_air_forces", "of (x, v, f, surface, resistance, wind, interval, scratch): adds the air's force on each triangle to f [N]"
 )
 
 
@@ -151,23 +151,35 @@ def add_lane_products(x, p, y, elements, along, across, bend, scratch):
         )  # fmt: skip
 
 
+@inlined
+def most_air(across, along, density, interval, tiny):
+    """What ``A |u|`` of a triangle of unit area at rest may be at most in its air force, see ``add_lane_air_forces`` [m/s]."""
+    return density / max(max(across, along) * interval, tiny)
+
+
 @uncounted
-def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
+def add_lane_air_forces(x, v, f, surface, resistance, wind, interval, scratch):
     """Add the air's force on each triangle to ``f`` [N], (3, particles, lanes).
 
     ``F = rho/2 A |u| (C_D (u . n) n + C_F (u - (u . n) n))``, with the area A, the unit normal n, and the wind u relative to the
     triangle.  Face on to the wind this is the drag ``rho/2 C_D A u^2``.  At an angle the component across the wind is lift, with
     the coefficient ``(C_D - C_F) sin cos`` of a stalled flat plate (Hoerner 1965, Fluid-Dynamic Drag, 3-15).
 
-    surface: see ``elements.SurfaceArrays``.  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], (2, lanes).  wind: [m/s],
-    (3, lanes).
+    The force stands for an interval dt [s].  In it the air stops the sheet relative to the wind at most: with the mass per area
+    ``rho_s`` and the area ``A_0`` at rest, ``A |u|`` counts as ``rho_s A_0/(dt rho/2 max(C_D, C_F))`` where it is more.  This is
+    some 100 m/s for a sheet of cotton that is not stretched.  An explicit force beyond it would throw the sheet back faster than
+    it came.
+
+    surface: see ``elements.SurfaceArrays``.  resistance: ``rho C_D/2`` and ``rho C_F/2`` [kg/m^3], and ``rho_s`` [kg/m^2], (3,
+    lanes).  wind: [m/s], (3, lanes).
     """
-    triangles, shares = surface
+    triangles, shares, area = surface
     half = x.dtype.type(0.5)
     tiny = x.dtype.type(1e-18)
     one = x.dtype.type(1)
+    least = x.dtype.type(TINY)
     lanes = x.shape[2]
-    across, along = resistance[0], resistance[1]
+    across, along, density = resistance[0], resistance[1], resistance[2]
     row = scratch.rows
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
@@ -184,8 +196,9 @@ def add_lane_air_forces(x, v, f, surface, resistance, wind, scratch):
             uz = wind[2, l] - (a * v[2, i, l] + b * v[2, j, l] + c * v[2, k, l])
             # the terms along n and along u: A = twice/2, and (C_D - C_F) (u . n) n + C_F u is the bracket above
             n2 = nx * nx + ny * ny + nz * nz + tiny
-            speed = np.sqrt(ux * ux + uy * uy + uz * uz)
             twice = np.sqrt(n2)
+            most = area[t] * most_air(across[l], along[l], density[l], interval, least)
+            speed = min(np.sqrt(ux * ux + uy * uy + uz * uz), most * (one / (half * twice)))
             skin = half * speed * along[l] * twice
             face = half * speed * (across[l] - along[l]) * (ux * nx + uy * ny + uz * nz) * (one / twice)
             row[0, l] = face * nx + skin * ux

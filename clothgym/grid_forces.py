@@ -22,9 +22,7 @@ import numpy as np
 
 from clothgym._jit import disjoint, inlined, uncounted
 from clothgym.bending import Bending, add_no_forces, add_no_products, hinge_angles, hinge_rates, hinge_rows
-from clothgym.forces import add_lane_air_forces, add_lane_forces, add_lane_products
-
-TINY = 1e-30  # [m^2], see ``forces``
+from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products, most_air
 
 
 @inlined
@@ -305,23 +303,23 @@ def add_grid_hinge_products(x, p, y, elements, bend, scratch):
 
 
 @inlined
-def _air_force(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, half, one, tiny):
+def _air_force(px, py, pz, qx, qy, qz, ux, uy, uz, across, along, most, half, one, tiny):
     """Force on a triangle with sides p and q [m] in a relative wind u [m/s], in N; see ``forces.add_lane_air_forces``."""
     # normal times twice the area
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
     twice = np.sqrt(nx * nx + ny * ny + nz * nz + tiny)
-    speed = np.sqrt(ux * ux + uy * uy + uz * uz)
+    speed = min(np.sqrt(ux * ux + uy * uy + uz * uz), most * (one / (half * twice)))
     skin = half * speed * along * twice
     face = half * speed * (across - along) * (ux * nx + uy * ny + uz * nz) * (one / twice)
     return face * nx + skin * ux, face * ny + skin * uy, face * nz + skin * uz
 
 
 @disjoint
-def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
+def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, most, fx, fy, fz):
     """Forces on the first triangle of each cell, fx, fy, fz [N], (cells,): a, b, d in even cells, a, b, c in others.
 
     x ... vz: components of positions and velocities, (particles,).  c: particles in a row.  sa ... sd: the corners' shares of the
-    triangle.  wx, wy, wz: the wind [m/s].
+    triangle.  wx, wy, wz: the wind [m/s].  most: what area times speed may be [m^3/s].
     """
     # the corners b, c and d of the cell whose first corner is a = p
     half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
@@ -336,12 +334,12 @@ def _first_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, a
         uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
         uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
         fx[p], fy[p], fz[p] = _air_force(
-            xb[p] - x[p], yb[p] - y[p], zb[p] - z[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
+            xb[p] - x[p], yb[p] - y[p], zb[p] - z[p], qx, qy, qz, ux, uy, uz, across, along, most, half, one, tiny
         )  # fmt: skip
 
 
 @disjoint
-def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, fx, fy, fz):
+def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, across, along, most, fx, fy, fz):
     """Forces on the second triangle of each cell: d, c, a in even cells, d, c, b in others; see ``_first_triangles``."""
     half, zero, one, tiny = x.dtype.type(0.5), x.dtype.type(0), x.dtype.type(1), x.dtype.type(1e-18)
     xb, yb, zb, ub, vb, wb = x[1:], y[1:], z[1:], vx[1:], vy[1:], vz[1:]
@@ -354,7 +352,7 @@ def _second_triangles(x, y, z, vx, vy, vz, c, even, sa, sb, sc, sd, wx, wy, wz, 
         uy = wy - (sa[p] * vy[p] + sb[p] * vb[p] + sc[p] * vc[p] + sd[p] * vd[p])
         uz = wz - (sa[p] * vz[p] + sb[p] * wb[p] + sc[p] * wc[p] + sd[p] * wd[p])
         fx[p], fy[p], fz[p] = _air_force(
-            xc[p] - xd[p], yc[p] - yd[p], zc[p] - zd[p], qx, qy, qz, ux, uy, uz, across, along, half, one, tiny
+            xc[p] - xd[p], yc[p] - yd[p], zc[p] - zd[p], qx, qy, qz, ux, uy, uz, across, along, most, half, one, tiny
         )  # fmt: skip
 
 
@@ -368,15 +366,16 @@ def _share_out(fx, fy, fz, own, others, ax, ay, az, bx, by, bz):
 
 
 @uncounted
-def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
+def add_grid_air_forces(x, v, f, surface, resistance, wind, interval, scratch):
     """The forces of ``forces.add_lane_air_forces``, for all cells at once, and then corner by corner.
 
     The corners of a cell are a, b in one row and c, d in the next.  Its triangles are abd and adc if it is even, else abc and bdc.
     surface: an ``elements.GridSurface``.
     """
     # names for one lane's arrays; a and b: forces on the first and on the second triangles
-    cell, even, s = surface
+    cell, even, s, area = surface
     across, along = resistance[0, 0], resistance[1, 0]
+    most = area[0] * most_air(across, along, resistance[2, 0], interval, x.dtype.type(TINY))
     r, u, total, columns = rows_of(x), rows_of(v), rows_of(f), cell[2]
     count = r.shape[1] - columns - 1
     ax, ay, az = scratch.rows[0, :count], scratch.rows[1, :count], scratch.rows[2, :count]
@@ -384,10 +383,10 @@ def add_grid_air_forces(x, v, f, surface, resistance, wind, scratch):
     wx, wy, wz = wind[0, 0], wind[1, 0], wind[2, 0]
     # the forces on both triangles of each cell
     _first_triangles(
-        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[0], s[1], s[2], s[3], wx, wy, wz, across, along, ax, ay, az
+        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[0], s[1], s[2], s[3], wx, wy, wz, across, along, most, ax, ay, az
     )  # fmt: skip
     _second_triangles(
-        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[4], s[5], s[6], s[7], wx, wy, wz, across, along, bx, by, bz
+        r[0], r[1], r[2], u[0], u[1], u[2], columns, even, s[4], s[5], s[6], s[7], wx, wy, wz, across, along, most, bx, by, bz
     )  # fmt: skip
     # the corners take their shares
     for corner in range(4):

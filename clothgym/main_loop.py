@@ -95,7 +95,7 @@ def advance_block(
         # the air's force is slow beside the springs': until it is computed again it is a constant push
         if air_every > 0 and step % air_every == 0:
             push[:] = 0
-            add_air_forces(x, v, push, weave.air, resistance, wind, work.scratch)
+            add_air_forces(x, v, push, weave.air, resistance, wind, x.dtype.type(air_every) * h, work.scratch)
         # the integrator: springs, bending, gravity, drag and that push move the particles on
         substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
         # springs that are stretched beyond the limit are pulled back to it

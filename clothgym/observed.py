@@ -74,7 +74,7 @@ class Observed:
 
     @property
     def diverged(self) -> NDArray:
-        """Whether an environment has diverged since its reset, (num_envs,): a position was not finite, or a speed above 1 km/s."""
+        """Whether an environment has diverged since its reset, (num_envs,): a position was not finite, or a speed above 10 km/s."""
         return self.layout.to_public(self._diverged)
 
     @property

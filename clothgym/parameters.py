@@ -62,7 +62,7 @@ def fabric_rows(mesh: ClothMesh, parameters: NDArray, hinged: bool, air_density:
         "rigidity": bend if hinged else 0 * bend,
         "damping_time": damping_time,
         "drag_rate": air_drag / density,
-        "resistance": np.stack([drag_coefficient, skin_friction], axis=1) * air_density / 2,
+        "resistance": np.stack([drag_coefficient * air_density / 2, skin_friction * air_density / 2, density], axis=1),
     }
 
 

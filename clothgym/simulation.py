@@ -209,7 +209,7 @@ class Simulation(Observed):
             h=self.dtype.type(h),
             carried=self.dtype.type(h * method.carried),
             substeps=self.substeps,
-            air_every=air_every if self._fabric.resistance.any() else 0,
+            air_every=air_every if self._fabric.resistance[:, :2].any() else 0,
             look_every=look_every,
             options=tuple(method.options.values()),
             plan=self._plan,

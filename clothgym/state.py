@@ -35,8 +35,9 @@ class Fabric(NamedTuple):
 
     stiffness: spring constants by kind [N/m], (block, kinds, lane).  rigidity: of the hinges [N m], (block, lane).
     damping_time [s], (block, lane).
-    drag_rate: linear drag per mass [1/s], (block, lane).  resistance: half the air's density times the coefficients
-    of drag and skin friction [kg/m^3], (block, 2, lane).  gravity [m/s^2] and wind [m/s], (block, 3, lane).
+    drag_rate: linear drag per mass [1/s], (block, lane). resistance: half the air's density times the coefficients of drag and
+    skin friction [kg/m^3], and the sheet's mass per area [kg/m^2], (block, 3, lane). gravity [m/s^2] and wind [m/s], (block, 3,
+    lane).
     """
 
     stiffness: NDArray
@@ -304,7 +305,7 @@ def at_rest(
         rigidity=np.zeros(num_envs),
         damping_time=np.zeros(num_envs),
         drag_rate=np.zeros(num_envs),
-        resistance=np.zeros((num_envs, 2)),
+        resistance=np.zeros((num_envs, 3)),
         gravity=each(gravity),
         wind=each(wind),
         parameters=each(parameters),

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from clothgym.render import Camera
 
 REACH = 0.03  # of the fingers [m]
+UNEVEN = 1e-4  # a sheet begins with its particles raised by about so much [m]: nothing flat can buckle
 GUIDE_REACH = 0.4 * SIDE  # the sheet begins farther away than in ClothDrape-v0
 PICKING = 0.3  # share of the potential that is for taking hold
 PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
@@ -104,7 +105,6 @@ class DrapeGripperTask(GripperTask):
     arguments: ClassVar = {
         "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
         "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.53 N",
-        "self_collision": 'or ``"fast"``; ``"strict"`` with flat starts only: rumpled ones pass through themselves',
     }
 
     def __init__(self, num_envs: int, grippers: int = 2, **kwargs: Any) -> None:
@@ -149,7 +149,7 @@ class DrapeGripperTask(GripperTask):
         # before the target, whose half width is at most sqrt(2) radii
         edge = target.center[1] - np.sqrt(2) * target.radius - gap
         x += (target.center[0] + sideways, edge - x[:, 1].max(), 0)
-        x[:, 2] += np.abs(rng.normal(scale=1e-4, size=len(x)))
+        x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
         count = len(self.places)
         away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
         self.gripper_starts[env] = x[self.places] + SIDE * away
@@ -200,7 +200,7 @@ class DrapeGripperTask(GripperTask):
 
 @cache
 def _rumpled() -> NDArray:
-    """Sheets that were picked up and dropped (``benchmarks/rumpled_sheets.py``), about the origin [m], (sheets, particles, 3)."""
+    """Sheets that were picked up and dropped, free of intersections, about the origin [m], (sheets, particles, 3)."""
     with resources.as_file(resources.files("clothgym.envs").joinpath("rumpled.npz")) as path, np.load(path) as file:
         return file["positions"] * 1e-4
 

@@ -92,10 +92,10 @@ def test_forces_and_products_are_those_of_lanes(shape, bending):
 def test_the_air_presses_as_it_does_on_lanes(shape):
     mesh, real = grid(*shape, 0.3, 0.5), np.float64
     x, v, f = thrown(mesh, real)
-    resistance, wind = np.array([[0.7], [0.05]]), np.array([[1.0], [-2.0], [0.5]])
+    resistance, wind = np.array([[0.7], [0.05], [0.2]]), np.array([[1.0], [-2.0], [0.5]])
     offset, f2 = grid_of(mesh, np.dtype(real), "springs").offset, np.zeros_like(f)
-    add_grid_air_forces(x, v, f, grid_surface_of(mesh, np.dtype(real)), resistance, wind, room_for_forces(x, offset))
-    add_lane_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, room_for_forces(x, offset[:0]))
+    add_grid_air_forces(x, v, f, grid_surface_of(mesh, np.dtype(real)), resistance, wind, 0.0, room_for_forces(x, offset))
+    add_lane_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, 0.0, room_for_forces(x, offset[:0]))
     assert np.abs(f2).max() > 1e-3 and np.allclose(f, f2, rtol=0, atol=1e-12)
 
 

@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from clothgym import Material, Simulation, grid
+from clothgym import INTEGRATORS, Material, Simulation, grid
 from clothgym.elements import element_arrays
 from clothgym.forces import Oscillators, frequency_bound, largest_frequency
 from clothgym.triangles import triangle_mesh
@@ -269,3 +269,24 @@ def test_frequencies_against_a_dense_eigenvalue(mesh, bending, rigidity):
     o = Oscillators(mesh.rest_positions, elements, stiffness, rigidity, bending == "quadratic", 0.0, 1 / mass)
     assert largest_frequency(o) == pytest.approx(exact, rel=3e-4)
     assert 0.9999 * exact <= frequency_bound(o) < 1.6 * exact
+
+
+# --- violence ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("limit", [None, 0.1])
+@pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "explicit_euler"])
+@pytest.mark.parametrize("side", [9, 15])
+def test_a_corner_that_is_torn_three_meters_away_comes_back(side, name, limit):
+    """At 180 m/s, with the automatic substeps: half a second there, and three seconds after that the sheet hangs as before."""
+    simulation = Simulation(
+        grid(side, side, 0.6, 0.6), integrator=name, anchors=(0, side - 1), anchor_speed=1e4, strain_limit=limit, threads=1
+    )
+    home = simulation.attachment_positions
+    for place, steps in ((home + [(0, 0, 0), (3, 0, 0)], 30), (home, 180)):
+        for _ in range(steps):
+            simulation.move_anchors(place)
+            simulation.step()
+    assert not simulation.diverged.any()
+    assert simulation.strain().max() < 0.4 and np.abs(simulation.positions).max() < 0.65
+    assert np.sqrt((simulation.velocities**2).sum(axis=2).mean()) < 0.5
