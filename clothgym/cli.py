@@ -273,7 +273,7 @@ def _view(options: argparse.Namespace) -> None:
         free_port(options.host, options.port)
         start, policies = policies_of(options.policy, options.what)
         playground = serve(start, options.host, options.port, options.replay, policies, actor)
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
         options.refuse(str(error))
     try:
         while True:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +29,16 @@ PICTURE, FILM = 960, 480  # pixels of a side
 LONGEST = 300  # frames of a film or of meshes, the last of the recording
 
 
-def made(kind: str, stage: Stage, moment: int, camera: Any, color: str = "fabric") -> tuple[str, bytes]:
+def made(
+    kind: str, stage: Stage, moment: int, camera: Any, color: str = "fabric", left: Callable[[], bool] = lambda: False
+) -> tuple[str, bytes]:
     """A file's name and content: of the frame at ``moment``, or of the frames up to it, seen by a viewer's camera; color: of
-    pictures and films, "fabric" or "strain".
+    pictures and films, "fabric" or "strain"; left: whether the visitor has left, who then needs no file.
 
     Raises:
         ValueError: no such kind.
         ImportError: a library that this kind needs is missing; the message says how to get it.
+        InterruptedError: the visitor has left.
     """
     if kind not in KINDS:
         raise ValueError(f"file kind={kind!r}: must be one of {', '.join(KINDS)}")
@@ -47,14 +50,22 @@ def made(kind: str, stage: Stage, moment: int, camera: Any, color: str = "fabric
             write_picture(path, painter(recording, PICTURE, 3, color, _seen(camera))(frames[-1]))
         elif kind in ("gif", "mp4"):
             draw = painter(recording, FILM, 2, color, _seen(camera))
-            write_video(path, map(draw, frames), fps=1 / recording.time_step)
+            write_video(path, map(draw, _wanted(frames, left)), fps=1 / recording.time_step)
         elif kind == "glb":
             write_moving_mesh(path, recording, frames, 1 / recording.time_step)
         elif kind == "npz":
             recording.save(path)
         else:
-            return f"{stage.name}_obj.zip", _zipped(_sequence(Path(folder) / "frames", recording, frames))
+            return f"{stage.name}_obj.zip", _zipped(_sequence(Path(folder) / "frames", recording, _wanted(frames, left)))
         return path.name, path.read_bytes()
+
+
+def _wanted(frames: Sequence[Frame], left: Callable[[], bool]) -> Iterator[Frame]:
+    """The frames, as long as somebody waits for them."""
+    for frame in frames:
+        if left():
+            raise InterruptedError("the visitor has left")
+        yield frame
 
 
 def _seen(camera: Any) -> Camera:
@@ -65,7 +76,7 @@ def _seen(camera: Any) -> Camera:
     return Camera(eye=(x, y, max(z, 0.02)), target=target, vertical_fov=fov)  # type: ignore[arg-type]
 
 
-def _sequence(folder: Path, recording: Recording, frames: Sequence[Frame]) -> list[Path]:
+def _sequence(folder: Path, recording: Recording, frames: Iterator[Frame]) -> list[Path]:
     sequence = MeshSequence(folder, *joined(recording), "obj")
     return [sequence.add(together(frame), frame.solids) for frame in frames]
 

@@ -27,7 +27,7 @@ SIDE_BY_SIDE = 0.55  # share of its distance by which the eye moves back for eac
 NARROWER = 0.35  # and for each further sheet whose readings make the view narrower
 ROOM = 1.25  # distance of the page's eye relative to that of a picture, since panels make the view narrower
 ATTACHMENTS = 4  # anchors and grippers that a visitor can close and open
-MOST_SUBSTEPS = 400
+MOST_SUBSTEPS, LARGEST_SEED = 400, 2**31 - 1
 LEFT, COLUMN = 290, 75  # width of the left panel, and added to it for the readings of a third and a fourth sheet [pixels]
 READ_EVERY = 0.2  # between two updates of numbers and plots [s]
 # sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
@@ -47,6 +47,15 @@ CLOTH = (
 )
 
 
+def number_within(value: Any, low: float, high: float) -> float:
+    """A number that a browser has sent, clipped to its control's range; the lowest for what is no finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        return low
+    return min(max(number, low), high) if np.isfinite(number) else low
+
+
 class Page:
     """One visitor's page.
 
@@ -55,11 +64,21 @@ class Page:
         open_stage: makes the stage of a name.
         choices: names of scenes and environments, by title.
         start: the name shown first.
+        left: whether the visitor has left.
 
-    ``tick`` is called by one thread only; a visitor's actions come in a queue.
+    ``tick`` is called by one thread only; a visitor's actions come in a queue.  A browser may send anything, and may change a
+    control's range: what it sends is checked here, against ranges of our own.
     """
 
-    def __init__(self, client: Any, open_stage: Callable[[str], Stage], choices: Mapping[str, str], start: str) -> None:
+    def __init__(
+        self,
+        client: Any,
+        open_stage: Callable[[str], Stage],
+        choices: Mapping[str, str],
+        start: str,
+        left: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._left = left
         self.client, self._open_stage, self.choices = client, open_stage, dict(choices)
         self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
         self.playing, self.moment = True, 0
@@ -67,6 +86,7 @@ class Page:
         self._waiting: Any = None  # notification that the next frame takes a while
         self._fresh = False  # whether the stage has not advanced since it was built, and may have to compile first
         self.controls: dict[str, Any] = {}
+        self._now = 1  # substeps at present
         self.stage: Stage
         self.open(start)
 
@@ -156,20 +176,22 @@ class Page:
     def open(self, name: str) -> None:
         """Show another scene, environment or recording."""
         self.stage = self._open_stage(name)
+        self.stage.left = self._left
         self.playing, self.moment = True, 0
         if not self.controls:
             self._build()
         self._suit()
         self._see()
 
-    def _open(self, name: str) -> None:
+    def _open(self, title: str) -> None:
+        name = self.choices.get(title, self.stage.name)
         if name != self.stage.name:
             self._wait(f"Opening {name}.")
             self.open(name)
 
     def _press(self, button: str) -> None:
         if button == "reset":
-            self.stage.reset(int(self.controls["seed"].value))
+            self.stage.reset(int(number_within(self.controls["seed"].value, 0, LARGEST_SEED)))
             self.moment, self.playing = 0, True
         elif button == "step":
             self.playing = False
@@ -179,7 +201,8 @@ class Page:
 
     def _scrub(self, moment: float) -> None:
         """Show an earlier frame."""
-        self.playing, self.moment = False, min(int(moment), len(self.stage.recording.frames) - 1)
+        last = len(self.stage.recording.frames) - 1
+        self.playing, self.moment = False, int(number_within(moment, 0, last))
 
     def _compare(self, _: Any = None) -> None:
         assert isinstance(self.stage, SceneStage)
@@ -216,7 +239,7 @@ class Page:
         waiting = self.client.add_notification("One moment", f"Making {files.KINDS[kind]}.", loading=True)
         color = "strain" if self.controls["show"].value == "strain" else "fabric"
         try:
-            name, content = files.made(kind, self.stage, self.moment, self.client.camera, color)
+            name, content = files.made(kind, self.stage, self.moment, self.client.camera, color, self._left)
         finally:
             waiting.remove()
         self.client.send_file_download(name, content)
@@ -228,7 +251,7 @@ class Page:
         gui, add = self.client.gui, self._add
         add("about", gui.add_markdown(""))
         add("scene", gui.add_dropdown("scene", tuple(self.choices)))
-        self._ordered(self.controls["scene"], "open", lambda title: self.choices[title])
+        self._ordered(self.controls["scene"], "open")
         add("notes", gui.add_markdown(""))
         with gui.add_folder("Time"):
             self._add_time(gui)
@@ -246,7 +269,7 @@ class Page:
         with gui.add_folder("Save"):
             kinds = add("kind", gui.add_dropdown("as", tuple(files.KINDS.values()), initial_value=files.KINDS["png"]))
             names = {label: kind for kind, label in files.KINDS.items()}
-            self._ordered(add("save", gui.add_button("Save")), "save", lambda _: names[kinds.value])
+            self._ordered(add("save", gui.add_button("Save")), "save", lambda _: names.get(kinds.value, "png"))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(340)
         panel = self.panel = gui.add_panel()
@@ -324,8 +347,10 @@ class Page:
         for name, label, largest, step, unit, hint in sliders:
             slider = self._add(name, gui.add_slider(label, 0.0, largest, step, 0.0, hint=hint))
 
-            def meant(value: float, name: str = name, unit: float = unit) -> dict[str, float | None]:
-                given = round(value * unit, 12)
+            def meant(value: Any, name: str = name, largest: float = largest, unit: float = unit) -> dict[str, float | None]:
+                # a preset may lie beyond the slider
+                present = (getattr(self.stage.settings, name) or 0.0) / unit
+                given = round(number_within(value, 0.0, max(largest, present)) * unit, 12)
                 return {name: None if name == "strain_limit" and not given else given}
 
             self._ordered(slider, "change", meant)
@@ -342,7 +367,13 @@ class Page:
         substeps = self._add("substeps", gui.add_slider("substeps", 1, MOST_SUBSTEPS, 1, 1))
 
         for control in (auto, substeps):
-            self._ordered(control, "change", lambda _: {"substeps": "auto" if auto.value else int(substeps.value)})
+            self._ordered(control, "change", lambda _: {"substeps": self._substeps()})
+
+    def _substeps(self) -> int | str:
+        """What the controls say, within their range."""
+        if self.controls["auto"].value:
+            return "auto"
+        return int(number_within(self.controls["substeps"].value, 1, max(MOST_SUBSTEPS, self._now)))
 
     def _add_comparison(self, gui: Any) -> None:
         on = self._add(
@@ -387,7 +418,7 @@ class Page:
         controls["integrator"].visible = not compared
         stabilities = self.stage.stabilities()
         if stabilities:
-            now = round(stabilities[0].time_step / stabilities[0].substep)
+            self._now = now = round(stabilities[0].time_step / stabilities[0].substep)
             controls["auto"].value = settings.substeps == "auto"
             controls["substeps"].disabled = settings.substeps == "auto"
             controls["substeps"].max = max(MOST_SUBSTEPS, now)
@@ -396,7 +427,7 @@ class Page:
     def _draw(self) -> None:
         frames = self.stage.recording.frames
         self.moment = min(self.moment, len(frames) - 1)
-        mode = self.controls["show"].value
+        mode = self.controls["show"].value if self.controls["show"].value in MODES else MODES[0]
         with self.client.atomic():
             self.show.draw(frames[self.moment], mode, bool(self.controls["diagonals"].value))
             if self.moment == len(frames) - 1:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from clothgym.adapters import runs
 from clothgym.checks import known
+from clothgym.playground.access import MOST_VISITS, Access, is_loopback
 from clothgym.playground.episode import EpisodeStage, Policy, Replay
 from clothgym.playground.page import Page
 from clothgym.playground.recording import Recording
@@ -95,7 +96,7 @@ class Visit:
 
     def _live(self) -> None:
         try:
-            self.page = Page(self._client, self._gallery.open, self._gallery.titles, self._start)
+            self.page = Page(self._client, self._gallery.open, self._gallery.titles, self._start, self.closed.is_set)
             due = time.monotonic()
             while not self.closed.is_set():
                 self.page.tick()
@@ -127,18 +128,28 @@ class Playground:
         self.visits: dict[int, Visit] = {}
         # viser may still write to a page that has just been closed
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-        with contextlib.redirect_stdout(io.StringIO()):  # no banner: our own line gives the address
+        self.access = Access(host, free, lambda: len(self.visits) >= MOST_VISITS)
+        with contextlib.redirect_stdout(io.StringIO()), self.access.guarding():  # no banner: our own line gives the address
             self.server = viser.ViserServer(host=host, port=free, label="clothgym", verbose=False)
+        self.access.port = self.server.get_port()
+        if not self.access.stands():
+            self.server.stop()
+            raise RuntimeError(
+                f"viser {viser.__version__} cannot be guarded against other web pages, so the playground does not open: install a "
+                "version that it was tested with, pip install 'clothgym[view]'"
+            )
         # viser can open a public tunnel for any visitor who asks: not here
         self.server.request_share_url = lambda verbose=True: None
         furnish(self.server.scene)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(206, 64, 50), control_width="large")
-        name = "localhost" if host in ("", "0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        self.url = f"http://{name}:{free}"
+        self.url = self.access.url
         self.server.on_client_connect(self._come)
         self.server.on_client_disconnect(self._go)
 
     async def _come(self, client: Any) -> None:
+        if len(self.visits) >= MOST_VISITS:  # several came at once
+            client.add_notification("The playground is full", f"It has {MOST_VISITS} visitors. Try again later.", color="orange")
+            return
         self.visits[client.client_id] = Visit(client, self.gallery, self.start)
 
     async def _go(self, client: Any) -> None:
@@ -240,6 +251,7 @@ def serve(
     Raises:
         ImportError: viser is missing.
         FileNotFoundError, ValueError: no such scene, environment, file or address; the message says what would do.
+        RuntimeError: this viser cannot be guarded.
     """
     imported_viser()
     recording = Recording.load(replay) if replay is not None else None
@@ -252,5 +264,10 @@ def serve(
     if not stage.over:
         stage.advance()
     playground = Playground(gallery, start, host, port)
+    if not is_loopback(host):
+        tell(
+            f"--host {host}: other machines can reach this page. Whoever has its address can use this machine's processors. The "
+            "token in it changes with each start."
+        )
     tell(f"ready after {time.perf_counter() - begun:.1f} s: open {playground.url} in a browser; Ctrl+C ends it")
     return playground

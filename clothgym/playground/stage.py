@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
+FRAME_BUDGET = 0.5  # of computing, for one frame [s]
 GUSTS = 3600  # control steps after which the gusts repeat
 LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
 KEPT = 1800  # most recent frames that are kept
@@ -98,6 +99,7 @@ class Stage:
 
     def __init__(self) -> None:
         self.notes: dict[str, str] = {}
+        self.left: Callable[[], bool] = lambda: False  # whether the visitor has left, who need not be waited for
 
     @property
     def frame(self) -> Frame:
@@ -234,7 +236,11 @@ class SceneStage(Stage):
     # --- going on -------------------------------------------------------------------------------------------------------
 
     def advance(self) -> Frame:
+        begun = time.perf_counter()
         for _ in range(STEPS):
+            # a frame that takes too long is cut short: then the cloth moves slowly, but the page answers
+            if self.left() or time.perf_counter() - begun > FRAME_BUDGET:
+                break
             wind = np.array([self.settings.wind, 0, 0]) + self.settings.gust * self._gusts[self.steps % len(self._gusts)]
             for sheet in self.sheets:
                 if not sheet.burst:

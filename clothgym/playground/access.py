@@ -1,0 +1,153 @@
+"""Who may visit: every request to the playground's server passes here first.
+
+Any page in the visitor's browser can send requests to this machine.  So the ``Host`` of a request must be this server: a page
+whose name has been rebound to this address sends its own name.  And the ``Origin``, which browsers send with every websocket, must
+be this server's page.  A program other than a browser sends no ``Origin``, and no page can make it visit.  Beyond loopback a
+request also needs the token of the printed address, in its own address or in the cookie that the page has set.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hmac
+import http
+import ipaddress
+import secrets
+import socket
+from collections.abc import Callable, Iterator
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+MOST_VISITS = 16
+NOWHERE = "clothgym.invalid"  # a name that no server has
+FRAMES = "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks on this machine may embed the page
+
+
+class Access:
+    """The guard of one server.
+
+    Args:
+        host: address that the server listens at.
+        port: its port.
+        full: whether there is no room for one more visitor.
+
+    Attributes:
+        token: that a request must bring; "" on loopback, where only this machine's programs can send one.
+    """
+
+    def __init__(self, host: str, port: int, full: Callable[[], bool] = lambda: False) -> None:
+        self.host, self.port, self._full = host, port, full
+        self.token = "" if is_loopback(host) else secrets.token_urlsafe(24)
+
+    @property
+    def url(self) -> str:
+        """Where the page is: the address to open."""
+        return f"http://{_named(reachable(self.host))}:{self.port}" + (f"/?token={self.token}" if self.token else "")
+
+    def refusal(self, path: str, headers: Any) -> tuple[http.HTTPStatus, str] | None:
+        """Why a request is refused, None if it may pass; path: with its query; headers: of websockets."""
+        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+        # rebound names; beyond loopback a server has names that it does not know, and the token guards it
+        if len(hosts) != 1 or (not self.token and hosts[0].lower() not in self._own_names()):
+            return http.HTTPStatus.FORBIDDEN, f"This server is not {', '.join(hosts) or 'without a name'}: open {self.url}"
+        if origins and (len(origins) > 1 or not _is_page_of(origins[0], hosts[0])):
+            return http.HTTPStatus.FORBIDDEN, f"A page of {', '.join(origins)} may not visit this server."
+        if self.token and not self._has_token(path, headers):
+            return http.HTTPStatus.FORBIDDEN, "Open the whole address that the server has printed, with its token."
+        entering = headers.get("Upgrade") is not None or urlsplit(path).path in ("/", "/index.html")
+        if entering and self._full():
+            return http.HTTPStatus.SERVICE_UNAVAILABLE, f"The playground is full, with {MOST_VISITS} visitors. Try again later."
+        return None
+
+    def guarded(self, process: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
+        """A websocket server's ``process_request`` that refuses first, and then does as before."""
+
+        def process_request(connection: Any, request: Any) -> Any:
+            refused = self.refusal(request.path, request.headers)
+            if refused is not None:
+                return connection.respond(refused[0], refused[1] + "\n")
+            response = process(connection, request) if process is not None else None
+            if response is not None:
+                response.headers["Content-Security-Policy"] = FRAMES
+                response.headers["Referrer-Policy"] = "no-referrer"
+                if self.token:
+                    response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+            return response
+
+        return process_request
+
+    @contextlib.contextmanager
+    def guarding(self) -> Iterator[None]:
+        """While a server is made: it is made with this guard.  viser offers no door for it."""
+        from websockets.asyncio import server
+
+        plain = server.serve
+
+        def serve(*args: Any, process_request: Any = None, **kwargs: Any) -> Any:
+            return plain(*args, process_request=self.guarded(process_request), **kwargs)
+
+        server.serve = serve  # type: ignore[assignment,misc]
+        try:
+            yield
+        finally:
+            server.serve = plain  # type: ignore[misc]
+
+    def stands(self) -> bool:
+        """Whether the server refuses a request that it must refuse; asked of the server itself."""
+        with socket.create_connection((_near(self.host), self.port), timeout=10) as probe:
+            probe.sendall(f"GET / HTTP/1.1\r\nHost: {NOWHERE}\r\nConnection: close\r\n\r\n".encode())
+            return probe.recv(64).startswith(b"HTTP/1.1 403")
+
+    @property
+    def _cookie(self) -> str:
+        return f"clothgym-{self.port}"
+
+    def _own_names(self) -> set[str]:
+        names = {"localhost", "127.0.0.1", "[::1]", _named(self.host).lower()}
+        return {f"{name}:{self.port}" for name in names} | (names if self.port == 80 else set())
+
+    def _has_token(self, path: str, headers: Any) -> bool:
+        offered = parse_qs(urlsplit(path).query).get("token", [])
+        for header in headers.get_all("Cookie"):
+            for part in header.split(";"):
+                name, _, value = part.strip().partition("=")
+                offered += [value] if name == self._cookie else []
+        return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in offered)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach that address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def reachable(host: str) -> str:
+    """An address under which others reach a server that listens at ``host``: this machine's own for all of its addresses."""
+    if host not in ("", "0.0.0.0", "::"):
+        return host
+    family, beyond = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
+    # nothing is sent: a datagram socket that is connected knows the address that it would send from
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((beyond, 9))
+        return str(probe.getsockname()[0])
+    return "::1" if host == "::" else "127.0.0.1"
+
+
+def _near(host: str) -> str:
+    """Where this machine reaches a server that listens at ``host``."""
+    return {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+
+
+def _named(host: str) -> str:
+    """A host as addresses write it."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _is_page_of(origin: str, host: str) -> bool:
+    """Whether an ``Origin`` is that of a page of this ``Host``."""
+    parts = urlsplit(origin)
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower()
