@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym._jit import run_spans
 from clothgym.attachment_kernels import FREE, REACH2, SLIP2, bar_blocks, count_held, let_slip, pulls_with, settle_lag, steer_blocks
 from clothgym.bending import Bending
-from clothgym.checks import finite, indices, number, spread, vector
+from clothgym.checks import finite, indices, positive, spread, vector
 from clothgym.collisions import Solids
 from clothgym.elements import Weave
 from clothgym.state import Fabric, Layout, State
@@ -48,13 +48,12 @@ class Gripper:
     slip_force: float | None = None
 
     def __post_init__(self) -> None:
-        vector("Gripper position", self.position)
+        object.__setattr__(self, "position", tuple(vector("Gripper position", self.position).tolist()))
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name == "position" or (field.name == "slip_force" and value is None):
                 continue
-            if number(f"Gripper {field.name}", value) <= 0:
-                raise ValueError(f"Gripper {field.name}={value!r}: must be positive")
+            object.__setattr__(self, field.name, positive(f"Gripper {field.name}", value))
 
 
 class Attachments:

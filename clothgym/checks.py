@@ -3,82 +3,116 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-LARGEST = 1e30  # magnitude in an array: its differences over a control step are still finite in float32
+LARGEST = 1e30  # magnitude of a number: its differences over a control step are still finite in float32
+LONGEST = 200  # characters of a value in a message
+SMALLEST = 1e-30  # of what must be positive: its inverse is still finite in float32
+MOST = 2**31 - 1  # of a count
+MOST_PARTICLES = 10_000_000  # of a batch; a million of them need about a gigabyte
 
 
 def number(name: str, value: Any) -> float:
-    """``value`` as a float, if it is a finite number."""
+    """``value`` as a float, if it is a finite number of a magnitude up to LARGEST; a tensor without axes is one."""
     # the usual case, at once
-    if type(value) is float and math.isfinite(value):
+    if type(value) is float and abs(value) <= LARGEST:
         return value
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.array(np.nan)
-    if array.shape != () or not np.isfinite(array) or isinstance(value, (bool, np.bool_)):
-        raise ValueError(f"{name}={value!r}: must be a finite number")
+    array = _as_numbers(value)
+    if array is None or array.shape != () or not np.isfinite(array) or isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name}={shown(value)}: must be a finite number")
+    if not abs(array) <= LARGEST:
+        raise ValueError(f"{name}={shown(value)}: must lie within {LARGEST:g}")
     return float(array)
 
 
 def positive(name: str, value: Any) -> float:
-    """``value`` as a float, if it is a finite number above zero."""
-    if number(name, value) <= 0:
-        raise ValueError(f"{name}={value!r}: must be positive and finite")
-    return float(value)
+    """``value`` as a float, if it is a finite number from SMALLEST to LARGEST."""
+    plain = number(name, value)
+    if plain <= 0:
+        raise ValueError(f"{name}={shown(value)}: must be positive and finite")
+    if plain < SMALLEST:
+        raise ValueError(f"{name}={shown(value)}: must be at least {SMALLEST:g}")
+    return plain
 
 
 def not_negative(name: str, value: Any) -> float:
     """``value`` as a float, if it is a finite number of at least zero."""
-    if number(name, value) < 0:
-        raise ValueError(f"{name}={value!r}: must be zero or positive")
-    return float(value)
+    plain = number(name, value)
+    if plain < 0:
+        raise ValueError(f"{name}={shown(value)}: must be zero or positive")
+    return plain
 
 
-def count(name: str, value: Any, what: str = "", least: int = 1) -> int:
-    """``value`` as an int, if it is an integer of at least ``least``; what: begins the description in the message."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < least:
-        raise ValueError(f"{name}={value!r}: must be {what}an integer of at least {least}")
+def count(name: str, value: Any, what: str = "", least: int = 1, most: int = MOST) -> int:
+    """``value`` as an int, if it is an integer from ``least`` to ``most``; what: begins the description in the message."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.bool_))
+    if not whole or value < least:
+        raise ValueError(f"{name}={shown(value)}: must be {what}an integer of at least {least}")
+    if value > most:
+        raise ValueError(f"{name}={shown(value)}: must be {what}an integer of at most {most}")
     return int(value)
+
+
+def room(what: str, particles: int) -> None:
+    """Check that so many particles fit into memory; what: names the arguments that ask for them, with their values."""
+    if particles > MOST_PARTICLES:
+        raise ValueError(
+            f"{what}: {shown(particles)} particles need about {shown(particles // 1_000_000)} GB of memory; there may be "
+            f"{MOST_PARTICLES} in a batch"
+        )
+
+
+def shown(value: Any) -> str:
+    """``repr(value)``, shortened where it is long."""
+    try:
+        text = repr(value)
+    except Exception:  # an integer of more digits than Python prints, or an object whose repr fails
+        return f"<{type(value).__name__}>"
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 20]} ... {text[-14:]}"
+
+
+def _as_numbers(value: Any) -> NDArray[np.float64] | None:
+    """A number, list, array or tensor as a float64 array, None where it is not of real numbers."""
+    try:
+        # tensors that require gradients give their numbers only when they are detached
+        array = np.asarray(value.detach() if hasattr(value, "detach") else value)
+        if array.dtype.kind == "O" and all(type(one) is int for one in array.ravel()):
+            array = array.astype(np.float64)  # integers beyond 64 bits
+    except (TypeError, ValueError, OverflowError, RuntimeError, AttributeError):
+        return None
+    return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" or array.size == 0 else None
 
 
 def members(name: str, value: Any, kind: type, what: str) -> None:
     """Check that ``value`` is a sequence of instances of the class ``kind``; what: their name in the message."""
     if not isinstance(value, Sequence) or not all(isinstance(one, kind) for one in value):
-        raise ValueError(f"{name}={value!r}: must be a sequence of {what}")
+        raise ValueError(f"{name}={shown(value)}: must be a sequence of {what}")
 
 
 def one_of(name: str, value: Any, *known: str) -> None:
     """Check that ``value`` is one of the known words."""
-    if value not in known:
-        raise ValueError(f"{name}={value!r}: must be {' or '.join(map(repr, known))}")
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name}={shown(value)}: must be {' or '.join(map(repr, known))}")
 
 
 def known(what: str, name: Any, names: Iterable[str]) -> None:
     """Check that ``name`` is one of ``names``; the message suggests the closest one, and lists them all."""
     names = list(names)
     if not isinstance(name, str) or name not in names:
-        near = difflib.get_close_matches(str(name), names, n=1)
+        near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
         guess = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"no {what} {name!r}{guess} (there are: {', '.join(names)})")
+        raise ValueError(f"no {what} {shown(name)}{guess} (there are: {', '.join(names)})")
 
 
 def finite(name: str, value: ArrayLike) -> NDArray:
     """``value`` as a float64 array, if it holds finite numbers of a magnitude up to LARGEST."""
-    # numbers
-    try:
-        array = np.asarray(value)
-        if array.dtype.kind == "c":
-            raise TypeError
-        array = np.asarray(array, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}={value!r}: must be numbers") from None
+    array = _as_numbers(value)
+    if array is None:
+        raise ValueError(f"{name}={shown(value)}: must be numbers")
     # within range; NaN is not
     within = np.abs(array) <= LARGEST
     if within.all():
@@ -95,7 +129,7 @@ def vector(name: str, value: ArrayLike) -> NDArray:
         return np.array(value)
     array = finite(name, value)
     if array.shape != (3,):
-        raise ValueError(f"{name}={value!r}: must be three numbers")
+        raise ValueError(f"{name}={shown(value)}: must be three numbers")
     return array
 
 
@@ -127,9 +161,12 @@ def sheets(name: str, value: ArrayLike, shape: tuple[int, ...], *others: tuple[i
 
 def indices(name: str, value: ArrayLike, end: int, what: str) -> NDArray:
     """``value`` as an int64 array, (count,), if it holds integers from 0 to ``end - 1``; what: their name in the message."""
-    array = np.atleast_1d(np.asarray(value))
-    if array.size == 0:
+    try:
+        array = np.atleast_1d(np.asarray(value))
+    except (TypeError, ValueError, RuntimeError):  # ragged, or a tensor elsewhere
+        array = np.full(1, np.nan)
+    if array.shape == (0,):
         return np.zeros(0, np.int64)
     if array.dtype.kind not in "iu" or array.ndim != 1 or array.min() < 0 or array.max() >= end:
-        raise ValueError(f"{name}={value!r}: must be integers, {what} are 0 to {end - 1}")
+        raise ValueError(f"{name}={shown(value)}: must be integers, {what} are 0 to {end - 1}")
     return array.astype(np.int64)

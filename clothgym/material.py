@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import known, number
+from clothgym.checks import known, not_negative, positive
 from clothgym.mesh import BEND_X, BEND_Y, EDGE, NUM_KINDS, OPPOSITE, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
 
@@ -47,11 +47,8 @@ class Material:
         for field in fields(self):
             if field.name == "source":
                 continue
-            value = number(field.name, getattr(self, field.name))
-            positive = field.name in ("density", "stretch_stiffness")
-            if value < 0 or (positive and value == 0):
-                need = "positive" if positive else "zero or positive"
-                raise ValueError(f"{field.name}={value!r}: must be {need} and finite")
+            check = positive if field.name in ("density", "stretch_stiffness") else not_negative
+            object.__setattr__(self, field.name, check(field.name, getattr(self, field.name)))
 
     @staticmethod
     def preset(name: str, **changes: float) -> Material:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import positive
+from clothgym.checks import count, positive, room
 
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
@@ -110,13 +110,10 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
         ValueError: fewer than two rows or columns, or a side that is not positive and finite.
     """
     # bad arguments
-    for name, count in (("rows", rows), ("cols", cols)):
-        if not isinstance(count, (int, np.integer)) or count < 2:
-            raise ValueError(f"{name}={count!r}: a sheet needs at least 2 {name} of particles, as an integer")
-    for name, side in (("width", width), ("height", height)):
-        positive(name, side)
+    rows, cols = count("rows", rows, least=2), count("cols", cols, least=2)
+    width, height = positive("width", width), positive("height", height)
+    room(f"rows={rows}, cols={cols}", rows * cols)
     # particles, row by row
-    rows, cols = int(rows), int(cols)
     dx, dy = width / (cols - 1), height / (rows - 1)
     index = np.arange(rows * cols).reshape(rows, cols)
     y, x = np.meshgrid(np.arange(rows) * dy - height / 2, np.arange(cols) * dx - width / 2, indexing="ij")

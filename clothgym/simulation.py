@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym import _jit, guards, integrators
 from clothgym.attachments import FREE, Attachments, Gripper, Grippers
 from clothgym.bending import model_of
-from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, sheets, spread, vector
+from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
 from clothgym.collisions.solids.particle_contact import needed
 from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
@@ -92,6 +92,7 @@ class Simulation(Observed):
         members("colliders", colliders, Collider, "Plane, Sphere, Capsule, Box or MeshCollider")
         members("grippers", grippers, Gripper, "Gripper")
         self.num_envs = count("num_envs", num_envs)
+        room(f"num_envs={num_envs}", self.num_envs * mesh.num_particles)
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
         one_of("contact", contact, "sheet", "particles")
@@ -110,6 +111,8 @@ class Simulation(Observed):
         by_particle = is_regular(mesh) and self.integrator.any_order
         self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
         # what holds the sheet
+        if not isinstance(anchors, Sequence | np.ndarray):
+            raise ValueError(f"anchors={shown(anchors)}: must be a sequence of particles, or of patches of them; () for none")
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._attachments = Attachments(
             self.layout, patches, positive("anchor_speed", anchor_speed), grippers, self.time_step, self.dtype

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, finite, positive
+from clothgym.checks import count, finite, positive, room
 from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
 
 FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
@@ -59,8 +59,8 @@ def disc(radius: float, rings: int) -> ClothMesh:
     Raises:
         ValueError: a radius that is not positive, or fewer than one ring.
     """
-    positive("radius", radius)
-    count("rings", rings)
+    radius, rings = positive("radius", radius), count("rings", rings)
+    room(f"rings={rings}", 1 + 3 * rings * (rings + 1))
     # ring by ring: its particles, and the triangles between it and the ring within, in six sectors
     points, triangles = [np.zeros((1, 3))], []
     for ring in range(1, rings + 1):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.checks import finite, number
+from clothgym.checks import finite, not_negative, positive, shown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +38,12 @@ class Wind:
         for name in ("speed", "direction"):
             bounds = finite(f"wind {name}", getattr(self, name))
             if bounds.shape != (2,) or bounds[0] > bounds[1]:
-                raise ValueError(f"wind {name}={getattr(self, name)!r}: must be a range [low, high]")
+                raise ValueError(f"wind {name}={shown(getattr(self, name))}: must be a range [low, high]")
+            object.__setattr__(self, name, tuple(bounds.tolist()))
         if self.speed[0] < 0:
             raise ValueError(f"wind speed={self.speed!r}: must not be below zero; change the direction instead")
-        if number("wind gust", self.gust) < 0:
-            raise ValueError(f"wind gust={self.gust!r}: must be zero or positive")
-        if number("wind gust_time", self.gust_time) <= 0:
-            raise ValueError(f"wind gust_time={self.gust_time!r}: must be positive")
+        object.__setattr__(self, "gust", not_negative("wind gust", self.gust))
+        object.__setattr__(self, "gust_time", positive("wind gust_time", self.gust_time))
 
     def series(self, rng: np.random.Generator, steps: int, time_step: float) -> NDArray[np.float64]:
         """Velocities of the air in successive control steps [m/s], (steps, 3): a steady wind plus gusts; time_step: [s]."""
