@@ -401,6 +401,10 @@ class Bending:
     isotropic: bool
     kernels: dict[str, Any]
 
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        """Copies and pickles are by name: its kernels stay where they are."""
+        return _named, (self.name,)
+
     def energy(self, bends: BendArrays, x: NDArray, rigidity: NDArray) -> NDArray:
         """Energy of the hinges [J], (num_envs,); x [m], (num_envs, particles, 3); rigidity [N m], (num_envs,)."""
         # quadratic: B/2 |sum_i q_i x_i|^2
@@ -420,13 +424,14 @@ def _kernels(forces: Any, products: Any, project: Any) -> dict[str, Any]:
 
 
 BENDING: dict[str, Bending] = {
-    model.name: model
-    for model in (
-        Bending("springs", False, False, _kernels(add_no_forces, add_no_products, project_nothing)),
-        Bending("hinge", True, False, _kernels(add_hinge_forces, add_hinge_products, project_hinges)),
-        Bending("quadratic", True, True, _kernels(add_quadratic_forces, add_quadratic_products, project_quadratic)),
-    )
+    "springs": Bending("springs", False, False, _kernels(add_no_forces, add_no_products, project_nothing)),
+    "hinge": Bending("hinge", True, False, _kernels(add_hinge_forces, add_hinge_products, project_hinges)),
+    "quadratic": Bending("quadratic", True, True, _kernels(add_quadratic_forces, add_quadratic_products, project_quadratic)),
 }
+
+
+def _named(name: str) -> Bending:
+    return BENDING[name]
 
 
 def model_of(name: str, mesh: ClothMesh) -> Bending:

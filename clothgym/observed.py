@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clothgym import guards
 from clothgym.attachments import Attachments
 from clothgym.bending import Bending
 from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids
 from clothgym.elements import Elements, SurfaceArrays, Weave
-from clothgym.forces import Energy, energy, structural_strain
+from clothgym.forces import Energy, Oscillators, energy, structural_strain
 from clothgym.geometry.intersections import count_intersections
+from clothgym.integrators import Integrator
 from clothgym.limiting import Limiting
 from clothgym.mesh import ClothMesh
 from clothgym.state import Fabric, Layout, Orders, State, View
@@ -20,6 +22,7 @@ class Observed:
     """The properties and measurements of a ``Simulation``; all are fresh copies, except ``view`` and ``orders``."""
 
     mesh: ClothMesh
+    integrator: Integrator
     layout: Layout
     bending: Bending
     strain_limit: float | None
@@ -111,6 +114,15 @@ class Observed:
         return self._attachments.pulls(
             self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks
         )
+
+    def largest_substep(self, env: int = 0) -> tuple[float, str]:
+        """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""
+        return self.integrator.largest_substep(self._oscillators(env))
+
+    def _oscillators(self, env: int) -> Oscillators:
+        """What decides on an environment's substep."""
+        sheet = self.mesh, self._exact_elements, self.bending
+        return guards.oscillators(*sheet, self._fabric, self._free_w, *self.layout.at(env))
 
     def strain(self) -> NDArray:
         """Length over rest length, minus one, of the structural springs or edges, (num_envs, those springs)."""

@@ -15,7 +15,7 @@ from clothgym.checks import count, finite, indices, members, not_negative, one_o
 from clothgym.collisions import Collider, SelfCollision, Solids
 from clothgym.collisions.solids.particle_contact import needed
 from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
-from clothgym.forces import Oscillators
+from clothgym.exclusive import Turn, exclusive
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
 from clothgym.limiting import checked_limit
@@ -93,6 +93,7 @@ class Simulation(Observed):
         members("grippers", grippers, Gripper, "Gripper")
         self.num_envs = count("num_envs", num_envs)
         room(f"num_envs={num_envs}", self.num_envs * mesh.num_particles)
+        self.turn = Turn("simulation")
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
         one_of("contact", contact, "sheet", "particles")
@@ -130,10 +131,7 @@ class Simulation(Observed):
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
         self._weave = weave_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
-        # the main loop with the kernels of all that
-        touched = needed(contact, self._solids.shapes.kinds)
-        parts = self.bending, by_particle, strain_limit is not None, self._contact.options is not None, touched
-        self._advance = compiled(self.integrator.substep, self.integrator.name, *parts)
+        self._compile()
         # a state at rest, with masses and stiffness of the material
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -161,11 +159,31 @@ class Simulation(Observed):
         self.substeps = count("substeps", substeps, "'auto' or ")
         self._warn_if_beyond_bound(np.arange(1))
 
+    def _compile(self) -> None:
+        """The main loop with the kernels of all that there is."""
+        touched = needed(self.contact, self._solids.shapes.kinds)
+        parts = self.bending, self.layout.by_particle, self.strain_limit is not None, self._contact.options is not None, touched
+        self._advance = compiled(self.integrator.substep, self.integrator.name, *parts)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: all but compiled code."""
+        return {name: value for name, value in vars(self).items() if name != "_advance"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._compile()
+
     # --- time -----------------------------------------------------------------------------------------------------------
 
+    @exclusive
     def step(self, n: int = 1) -> None:
-        """Advance all environments by ``n`` control steps; attachments move towards their targets at a bounded speed."""
+        """Advance all environments by ``n`` control steps; attachments move towards their targets at a bounded speed.
+
+        Raises:
+            RuntimeError: a step was interrupted, and not all environments have been reset since; or another thread is in a call.
+        """
         count("n", n)
+        self.turn.check_whole()
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
         motion, solids = Motion(self._x, self._v, self._w), Solid(self._solids.shapes, self._solids.rows)
@@ -183,6 +201,7 @@ class Simulation(Observed):
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
         for _ in range(n):
+            self.turn.unfinished = range(self.num_envs)
             _jit.run_spans(work, self.layout.blocks, self.threads)
             if self.colliders:
                 self._solids.end_step()
@@ -190,6 +209,7 @@ class Simulation(Observed):
                 self._attachments.slip(self._pulls(), self._w, self._free_w)
                 self._forgive_lag()
             self._steps += 1
+            self.turn.unfinished = ()
             self._contact.warn(self._steps)
             if self.on_divergence != "ignore" and self._diverged.any():
                 new = self.diverged & ~self._reported
@@ -220,25 +240,18 @@ class Simulation(Observed):
             limit=float(self.strain_limit or 0),
         )
 
-    def largest_substep(self, env: int = 0) -> tuple[float, str]:
-        """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""
-        return self.integrator.largest_substep(self._oscillators(env))
-
-    def _oscillators(self, env: int) -> Oscillators:
-        """What decides on an environment's substep."""
-        sheet = self.mesh, self._exact_elements, self.bending
-        return guards.oscillators(*sheet, self._fabric, self._free_w, *self.layout.at(env))
-
     def _warn_if_beyond_bound(self, envs: NDArray) -> None:
         guards.warn_if_beyond(self.integrator, map(self._oscillators, envs.tolist()), self.time_step, self.substeps)
 
     # --- what can be done -----------------------------------------------------------------------------------------------
 
+    @exclusive
     def move_anchors(self, targets: ArrayLike) -> None:
         """Where the anchors are to be at the end of the next step [m], (num_envs, anchors, 3), as far as their speed allows."""
         shape = (self.num_envs, self.anchors.size, 3)
         self._attachments.move(slice(0, self.anchors.size), spread("targets", finite("targets", targets), shape))
 
+    @exclusive
     def release(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Let go: pairs of environment and anchor (its place in ``anchors``), or all anchors, or all environments."""
         block, lane, which = self._pairs(envs, anchors)
@@ -246,6 +259,7 @@ class Simulation(Observed):
         self._forgive_lag()
         self._apply_masses(block, lane)
 
+    @exclusive
     def attach(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Take hold again, where the particle now is; arguments as for ``release``."""
         block, lane, which = self._pairs(envs, anchors)
@@ -265,36 +279,50 @@ class Simulation(Observed):
         which = spread("anchors", indices("anchors", anchors, count, "this simulation's anchors"), env.shape)
         return (*self.layout.at(env), which)
 
+    @exclusive
     def set_wind(self, wind: ArrayLike, envs: ArrayLike | None = None) -> None:
         """Velocity of the air from now on [m/s], (len(envs), 3) or (3,)."""
         env = self.layout.chosen(envs)
         block, lane = self.layout.at(env)
         self._fabric.wind[block, :, lane] = spread("wind", finite("wind", wind), (len(env), 3))
 
+    @exclusive
     def reset(self, envs: ArrayLike | None = None, positions: ArrayLike | None = None, velocities: ArrayLike | None = None) -> None:
         """Put environments back: rest positions or those given [m], at rest or as given [m/s], all anchors attached, grippers
         open and at home, solids that have moved where they began.
 
-        positions, velocities: (len(envs), particles, 3), or one sheet for all, (particles, 3).
+        positions, velocities: (len(envs), particles, 3), or one sheet for all, (particles, 3).  What cannot be changes nothing.
         """
+        self.begin(*self.checked_start(envs, positions, velocities))
+
+    def checked_start(self, envs: Any, positions: Any = None, velocities: Any = None) -> tuple[NDArray, NDArray, NDArray]:
+        """What ``reset`` is given, checked, for ``begin``."""
         env = self.layout.chosen(envs)
         shape = (len(env), self.mesh.num_particles, 3)
         x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
         if positions is not None:
             self._contact.check(x, env)
+        return env, np.broadcast_to(x, shape), np.broadcast_to(v, shape)
+
+    @exclusive
+    def begin(self, env: NDArray, x: NDArray, v: NDArray) -> None:
+        """Put environments back, see ``reset``, to what ``checked_start`` has returned."""
+        self.turn.begin(env.tolist())
         block, lane = self.layout.at(env)
-        self._x[block, :, :, lane] = np.swapaxes(np.broadcast_to(x, shape), 1, 2)
-        self._v[block, :, :, lane] = np.swapaxes(np.broadcast_to(v, shape), 1, 2)
+        self._x[block, :, :, lane] = np.swapaxes(x, 1, 2)
+        self._v[block, :, :, lane] = np.swapaxes(v, 1, 2)
         self._solids.begin(block, lane)
-        self._attachments.begin(block, lane, np.broadcast_to(x, shape))
+        self._attachments.begin(block, lane, x)
         self._steps[env] = 0
         self._diverged[block, lane] = False
         self._limited[block, :, lane] = 0
         self._reported[env] = False
         self._apply_masses(block, lane)
         self._contact.begin(block, lane, self._x)
+        self.turn.finish(env.tolist())
 
+    @exclusive
     def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **properties: ArrayLike) -> None:
         """Change material properties (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
 
@@ -318,11 +346,13 @@ class Simulation(Observed):
                 _, first = np.unique(after[env], axis=0, return_index=True)
                 self._warn_if_beyond_bound(env[first])
 
+    @exclusive
     def set_collider(self, index: int, colliders: Sequence[Collider], envs: ArrayLike | None = None) -> None:
         """Put other solids of the same family (a plane, the same mesh, or any other) in place of collider ``index``, one an
         environment."""
         self._solids.replace(index, colliders, *self.layout.at(self.layout.chosen(envs)))
 
+    @exclusive
     def move_colliders(
         self, index: int, targets: ArrayLike | None = None, velocities: ArrayLike | None = None, envs: ArrayLike | None = None
     ) -> None:
@@ -338,8 +368,14 @@ class Simulation(Observed):
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
+    @exclusive
     def get_state(self) -> State:
-        """All that is needed to go on bit for bit, as fresh copies."""
+        """All that is needed to go on bit for bit, as fresh copies; refused while a step is unfinished, as ``step`` is."""
+        self.turn.check_whole()
+        return self._state()
+
+    def _state(self) -> State:
+        """The same, whether whole or not."""
         public = self.layout.to_public
         return State(
             positions=self.positions,
@@ -355,13 +391,14 @@ class Simulation(Observed):
             sheet=self._sheet,
         )
 
+    @exclusive
     def set_state(self, state: State) -> None:
         """Go on from a state of a simulation with the same mesh, anchors, colliders and number of environments.
 
         Raises:
             ValueError: the state does not fit; nothing is changed then.
         """
-        check_fits(state, self.get_state())
+        check_fits(state, self._state())
         guards.refuse_properties(self.integrator, self.mesh, state.parameters, state.parameters)
         self._contact.check_memory(state)
         sound = np.flatnonzero(~state.diverged)
@@ -370,6 +407,7 @@ class Simulation(Observed):
 
     def _go_on(self, state: State) -> None:
         """Take over what a state holds."""
+        self.turn.unfinished = range(self.num_envs)
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = self.layout.vectors_to_blocks(state.positions, dtype)
         self._v = self.layout.vectors_to_blocks(state.velocities, dtype)
@@ -386,6 +424,7 @@ class Simulation(Observed):
         self._reported = self.diverged
         self._apply_masses(*self.layout.at(np.arange(self.num_envs)))
         self._contact.restore(state, self._x)
+        self.turn.unfinished = ()
 
     # --- from descriptions to rows --------------------------------------------------------------------------------------
 

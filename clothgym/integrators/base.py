@@ -139,6 +139,19 @@ class Integrator:
             options[name] = int(value) if whole else float(value)
         return replace(self, options=MappingProxyType({**self.options, **options}))
 
+    def __reduce__(self) -> tuple[Callable[..., Integrator], tuple[Any, ...]]:
+        """Copies and pickles of a method of the table are by its name and options: its kernels stay where they are."""
+        from clothgym.integrators import INTEGRATORS, get  # the table lies above
+
+        if self.name in INTEGRATORS and replace(INTEGRATORS[self.name], options=self.options) == self:
+            return get, ({"name": self.name, **self.options},)
+        return _rebuilt, ({**vars(self), "options": dict(self.options)},)
+
+
+def _rebuilt(attributes: dict[str, Any]) -> Integrator:
+    """A method that is not in the table, from a pickle, which knows no mapping proxies."""
+    return Integrator(**{**attributes, "options": MappingProxyType(attributes["options"])})
+
 
 @kernel
 def room_for_work(x, offset, room):

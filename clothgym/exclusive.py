@@ -1,0 +1,87 @@
+"""Floor 0: one thread at a time in an object, and what it knows of a call that was interrupted."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Collection, Iterable
+from threading import get_ident
+from typing import Any, TypeVar, cast
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+class Turn:
+    """Whose turn it is in an object with a batch of environments.
+
+    Attributes:
+        what, error: the object, for messages, and what is raised where environments are unfinished.
+        unfinished: environments that a call is changing.  After an interruption they are still here: only a reset or a restored
+            state takes them out.
+    """
+
+    def __init__(self, what: str, unfinished: Collection[int] = (), error: type[Exception] = RuntimeError) -> None:
+        self.what, self.unfinished, self.error = what, unfinished, error
+        self._holder: dict[str, int] = {}
+
+    def take(self) -> bool:
+        """Begin a call; returns whether it is the outermost one of this thread, which has to ``give_back``.
+
+        Raises:
+            RuntimeError: another thread is in a call.
+        """
+        me = get_ident()
+        if self._holder.get("thread") == me:
+            return False
+        # one operation of the interpreter: of two threads one comes first
+        if self._holder.setdefault("thread", me) != me:
+            raise RuntimeError(
+                f"another thread is in the middle of a call of this {self.what}: give each thread one of its own, or let them "
+                "take turns, with a threading.Lock"
+            )
+        return True
+
+    def give_back(self) -> None:
+        """End the outermost call."""
+        self._holder.pop("thread", None)
+
+    def check_whole(self) -> None:
+        """Refuse to go on with half a step.
+
+        Raises:
+            RuntimeError: a call was interrupted, and not all environments have been reset since.
+        """
+        if self.unfinished:
+            raise self.error(
+                f"a call of this {self.what} was interrupted and left environment {min(self.unfinished)} between two steps: call "
+                "reset(), or set_state() with a state from before"
+            )
+
+    def begin(self, envs: Iterable[int]) -> None:
+        """These environments are about to change."""
+        self.unfinished = {*self.unfinished, *envs}
+
+    def finish(self, envs: Iterable[int]) -> None:
+        """These environments are whole again."""
+        self.unfinished = set(self.unfinished).difference(envs)
+
+    def __reduce__(self) -> tuple[type[Turn], tuple[str, Collection[int], type[Exception]]]:
+        """A copy is nobody's; it cannot be made while another thread is in a call."""
+        if self.take():
+            self.give_back()
+        return Turn, (self.what, self.unfinished, self.error)
+
+
+def exclusive(method: Method) -> Method:
+    """A method that one thread at a time may be in, by the object's ``turn``; it may call others of the object."""
+
+    @functools.wraps(method)
+    def taken(self: Any, *args: Any, **kwargs: Any) -> Any:
+        turn = self.turn
+        if not turn.take():
+            return method(self, *args, **kwargs)
+        try:
+            return method(self, *args, **kwargs)
+        finally:
+            turn.give_back()
+
+    return cast(Method, taken)
