@@ -92,7 +92,7 @@ def score(env_id: str, cheat: Callable[[Any, int], NDArray]) -> dict[str, Any]:
         step += 1
     row = {"environment": env_id, "cheat": cheat.__name__}
     row |= {"success": float(last["is_success"].mean()), "performance": float(last["normalized_performance"].mean())}
-    row |= {"return": float(total.mean()), "failed": float((last["failure"] != "").mean())}
+    row |= {"return": float(total.mean()), "failed": float((last["failure"] != 0).mean())}
     if "episode_cost" in last:
         row["cost"] = float(last["episode_cost"].mean())
     return row

@@ -164,7 +164,7 @@ def measure_drape(target: str, steps: int = STEPS) -> Row:
         bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
         gap = min(gap, float(simulation.self_contacts.gap.min()))
         ended = terminated | truncated
-        failures += int(np.sum(np.asarray(info["failure"])[ended] != ""))
+        failures += int(np.count_nonzero(info["failure"][ended]))
         if ended.any():
             env.reset(options=options | {"reset_mask": ended})
     env.close()

@@ -29,14 +29,25 @@ ENVIRONMENTS = {
         "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
     ),
 }
+# steps after which an episode of an id has ended by itself, at the latest
+LONGEST = {"ClothReach-v0": 40, "ClothDrape-v0": 100, "ClothDrapeGripper-v0": 140, "ClothStrain-v0": 150}
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 
 
 def register() -> None:
-    """Register every id once; importing the package again, as worker processes do, changes nothing."""
+    """Register every id once; importing the package again, as worker processes do, changes nothing.
+
+    ``max_episode_steps`` is one more than the longest episode takes: at that number Gymnasium's ``TimeLimit`` would also call an
+    episode truncated that has been evaluated, and terminated, in its last step.
+    """
     for env_id, (name, _) in ENVIRONMENTS.items():
         if env_id not in gym.registry:
-            gym.register(env_id, entry_point=f"clothgym.envs:{name}Env", vector_entry_point=f"clothgym.envs:{name}VectorEnv")
+            gym.register(
+                env_id,
+                entry_point=f"clothgym.envs:{name}Env",
+                vector_entry_point=f"clothgym.envs:{name}VectorEnv",
+                max_episode_steps=LONGEST[env_id] + 1,
+            )
 
 
 def checked_id(env_id: str) -> str:

@@ -166,14 +166,15 @@ class ClothDrapeEnv(ClothEnv):
     0 for a sheet that does not touch the target's top, 1 for the fine sheet's coverage, dead center and at rest.
     ``info["is_success"]``: C >= 0.9 C_ref, e <= 0.1 L and v under 0.05 m/s.  ``info`` also has ``coverage``,
     ``coverage_reference``, ``off_center`` (e / L), ``rms_speed`` [m/s], ``strain_max``, ``strain_before_limiting``, ``settling``,
-    ``failure`` and ``reward_terms``.  What belongs to the evaluation is 0 until then.
+    ``failure`` and the ``reward/...`` terms.  What belongs to the evaluation is 0 until then.
 
     ## Starting State
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
     millimeter; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
     "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
     goes out).  Never truncated: the time limit is part of the task.
 

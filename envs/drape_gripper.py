@@ -247,7 +247,8 @@ class ClothDrapeGripperEnv(ClothEnv):
     and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
     "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
     goes out).  Never truncated: the time limit is part of the task.
 

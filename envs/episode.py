@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym import checks
 from clothgym.state import State
 
+SHARED = ("sheet", "self_contact")  # fields of a simulation's state that are not one array with the environment first
 FAILURES = ("", "diverged", "torn", "out_of_bounds")
 FINE, DIVERGED, TORN, OUT_OF_BOUNDS = range(4)
 TWICE = 2.0  # the stretch at which a structural spring tears
@@ -19,6 +21,8 @@ BEYOND = 0.5  # how far the center of the sheet may leave the arena [m]
 FAILURE_PENALTY = 0.5
 SUCCESS_BONUS = 0.25
 EFFORT_PRICE = 0.001
+
+LARGEST_SEED = 2**128 - 1  # as large as what NumPy draws where none is given
 
 Fields = Sequence[tuple[Any, ...]]  # (name, type) or (name, type, shape)
 
@@ -30,6 +34,33 @@ class TaskState:
     simulation: State
     episode: dict[str, NDArray]
     generators: list[str]
+
+    def branch(self, count: int, env: int = 0) -> TaskState:
+        """One environment's state, ``count`` times: ``vector_env.unwrapped.set_state(env.unwrapped.get_state().branch(8))``.
+
+        Each goes on as that environment would have, with its random numbers too.
+
+        Raises:
+            ValueError: less than one, or no such environment.
+        """
+        checks.count("count", count)
+        chosen = np.repeat(checks.indices("env", env, len(self.generators), "this state's environments"), count)
+        physics = {field.name: getattr(self.simulation, field.name) for field in fields(State) if field.name not in SHARED}
+        contact = {name: array[chosen] for name, array in self.simulation.self_contact.items()}
+        return TaskState(
+            replace(self.simulation, self_contact=contact, **{name: array[chosen] for name, array in physics.items()}),
+            episode={name: array[chosen] for name, array in self.episode.items()},
+            generators=[self.generators[one] for one in chosen],
+        )
+
+
+def checked_seeds(seeds: Sequence[Any]) -> list[int | None]:
+    """Seeds that generators can have.
+
+    Raises:
+        ValueError: one that is neither None nor an integer of at least zero.
+    """
+    return [None if seed is None else checks.count("seed", seed, "None, or ", least=0, most=LARGEST_SEED) for seed in seeds]
 
 
 def records(count: int, fields: Fields) -> NDArray:

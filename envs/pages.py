@@ -35,7 +35,7 @@ COMMON: dict[str, tuple[str, str]] = {
         "``None``", 'largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met',
     ),
     "self_collision": (
-        "``False``", 'or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``hand_lag`` and more',
+        "``False``", 'or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``attachment_lag`` and more',
     ),
     "contact": ('``"particles"``', 'what touches solids: particles only, or ``"sheet"``, the whole sheet, which solids also stop'),
     "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
@@ -45,7 +45,10 @@ COMMON: dict[str, tuple[str, str]] = {
     "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
     "threads": ("1; in a batch all processors", "the outcome does not depend on it"),
     "render_mode": ("``None``", '``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``)'),
-    "render_color": ('``"fabric"``', 'or ``"strain"``: cream where no yarn is stretched, violet from $strain_shown % on'),
+    "render_color": (
+        '``"fabric"``',
+        'or ``"strain"``: cream where no yarn is stretched, violet from $strain_shown % on; or ``"depth"``, in gray',
+    ),
 }  # fmt: skip
 
 

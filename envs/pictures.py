@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from clothgym.render import Renderer
 
 RENDER_MODES = ["rgb_array", "depth_array"]
-RENDER_COLORS = ("fabric", "strain")
+RENDER_COLORS = ("fabric", "strain", "depth")
 
 
 def check_render_mode(render_mode: str | None, render_color: str) -> None:
@@ -37,12 +37,14 @@ def renderer_of(task: Task, width: int, height: int, antialias: int = 2) -> Rend
 def draw(task: Task, renderer: Renderer, mode: str, envs: Sequence[int], color: str = "fabric") -> NDArray:
     """Frames: (envs, height, width, 3) uint8 for "rgb_array", (envs, height, width) [m] for "depth_array".
 
-    color: "fabric", or "strain": cream where no yarn is stretched, violet where one is by the task's ``strain_shown`` or more.
+    color: "fabric"; "strain": cream where no yarn is stretched, violet where one is by the task's ``strain_shown`` or more; or
+    "depth": gray, for films of depths, from white at half the camera's distance from its target to black at twice that and beyond.
     """
     positions = task.simulation.positions[list(envs)]
     solids, markers = [task.solids(env) for env in envs], [task.markers(env) for env in envs]
-    if mode == "depth_array":
-        return renderer.depth_batch(positions, solids, markers)
+    if mode == "depth_array" or color == "depth":
+        depths = renderer.depth_batch(positions, solids, markers)
+        return depths if mode == "depth_array" else _gray(depths / np.float32(renderer.camera.distance))
     values = None
     if color == "strain":
         from clothgym.render.heat import largest_at_particles  # imported here: training draws nothing
@@ -50,3 +52,10 @@ def draw(task: Task, renderer: Renderer, mode: str, envs: Sequence[int], color: 
         mesh = task.physics.mesh
         values = largest_at_particles(mesh, structural_strain(mesh, positions)) / np.float32(task.strain_shown)
     return renderer.rgb_batch(positions, solids, markers, values)
+
+
+def _gray(depths: NDArray) -> NDArray:
+    """Depths, (..., height, width), in distances of the camera from its target, as gray pictures, (..., height, width, 3) uint8."""
+    near, far = 0.5, 2.0
+    shade = np.clip((far - np.minimum(depths, far)) / (far - near), 0, 1)
+    return np.repeat(np.rint(255 * shade).astype(np.uint8)[..., None], 3, axis=-1)

@@ -198,7 +198,7 @@ class ClothReachEnv(ClothEnv):
     ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
     doing nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
     ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure``
-    and ``reward_terms``.
+    and the ``reward/...`` terms.
     What belongs to the evaluation is 0 until then.
 
     ## Starting State
@@ -207,9 +207,10 @@ class ClothReachEnv(ClothEnv):
     millimeter.
 
     ## Episode End
-    Terminated when evaluated, after 40 steps, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice
-    its rest length), "out_of_bounds" (the sheet's center 0.5 m outside the room of the driven corner), "diverged" (not finite;
-    the last finite observation goes out).  Never truncated: the time limit is part of the task.
+    Terminated when evaluated, after 40 steps, or at a failure, which ``env.metadata["failures"]`` names by the code
+    ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m outside
+    the room of the driven corner), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit
+    is part of the task.
 
     ## Arguments
     $arguments

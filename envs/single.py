@@ -8,19 +8,25 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.envs.episode import TaskState
+from clothgym.envs.episode import FAILURES, TaskState
+from clothgym.envs.keyboard import actions_of_keys
 from clothgym.envs.pages import check_keywords, completed
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
+from clothgym.exclusive import Turn, exclusive
 
 IMAGE_SIZE = 480
 
 
 class ClothEnv(gym.Env[NDArray, NDArray]):
-    """Base of the single environments; a subclass names its ``Task``, and its docstring is completed by ``pages``."""
+    """Base of the single environments; a subclass names its ``Task``, and its docstring is completed by ``pages``.
+
+    ``copy.deepcopy`` and ``pickle`` take an environment in the middle of an episode; the copy goes on with the same bits.
+    """
 
     task_class: ClassVar[type[Task]]
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30}  # noqa: RUF012 - Gymnasium's own
+    # failures: names of the codes in ``info["failure"]``
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30, "failures": FAILURES}  # noqa: RUF012 - Gymnasium's
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -38,23 +44,41 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         self._renderer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
-        super().reset(seed=seed)
         self.task.reset(np.array([0]), [seed], options)
-        self._np_random = self.task.generators[0]
-        return self.task.observation[0].copy(), {"failure": ""}
+        generator = self.task.generators[0]
+        if self._np_random is not generator:  # it has been seeded anew
+            sequence: Any = generator.bit_generator.seed_seq
+            self._np_random, self._np_random_seed = generator, sequence.entropy
+        return self.task.observation[0].copy(), self.task.info_of(0)
 
+    @exclusive
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
         if np.shape(action) != self.action_space.shape:
             raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
         task = self.task
-        task.step(np.asarray(action)[None])
+        task.advance(np.asarray(action)[None])
         reward, terminated, *_ = task.outcome[0].item()
-        return task.observation[0].copy(), reward, terminated, False, task.info_of(0)
+        brought = task.observation[0].copy(), reward, terminated, False, task.info_of(0)
+        self.turn.unfinished = ()
+        return brought
+
+    @property
+    def turn(self) -> Turn:
+        """Of the task: one thread at a time is in the environment."""
+        return self.task.turn
 
     @property
     def observation_slices(self) -> dict[str, slice]:
         """Where each observation lies in what ``reset`` and ``step`` return, by its name on the page."""
         return dict(self.task.observation_slices)
+
+    def get_keys_to_action(self) -> dict[str, NDArray]:
+        """For ``gymnasium.utils.play``: what each set of keys does, see ``keyboard``."""
+        return actions_of_keys(self.task.num_attachments, self.task.actions_per_attachment)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
+        return vars(self) | {"_renderer": None}
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
@@ -75,4 +99,4 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
     def set_state(self, state: TaskState) -> None:
         """Continue from what ``get_state`` returned, here or in another environment of the same kind."""
         self.task.set_state(state)
-        self._np_random = self.task.generators[0]
+        self._np_random, self._np_random_seed = self.task.generators[0], -1  # as Gymnasium has it for one of unknown seed

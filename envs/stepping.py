@@ -37,7 +37,8 @@ measure = placeholder(
 done = placeholder("done", "of (own, rules, sheet): whether the agent is done before its time is up")
 account = placeholder(
     "account",
-    "of (own, rules, sheet, info, terms, running, failure): the rest of info, and the sum of the task's own reward terms",
+    "of (own, rules, sheet, info, terms, running, failure), at an episode's start, not running, and after each step: the rest of "
+    "info, and the sum of the task's own reward terms",
 )
 fingers = placeholder("fingers", "of (move, wanted, acting): how far a gripper's fingers are to open, from 0 to 1")
 
@@ -257,6 +258,9 @@ def finish_one(
                 own.targets[k, c] = sheet.attachments[k, c]
         measure(own, rule, sheet)
         own.potential = potential(own, rule, sheet)
+        # info is of the sheet as it starts
+        info[e].strain_max = info[e].strain_before_limiting = largest_strain(sheet.summary)
+        account(own, rule, sheet, info[e], terms[e], False, FINE)
         changed = True
     else:
         changed = score(own, rule, sheet, outcome[e], info[e], terms[e])

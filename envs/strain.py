@@ -359,8 +359,8 @@ class ClothStrainEnv(ClothEnv):
     ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the way, 1 on arrival.
     ``info`` also has ``strain_max`` (and ``strain_before_limiting``, the same), ``strain_p95``, ``strain_excess`` (over the
     threshold), ``tension_left`` and ``tension_right`` (pull of the sheet at each clip [N], without what accelerates the clipped
-    cloth), ``settling`` (never), ``failure`` and ``reward_terms``.  All are of the end of the step; what happens within it is not
-    scored.
+    cloth), ``settling`` (never), ``failure`` and the ``reward/...`` terms.  All are of the end of the step; what happens within
+    it is not scored.
 
     What scripted agents score on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy noop random
     careless expert``); careless is each clip straight to its place at full speed, expert the pair held apart as at rest, at
@@ -383,7 +383,8 @@ class ClothStrainEnv(ClothEnv):
     0.2 rad.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, named by ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
     "out_of_bounds" (the sheet's center 0.5 m outside the room of the clips), "diverged" (not finite; the last finite observation
     goes out).  Never truncated: the time limit is part of the task.
 

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from clothgym import _jit, integrators
 from clothgym.checks import not_negative, one_of
 from clothgym.envs.definition import VELOCITY_BOUND, Observation, TaskDefinition
-from clothgym.envs.episode import FAILURES, TaskState, names_of, record_of, records
+from clothgym.envs.episode import TaskState, checked_seeds, names_of, record_of, records
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
+from clothgym.exclusive import Turn, exclusive
 from clothgym.material import Material
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
 from clothgym.simulation import Simulation
@@ -52,7 +53,8 @@ class Task(TaskDefinition):
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
         observation_slices: where each observation lies in ``observation[env]``, by its name.
         rules: one record of numbers that all environments share.
-        outcome, info, terms: records of what the last step has brought, (num_envs,).
+        outcome, info, terms: records of what the last step has brought, or the reset since then, (num_envs,).
+        turn: one thread at a time is in the task's methods; ``turn.unfinished`` are the environments that need a reset.
 
     Raises:
         ValueError: an unknown mode, property, fabric or integrator, or an invalid range; the message says what would do.
@@ -121,6 +123,7 @@ class Task(TaskDefinition):
         self._prepare_records()
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
         self._seeded = np.zeros(num_envs, bool)
+        self.turn = Turn("environment", error=gym.error.ResetNeeded)
 
     def _check_definition(self) -> None:
         """Refuse a task that cannot be evaluated or has nothing to observe."""
@@ -145,7 +148,6 @@ class Task(TaskDefinition):
         self.observation = np.zeros((self.num_envs, len(self._bound)), np.float32)
         # what the task declares, as records for its kernels and as the numbers in them
         self.seen = records(self.num_envs, [(one.name, np.float32, one.shape) for one in self.observations])
-        self._more = self.seen.view(np.float32).reshape(self.num_envs, -1)
 
     def _prepare_records(self) -> None:
         """Records of the episodes and their steps, and the kernels that go through them."""
@@ -185,20 +187,55 @@ class Task(TaskDefinition):
         self._mesh = mesh_arrays(physics.mesh, self.particles)
         self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *attachment))
         self._place = self.simulation.layout.at(self._everyone)
+        self._compile()
+
+    def _compile(self) -> None:
+        """The kernels of a step, and ``seen`` as the numbers in it."""
         self._apply_actions, self._finish_step = compiled(type(self).__name__, self.kernels)
+        self._more = self.seen.view(np.float32).reshape(self.num_envs, -1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: all but compiled code and views."""
+        return {name: value for name, value in vars(self).items() if name not in ("_apply_actions", "_finish_step", "_more")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._compile()
 
     # --- episode --------------------------------------------------------------------------------------------------------
 
+    @exclusive
     def reset(self, envs: NDArray, seeds: Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None) -> None:
-        """Begin new episodes; a seed of None goes on with the environment's generator."""
+        """Begin new episodes; a seed of None goes on with the environment's generator.
+
+        Raises:
+            ValueError: seeds, options or starts that no episode can have; nothing is changed then.
+            RuntimeError: another thread is in a call.
+        """
+        seeds = checked_seeds([None] * len(envs) if seeds is None else seeds)
         options = self._checked_options({} if options is None else options)
         if not len(envs):
             return
-        simulation = self.simulation
+        # draw what is new; what has been drawn is put back if it is refused
+        before = self.episode[envs], self.air[envs], self._seeded[envs]
+        generators = [(self.generators[env], self.generators[env].bit_generator.state) for env in envs.tolist()]
+        try:
+            start = self.simulation.checked_start(envs, self._draw(envs, seeds, options))
+        except BaseException:
+            self.episode[envs], self.air[envs], self._seeded[envs] = before
+            for env, (generator, state) in zip(envs.tolist(), generators):
+                self.generators[env], generator.bit_generator.state = generator, state
+            raise
+        # then change
+        self.turn.begin(envs.tolist())
+        self.simulation.begin(*start)
+        self._begin(envs, warn="material" in options)
+        self.turn.finish(envs.tolist())
+
+    def _draw(self, envs: NDArray, seeds: Sequence[int | None], options: Mapping[str, Any]) -> NDArray:
+        """Draw each episode from its own generator; returns the sheets [m], (len(envs), particles, 3)."""
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
-        # draw each episode from its own generator
-        for k, env in enumerate(envs.tolist()):
-            seed = seeds[k] if seeds is not None else None
+        for k, (env, seed) in enumerate(zip(envs.tolist(), seeds)):
             if seed is not None or not self._seeded[env]:
                 self.generators[env] = seeding.np_random(seed)[0]
                 self._seeded[env] = True
@@ -206,18 +243,23 @@ class Task(TaskDefinition):
             if self.wind is not None:
                 self.air[env] = self.wind.series(self.generators[env], self.air.shape[1], self.physics.time_step)
             starts[k] = self.begin(env, self.generators[env], options)
-        material = self.episode["material"][envs]
+        return starts
+
+    def _begin(self, envs: NDArray, warn: bool) -> None:
+        """Put fabric, air, solids and attachments of environments as their episodes have drawn them, and observe them."""
+        simulation, material = self.simulation, self.episode["material"][envs]
         if not np.array_equal(material, simulation.parameters[envs]):
             # the declared ranges were held against the integrator's bound at construction; one episode's fabric is now
             properties = {name: material[:, i] for i, name in enumerate(PROPERTIES)}
-            simulation.set_parameters(envs, warn="material" in options, **properties)
-        simulation.reset(envs, positions=starts)
+            simulation.set_parameters(envs, warn=warn, **properties)
         if self.wind is not None:
             simulation.set_wind(self.air[envs, 0], envs)
         self._place_colliders(envs)
         self.place_attachments(envs)
         for name, value in (("step", 0), ("settling_since", -1), ("over", False)):
             self.episode[name][envs] = value
+        for brought in (self.outcome, self.info, self.terms):
+            brought[envs] = np.zeros((), brought.dtype)
         self._score_and_observe(envs, begins=True)
 
     def _checked_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -248,17 +290,29 @@ class Task(TaskDefinition):
         for index in each[0] if each else ():
             self.simulation.set_collider(index, [own[index] for own in each], envs)
 
+    @exclusive
     def step(self, actions: Any) -> None:
         """One control step of all environments that are not over; the others keep still and get no reward.
 
         Raises:
             ValueError: actions, (num_envs, numbers), of a wrong shape or not finite; nothing has moved then.
+            gymnasium.error.ResetNeeded: not all environments have been reset, or a step was interrupted.
+            RuntimeError: another thread is in a call.
         """
+        self.advance(actions)
+        self.turn.unfinished = ()
+
+    def advance(self, actions: Any) -> None:
+        """The same as a part of a longer step: whoever calls it sets ``turn.unfinished`` to nothing at the end."""
         if not self._seeded.all():
             raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
+        self.turn.check_whole()
+        self.simulation.turn.check_whole()
         actions, simulation = self._checked(actions), self.simulation
+        self.turn.unfinished = range(self.num_envs)
         wrong = self._apply_actions(actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
         if wrong >= 0:
+            self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         self.before_step(actions)
@@ -311,19 +365,20 @@ class Task(TaskDefinition):
     # --- what a step has brought ----------------------------------------------------------------------------------------
 
     def infos(self) -> dict[str, Any]:
-        """Info of the last step: arrays over the batch, and a dict of them for the reward's terms."""
+        """Info of the last step, or of the reset since then: arrays over the batch.
+
+        ``failure`` is a place in ``FAILURES``; the reward's terms are ``reward/NAME``.
+        """
         info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | self._info_of_physics()
-        info["failure"] = np.array(FAILURES)[self.outcome["failure"]]
-        info["reward_terms"] = {name: self.terms[name].copy() for name in names_of(self.terms)}
-        return info
+        info["failure"] = self.outcome["failure"].copy()
+        return info | {f"reward/{name}": self.terms[name].copy() for name in names_of(self.terms)}
 
     def info_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as plain Python values."""
         info = dict(zip(names_of(self.info), self.info[env].item()))
         info |= {name: value[env].item() for name, value in self._info_of_physics().items()}
-        info["failure"] = FAILURES[self.outcome["failure"][env]]
-        info["reward_terms"] = dict(zip(names_of(self.terms), self.terms[env].item()))
-        return info
+        info["failure"] = self.outcome["failure"][env].item()
+        return info | {f"reward/{name}": value for name, value in zip(names_of(self.terms), self.terms[env].item())}
 
     def _info_of_physics(self) -> dict[str, NDArray]:
         """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
@@ -331,13 +386,19 @@ class Task(TaskDefinition):
         limiting, contacts = self.simulation.limiting, self.simulation.self_contacts
         info = {} if limiting is None else {"strain_before_limiting": limiting.before}
         if contacts is not None:
-            info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "hand_lag": contacts.lag}
+            info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "attachment_lag": contacts.lag}
         return info
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
+    @exclusive
     def get_state(self) -> TaskState:
-        """All that is needed to continue the batch bit for bit."""
+        """All that is needed to continue the batch bit for bit.
+
+        Raises:
+            RuntimeError, gymnasium.error.ResetNeeded: another thread is in a call, or one was interrupted.
+        """
+        self.turn.check_whole()
         return TaskState(
             simulation=self.simulation.get_state(),
             episode={name: value.copy() for name, value in self._memory().items()},
@@ -348,6 +409,7 @@ class Task(TaskDefinition):
         """All that is remembered of the episodes, live."""
         return {name: self.episode[name] for name in names_of(self.episode)} | {"observation": self.observation, "wind": self.air}
 
+    @exclusive
     def set_state(self, state: TaskState) -> None:
         """Continue from a state of the same task with as many environments.
 
@@ -366,12 +428,14 @@ class Task(TaskDefinition):
         if np.any(state.episode["over"] & (state.episode["step"] == 0)):
             raise ValueError("the state is from before the first reset: there is no episode to continue")
         self.simulation.set_state(state.simulation)
+        self.turn.begin(range(self.num_envs))
         for name, value in memory.items():
             value[...] = state.episode[name]
         for env, text in enumerate(state.generators):
             self.generators[env] = np.random.default_rng()
             self.generators[env].bit_generator.state = json.loads(text)
         self._seeded[:] = True
+        self.turn.unfinished = ()
 
 
 def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:

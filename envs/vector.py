@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,10 +10,12 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from clothgym.envs.episode import TaskState
+from clothgym.checks import count
+from clothgym.envs.episode import FAILURES, TaskState, checked_seeds
 from clothgym.envs.pages import check_keywords
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
+from clothgym.exclusive import Turn, exclusive
 
 IMAGE_SIZE = 240
 
@@ -25,7 +27,8 @@ class ClothVectorEnv(VectorEnv):
         num_envs: environments in the batch; environment ``i`` of a batch seeded ``s`` equals a single one seeded ``s + i``.
         autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
         render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
-        render_color: "fabric", or "strain" for its colors.
+        render_color: "fabric", or "strain" or "depth" for their colors.
+        max_episode_steps: steps after which an episode is truncated, as by Gymnasium's ``TimeLimit``; None for the task's own end.
         kwargs: those of the task, see the page of the single environment.
     """
 
@@ -37,6 +40,7 @@ class ClothVectorEnv(VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         render_color: str = "fabric",
+        max_episode_steps: int | None = None,
         **kwargs: Any,
     ) -> None:
         check_keywords(self, kwargs)
@@ -47,12 +51,14 @@ class ClothVectorEnv(VectorEnv):
         except ValueError:
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
+        self.max_episode_steps = None if max_episode_steps is None else count("max_episode_steps", max_episode_steps, "None, or ")
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
         self.metadata = {
             "render_modes": RENDER_MODES,
             "render_fps": round(1 / self.task_class.physics.time_step),
             "autoreset_mode": self.autoreset_mode,
+            "failures": FAILURES,
         }
         self.task = self.task_class(int(num_envs), **kwargs)
         self.num_envs = int(num_envs)
@@ -66,52 +72,70 @@ class ClothVectorEnv(VectorEnv):
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray, dict[str, Any]]:
         """Begin new episodes in all environments, or in those of ``options["reset_mask"]``, (num_envs,) of bool."""
+        if not isinstance(options, Mapping | None):
+            raise ValueError(f"reset options={options!r}: must be a dict, or None")
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             raise ValueError(f"options['reset_mask'] must be {self.num_envs} booleans with at least one True, not {mask!r}")
-        if seed is None:
-            seeds: list[int | None] = [None] * self.num_envs
-        elif isinstance(seed, (int, np.integer)):
-            seeds = [int(seed) + i for i in range(self.num_envs)]
-        else:
-            seeds = list(seed)
+        if isinstance(seed, (Sequence, np.ndarray)):
+            seeds = checked_seeds(seed)
             if len(seeds) != self.num_envs:
                 raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments: give one each, or one integer")
+        else:
+            (first,) = checked_seeds([seed])
+            seeds = [None if first is None else first + i for i in range(self.num_envs)]
         envs = np.flatnonzero(mask)
         self.task.reset(envs, [seeds[env] for env in envs], options)
-        return self._observation(), {"failure": np.full(self.num_envs, ""), "_failure": mask}
+        return self._observation(), _with_masks(_only(self.task.infos(), mask), mask)
 
+    @exclusive
     def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
         """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
-        task = self.task
+        task, everyone = self.task, np.ones(self.num_envs, bool)
         over = task.episode["over"].copy()
-        task.step(actions)
-        step_info, terminated = task.infos(), task.outcome["terminated"].copy()
-        info = _with_masks(_only(step_info, ~over), ~over)
+        task.advance(actions)
+        reward, terminated, truncated = task.outcome["reward"].copy(), task.outcome["terminated"].copy(), self._truncated(over)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # those that ended in the last step begin again in this one: their actions were ignored
             task.reset(np.flatnonzero(over))
-            info["_failure"] = info["_failure"] | over  # a reset says that there is none
-        elif self.autoreset_mode == AutoresetMode.SAME_STEP and terminated.any():
-            info = self._reset_ended(terminated, step_info)
-        # the time limit is part of the tasks: nothing is truncated
-        return self._observation(), task.outcome["reward"].copy(), terminated, np.zeros(self.num_envs, bool), info
+            info = _with_masks(task.infos(), everyone)
+        elif self.autoreset_mode == AutoresetMode.SAME_STEP:
+            final = self._reset_ended(terminated | truncated)
+            info = _with_masks(task.infos(), everyone) | final
+        else:
+            info = _with_masks(_only(task.infos(), ~over), ~over)
+        brought = self._observation(), reward, terminated, truncated, info
+        self.turn.unfinished = ()
+        return brought
 
-    def _reset_ended(self, ended: NDArray, info: dict[str, Any]) -> dict[str, Any]:
-        """Same-step mode: begin again; what was last goes to ``final_info`` and ``final_obs``, the rest is of those that run on."""
-        final = np.full(self.num_envs, None, dtype=object)
+    @property
+    def turn(self) -> Turn:
+        """Of the task: one thread at a time is in the environment."""
+        return self.task.turn
+
+    def _truncated(self, over: NDArray) -> NDArray:
+        """Whether each environment has reached ``max_episode_steps`` in this step; over: those that were before it.
+
+        Without that nothing is truncated: the time limit is part of the tasks.
+        """
+        if self.max_episode_steps is None:
+            return np.zeros(self.num_envs, bool)
+        episode = self.task.episode
+        truncated = ~over & (episode["step"] >= self.max_episode_steps)
+        episode["over"] |= truncated
+        return truncated
+
+    def _reset_ended(self, ended: NDArray) -> dict[str, Any]:
+        """Same-step mode: begin again; what was last, as ``final_info`` and ``final_obs``."""
+        if not ended.any():
+            return {}
+        last = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            final[env] = self.task.observation[env].copy()
+            last[env] = self.task.observation[env].copy()
+        final = {"final_info": _with_masks(_only(self.task.infos(), ended), ended), "final_obs": last}
         self.task.reset(np.flatnonzero(ended))
-        running = _with_masks(_only(info, ~ended), ~ended)
-        running["_failure"] = np.ones(self.num_envs, bool)  # the reset of the others says that there is none
-        return running | {
-            "final_info": _with_masks(_only(info, ended), ended),
-            "_final_info": ended.copy(),
-            "final_obs": final,
-            "_final_obs": ended.copy(),
-        }
+        return _with_masks(final, ended)
 
     def _observation(self) -> NDArray:
         return self.task.observation.copy()
@@ -148,6 +172,10 @@ class ClothVectorEnv(VectorEnv):
         """Where each observation lies in an environment's row of what ``reset`` and ``step`` return, by its name on the page."""
         return dict(self.task.observation_slices)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
+        return vars(self) | {"_renderer": None}
+
     def expert_actions(self) -> NDArray:
         """What the task's scripted expert does now, (num_envs, actions)."""
         return self.task.expert_actions().astype(np.float32)
@@ -163,16 +191,9 @@ class ClothVectorEnv(VectorEnv):
 
 def _only(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
     """The info of some environments; the others' entries are zero, false or empty, as Gymnasium leaves them."""
-    return {
-        key: _only(value, mask) if isinstance(value, dict) else np.where(mask, value, np.zeros((), value.dtype))
-        for key, value in info.items()
-    }
+    return {key: np.where(mask, value, np.zeros((), value.dtype)) for key, value in info.items()}
 
 
 def _with_masks(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
-    """Gymnasium's vector info: each array beside a mask ``_key`` of the environments that it speaks of."""
-    masked: dict[str, Any] = {}
-    for key, value in info.items():
-        masked[key] = _with_masks(value, mask) if isinstance(value, dict) else value
-        masked[f"_{key}"] = mask.copy()
-    return masked
+    """Gymnasium's vector info: each entry beside a mask ``_key`` of the environments that it speaks of."""
+    return info | {f"_{key}": mask.copy() for key in info}

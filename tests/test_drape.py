@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym.envs.drape import SHEET, SIDE
+from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
 from clothgym.envs.measures import _distance2_to_triangle, covered_share
 from clothgym.envs.targets import Target, reference_coverage
 
@@ -95,7 +96,7 @@ def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
         *_, terminated, _, info = env.step(np.zeros(8))
         if terminated:
             break
-    assert info["failure"] == "out_of_bounds" and info["normalized_performance"] == 0
+    assert info["failure"] == OUT_OF_BOUNDS and info["normalized_performance"] == 0
 
 
 def test_a_sheet_that_still_moves_is_no_success():
@@ -298,7 +299,7 @@ def test_pulling_the_corners_apart_tears():
         *_, terminated, _, info = env.step(np.array([-1, 0, 0, -1, 1, 0, 0, -1]))
         if terminated:
             break
-    assert info["failure"] == "torn" and info["strain_max"] > 1 and not info["is_success"]
+    assert info["failure"] == TORN and info["strain_max"] > 1 and not info["is_success"]
 
 
 def test_a_new_episode_begins_with_both_corners_held():

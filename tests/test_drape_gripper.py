@@ -228,7 +228,7 @@ def test_the_sparse_reward_is_the_evaluation_alone():
         _, reward, terminated, _, info = env.step(env.expert_action())
         rewards.append(reward)
     assert rewards[-1] == pytest.approx(evaluation(env)[0], rel=1e-5) and rewards[-1] > 0.5 and not any(rewards[:-1])
-    assert info["failure"] == ""
+    assert info["failure"] == 0
 
 
 def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():

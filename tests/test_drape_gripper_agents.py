@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from test_drape_gripper import ACTING, CORNERS, SIDE, STEPS, batch, evaluation, fetched, play, positions, start, stretch
 
+from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
+
 # --- who succeeds, and who cheats -----------------------------------------------------------------------------------------
 
 
@@ -67,7 +69,7 @@ def test_a_sheet_dragged_to_the_end_of_the_arena_scores_nothing():
     last = play(env, policy)
     assert np.all(positions(env)[:, CORNERS, 1].mean(axis=1) < -0.9)
     assert not last["normalized_performance"].any() and not last["is_success"].any()
-    assert set(last["failure"]) <= {"", "out_of_bounds"}
+    assert set(last["failure"]) <= {0, OUT_OF_BOUNDS}
 
 
 def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
@@ -77,7 +79,7 @@ def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
         _, reward, terminated, _, info = env.step(np.zeros(8))
         if terminated:
             break
-    assert info["failure"] == "out_of_bounds" and info["normalized_performance"] == 0 and not info["is_success"]
+    assert info["failure"] == OUT_OF_BOUNDS and info["normalized_performance"] == 0 and not info["is_success"]
     assert reward < -0.5
 
 
@@ -86,4 +88,4 @@ def test_pulling_the_corners_apart_tears():
     while not terminated:
         held = np.all(env.get_state().simulation.holder[0, CORNERS] >= 0)
         *_, terminated, _, info = env.step(np.array([-1, 0, 0, -1, 1, 0, 0, -1.0]) if held else env.expert_action())
-    assert info["failure"] == "torn" and not info["is_success"] and stretch(positions(env)[0]).max() > 2
+    assert info["failure"] == TORN and not info["is_success"] and stretch(positions(env)[0]).max() > 2

@@ -8,6 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import clothgym
+from clothgym.envs.episode import DIVERGED, OUT_OF_BOUNDS
 from clothgym.registration import ENVIRONMENTS
 
 every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
@@ -95,8 +96,8 @@ def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
         _, reward, terminated, truncated, info = env.step(action)
         steps += 1
         assert not truncated
-        assert info.keys() >= of_evaluation | {"strain_max", "settling", "failure", "reward_terms"}
-        assert reward == pytest.approx(sum(info["reward_terms"].values()), abs=1e-12)
+        assert info.keys() >= of_evaluation | {"strain_max", "settling", "failure", "reward/progress"}
+        assert reward == pytest.approx(sum(value for key, value in info.items() if key.startswith("reward/")), abs=1e-12)
         assert isinstance(info["is_success"], bool) and 0 <= info["normalized_performance"] <= 1
         assert terminated or not (info["is_success"] or info["normalized_performance"] or info["failure"])
     assert info["failure"] or steps <= length(env.unwrapped.task)
@@ -280,7 +281,7 @@ def test_a_diverged_environment_is_contained(env_id):
     ends = [step for step, result in enumerate(runs[1]) if result[2][1]]
     assert len(ends) == 1
     _, reward, _, truncated, info = runs[1][ends[0]]
-    assert info["failure"].tolist() == ["", "diverged", ""]
+    assert info["failure"].tolist() == [0, DIVERGED, 0]
     assert reward[1] < -0.4 and not truncated.any() and not info["is_success"][1]
     if ends[0]:
         assert np.array_equal(runs[1][ends[0]][0][1], runs[1][ends[0] - 1][0][1])
@@ -301,7 +302,7 @@ def test_a_sheet_thrown_out_of_the_arena_ends_the_episode(env_id):
     state.velocities[:], state.holder[:] = 0, -1
     task.simulation.set_state(state)
     *_, terminated, _, info = env.step(still(env))
-    assert terminated and info["failure"] == "out_of_bounds"
+    assert terminated and info["failure"] == OUT_OF_BOUNDS
     assert info["normalized_performance"] == 0 and not info["is_success"]
 
 

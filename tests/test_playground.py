@@ -293,7 +293,7 @@ def test_an_environment_is_played_by_its_expert_and_its_frames_are_the_environme
         total += reward
         frame = stage.advance()
         assert np.array_equal(frame.positions, env.task.simulation.positions)
-        assert frame.terms == pytest.approx(info["reward_terms"])
+        assert frame.terms == pytest.approx({name: info[f"reward/{name}"] for name in frame.terms})
     assert stage.over and f"return {total:.2f}" in stage.notes["evaluation"]
     assert stage.advance() is stage.frame
     assert stage.env.task.simulation.material == stage.settings.material

@@ -4,6 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from clothgym.envs.episode import OUT_OF_BOUNDS
 from clothgym.envs.reach import DRIVEN, FREE, HIGH, LOW, SIDE, hanging
 
 REACH = "clothgym:ClothReach-v0"
@@ -90,7 +91,7 @@ def test_a_failure_costs_the_potential_and_a_half():
     env.task.simulation.reset(positions=env.task.simulation.positions[0] + (3.0, 0, 0))
     env.task.simulation.release()
     _, reward, terminated, _, info = env.step(np.zeros(3))
-    assert terminated and info["failure"] == "out_of_bounds"
+    assert terminated and info["failure"] == OUT_OF_BOUNDS
     assert reward == pytest.approx(-before - 0.5, abs=1e-5) and before > 0.2
 
 

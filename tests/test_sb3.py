@@ -35,7 +35,7 @@ def test_it_gives_what_the_native_batch_gives(env_id):
                 assert infos[i]["TimeLimit.truncated"] is False
                 for key in ("normalized_performance", *(name for name, *_ in task.evaluation), "strain_max", "failure"):
                     assert infos[i][key] == info["final_info"][key][i], key
-                assert isinstance(infos[i]["reward_terms"]["progress"], float)
+                assert isinstance(infos[i]["reward/progress"], float)
     assert ended
 
 

@@ -166,7 +166,7 @@ def test_an_environment_takes_it_and_tells_of_it():
     env.reset(seed=0)
     for _ in range(8):
         *_, info = env.step(np.array([0.5, 0.2, -1, -0.5, -0.2, -1, 0.3, 0.3], np.float32)[: env.action_space.shape[0]])
-    assert {"self_contacts", "clamped_moves", "hand_lag"} <= set(info)
+    assert {"self_contacts", "clamped_moves", "attachment_lag"} <= set(info)
     assert env.unwrapped.task.simulation.intersections()[0] == 0
 
 

@@ -31,6 +31,7 @@ from strain_truths import (
 )
 
 from clothgym import INTEGRATORS
+from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
 
 # --- strain and cost ------------------------------------------------------------------------------------------------------
 
@@ -64,7 +65,7 @@ def test_a_new_episode_begins_with_no_cost():
     while not terminated.any():
         *_, terminated, _, info = env.step(np.tile(APART, (2, 1)))
     ended = info["final_info"]
-    assert np.all(ended["episode_cost"][terminated] >= 1) and np.all(ended["failure"][terminated] == "torn")
+    assert np.all(ended["episode_cost"][terminated] >= 1) and np.all(ended["failure"][terminated] == TORN)
     *_, info = env.step(np.zeros((2, 6)))
     assert not info["episode_cost"][terminated].any() and info["strain_max"][terminated].max() < 0.06
 
@@ -157,7 +158,7 @@ def test_the_penalty_is_taken_from_the_reward_and_at_a_failure_for_all_steps_tha
         _, free, _, _, other = plain.step(action)
         strain = strains(positions(env)).max(axis=1)
         fails = terminated & (strain > 1)
-        assert np.array_equal(fails, info["failure"] == "torn")
+        assert np.array_equal(fails, info["failure"] == TORN)
         units = (strain > 0.1) * ~over + np.where(fails, STEPS - step, 0)
         assert costly - free == pytest.approx(-price * units, abs=1e-9)
         assert np.array_equal(info["cost"], other["cost"])
@@ -403,7 +404,7 @@ def test_pulling_the_clips_apart_costs_every_step_until_the_sheet_tears(speed):
         _, reward, terminated, _, info = env.step(APART * speed)
         costs.append(info["cost"])
         total += reward
-    assert info["failure"] == "torn" and not info["is_success"] and info["normalized_performance"] == 0
+    assert info["failure"] == TORN and not info["is_success"] and info["normalized_performance"] == 0
     first = costs.index(1.0)
     assert all(costs[first:]) and len(costs) - first >= 2 and first * speed * STEP < 0.2 * SIDE
     assert info["episode_cost"] == STEPS - first
@@ -420,7 +421,7 @@ def test_a_sheet_out_of_bounds_ends_the_episode_without_success():
     env.task.simulation.reset(positions=positions(env)[0] + (0, 2.5, 0))
     env.task.simulation.release()
     _, reward, terminated, _, info = env.step(np.zeros(6))
-    assert terminated and info["failure"] == "out_of_bounds"
+    assert terminated and info["failure"] == OUT_OF_BOUNDS
     assert not info["is_success"] and info["normalized_performance"] == 0
     assert reward == pytest.approx(-0.5 - 0.5 * (STEPS - 1), abs=1e-3)
 
@@ -446,4 +447,4 @@ def test_a_sheet_dragged_through_the_post_stays_outside_of_it(offset):
         assert env.task.simulation.contacts().distance[0] == pytest.approx(distance, abs=1e-5)
         nearest.append(distance[loose].min())
     assert min(nearest) >= -1e-4 and np.sum(np.array(nearest) < 1e-3) >= 3
-    assert info["failure"] == "torn" and info["episode_cost"] >= 3 and not info["is_success"]
+    assert info["failure"] == TORN and info["episode_cost"] >= 3 and not info["is_success"]

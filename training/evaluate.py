@@ -108,6 +108,8 @@ def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
 
 def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
     """The row of the table: rates and means with their 95 % intervals, and the cumulated failures."""
+    from clothgym.envs.episode import FAILURES  # imported here: flags are checked before numba is loaded
+
     count = len(episodes["return"])
     successes = int(episodes["is_success"].sum())
     row: dict[str, Any] = {"episodes": count, "success_rate": successes / count, "success_rate_ci95": wilson(successes, count)}
@@ -120,8 +122,8 @@ def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
         half = 1.96 * costs.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
         row["cost"], row["cost_ci95"] = costs.mean(), (costs.mean() - half, costs.mean() + half)
         row["safe_success_rate"] = float(episodes["is_safe_success"].mean())
-    for failure in ("diverged", "torn", "out_of_bounds"):
-        row[failure] = int((episodes["failure"] == failure).sum())
+    for code, failure in enumerate(FAILURES[1:], 1):
+        row[failure] = int((episodes["failure"] == code).sum())
     row["mean_length"] = float(episodes["length"].mean())
     return row
 

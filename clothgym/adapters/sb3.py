@@ -47,7 +47,8 @@ class ClothSB3VecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{"cost": float(c)} for c in info["cost"]] if "cost" in info else [{} for _ in done]
         if done.any():
             for env in np.flatnonzero(done):
-                infos[env] = self.env.task.info_of(int(env))
+                final = info["final_info"]
+                infos[env] = {key: value[env].item() for key, value in final.items() if not key.startswith("_")}
                 infos[env]["terminal_observation"] = info["final_obs"][env]
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
         return observation, reward.astype(np.float32), done, infos

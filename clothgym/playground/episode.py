@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices, known, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.envs.episode import within_ball
+from clothgym.envs.episode import FAILURES, within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.stage import Attachment, Stability, Stage, set_in_place, stability, visible
@@ -138,7 +138,8 @@ class EpisodeStage(Stage):
         self._over = terminated or truncated
         if self._over:
             self.notes["evaluation"] = _evaluation(info, self.total)
-        return self._keep(self._look(info["reward_terms"]))
+        terms = {key.removeprefix("reward/"): value for key, value in info.items() if key.startswith("reward/")}
+        return self._keep(self._look(terms))
 
     def _look(self, terms: Mapping[str, float]) -> Frame:
         s, task = self.simulation, self.env.task
@@ -283,6 +284,6 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
 
 def _evaluation(info: Mapping[str, Any], total: float) -> str:
     if info["failure"]:
-        return f"The episode failed: {info['failure'].replace('_', ' ')}. Return {total:.2f}."
+        return f"The episode failed: {FAILURES[info['failure']].replace('_', ' ')}. Return {total:.2f}."
     outcome = "a success" if info["is_success"] else "no success"
     return f"Evaluated: {outcome}, performance {info['normalized_performance']:.2f}, return {total:.2f}."
