@@ -14,6 +14,7 @@ LONGEST = 200  # characters of a value in a message
 SMALLEST = 1e-30  # of what must be positive: its inverse is still finite in float32
 MOST = 2**31 - 1  # of a count
 MOST_PARTICLES = 10_000_000  # of a batch; a million of them need about a gigabyte
+MOST_NUMBERS = 1_000_000_000  # of an argument
 
 
 def number(name: str, value: Any) -> float:
@@ -77,19 +78,63 @@ def shown(value: Any) -> str:
 
 def _as_numbers(value: Any) -> NDArray[np.float64] | None:
     """A number, list, array or tensor as a float64 array, None where it is not of real numbers."""
+    array = as_array(value)
+    if array is None:
+        return None
+    if array.dtype.kind == "O" and all(type(one) is int for one in array.ravel()):
+        # integers beyond 64 bits
+        try:
+            return array.astype(np.float64)
+        except OverflowError:
+            return None
+    if array.dtype.kind not in "iuf" and array.size:
+        return None
+    with np.errstate(over="ignore"):  # what is beyond float64 is infinite, and refused as such
+        return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else np.zeros(array.shape)
+
+
+def as_array(value: Any) -> NDArray | None:
+    """A number, list, array or tensor as an array of whatever it holds, None where it is none: ragged, masked or without end."""
+    if type(value) is np.ndarray:
+        return value
+    if isinstance(value, range) and len(value) > MOST_NUMBERS:
+        return None
     try:
         # tensors that require gradients give their numbers only when they are detached
         array = np.asarray(value.detach() if hasattr(value, "detach") else value)
-        if array.dtype.kind == "O" and all(type(one) is int for one in array.ravel()):
-            array = array.astype(np.float64)  # integers beyond 64 bits
-    except (TypeError, ValueError, OverflowError, RuntimeError, AttributeError):
+    except Exception:  # ragged, or an object or tensor whose own conversion fails
         return None
-    return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" or array.size == 0 else None
+    return None if np.ma.is_masked(value) else array
+
+
+def numbers(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """``value`` as a float64 array, if it holds real numbers, finite or not, and has that shape."""
+    array = _as_numbers(value)
+    if array is None:
+        raise ValueError(f"{name}={shown(value)}: must be an array of numbers, {shape}")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}: must be {shape}")
+    return array
+
+
+def flag(name: str, value: Any) -> bool:
+    """``value`` as a bool, if it is True or False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name}={shown(value)}: must be True or False")
+    return bool(value)
+
+
+def mask(name: str, value: Any, length: int) -> NDArray[np.bool_]:
+    """``value`` as a bool array, (length,), if it is one with at least one True."""
+    array = as_array(value)
+    if array is None or array.shape != (length,) or array.dtype != bool or not array.any():
+        raise ValueError(f"{name} must be {length} booleans with at least one True, not {shown(value)}")
+    return array
 
 
 def members(name: str, value: Any, kind: type, what: str) -> None:
     """Check that ``value`` is a sequence of instances of the class ``kind``; what: their name in the message."""
-    if not isinstance(value, Sequence) or not all(isinstance(one, kind) for one in value):
+    if not isinstance(value, Sequence) or len(value) > MOST_PARTICLES or not all(isinstance(one, kind) for one in value):
         raise ValueError(f"{name}={shown(value)}: must be a sequence of {what}")
 
 
@@ -161,10 +206,8 @@ def sheets(name: str, value: ArrayLike, shape: tuple[int, ...], *others: tuple[i
 
 def indices(name: str, value: ArrayLike, end: int, what: str) -> NDArray:
     """``value`` as an int64 array, (count,), if it holds integers from 0 to ``end - 1``; what: their name in the message."""
-    try:
-        array = np.atleast_1d(np.asarray(value))
-    except (TypeError, ValueError, RuntimeError):  # ragged, or a tensor elsewhere
-        array = np.full(1, np.nan)
+    array = as_array(value)
+    array = np.full(1, np.nan) if array is None else np.atleast_1d(array)
     if array.shape == (0,):
         return np.zeros(0, np.int64)
     if array.dtype.kind not in "iu" or array.ndim != 1 or array.min() < 0 or array.max() >= end:

@@ -18,6 +18,7 @@ from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
 
 BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
+MOST_SUBSTEPS = 100_000  # of a control step
 FASTEST = 1e4  # [m/s]: a corner torn away by meters in one step can whip beyond 1 km/s, and comes back
 
 
@@ -71,7 +72,7 @@ def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_st
     """Number of substeps in a control step [s], from the integrator's bound.
 
     Raises:
-        ValueError: there is no bound: no substep is small enough.
+        ValueError: there is no bound: no substep is small enough; or it takes more than MOST_SUBSTEPS.
     """
     largest, why = integrator.largest_substep(oscillators)
     if largest <= 0:
@@ -79,7 +80,13 @@ def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_st
             f"substeps='auto': {integrator.name} has no bound here, {why}; give a number of substeps, a fabric with damping_time, "
             "or another integrator, semi_implicit_euler for instance"
         )
-    return integrator.automatic_substeps(time_step, largest)
+    substeps = integrator.automatic_substeps(time_step, largest)
+    if substeps > MOST_SUBSTEPS:
+        raise ValueError(
+            f"substeps='auto': {integrator.name} needs {substeps:.3g} substeps in a control step, {why}; the most are "
+            f"{MOST_SUBSTEPS}: use a shorter time_step, a softer or heavier fabric, a coarser mesh, or another integrator"
+        )
+    return substeps
 
 
 def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_step: float, substeps: int) -> None:

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym import guards
 from clothgym.attachments import Attachments
 from clothgym.bending import Bending
+from clothgym.checks import count
 from clothgym.collisions import Contacts, SelfCollision, SelfContacts, Solids
 from clothgym.elements import Elements, SurfaceArrays, Weave
 from clothgym.forces import Energy, Oscillators, energy, structural_strain
@@ -117,7 +118,7 @@ class Observed:
 
     def largest_substep(self, env: int = 0) -> tuple[float, str]:
         """Largest substep [s] that the integrator should be used with in that environment, and why; zero if there is none."""
-        return self.integrator.largest_substep(self._oscillators(env))
+        return self.integrator.largest_substep(self._oscillators(count("env", env, least=0, most=self.layout.num_envs - 1)))
 
     def _oscillators(self, env: int) -> Oscillators:
         """What decides on an environment's substep."""

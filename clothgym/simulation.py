@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit, guards, integrators
+from clothgym import _jit, checks, guards, integrators
 from clothgym.attachments import FREE, Attachments, Gripper, Grippers
 from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
@@ -86,9 +86,9 @@ class Simulation(Observed):
     ) -> None:
         # what was asked for, checked before anything is made
         if not isinstance(mesh, ClothMesh):
-            raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
+            raise ValueError(f"mesh={shown(mesh)}: must be a ClothMesh, for instance clothgym.grid(17, 17, 0.6, 0.6)")
         if not isinstance(material, Material | None):
-            raise ValueError(f"material={material!r}: must be a Material, for instance Material.preset('cotton')")
+            raise ValueError(f"material={shown(material)}: must be a Material, for instance Material.preset('cotton')")
         members("colliders", colliders, Collider, "Plane, Sphere, Capsule, Box or MeshCollider")
         members("grippers", grippers, Gripper, "Gripper")
         self.num_envs = count("num_envs", num_envs)
@@ -153,10 +153,10 @@ class Simulation(Observed):
         self._apply_parameters(np.arange(self.num_envs))
         self.reset()
         # how many substeps
-        if substeps == "auto":
+        if isinstance(substeps, str) and substeps == "auto":
             self.substeps = guards.automatic_substeps(self.integrator, self._oscillators(0), self.time_step)
             return
-        self.substeps = count("substeps", substeps, "'auto' or ")
+        self.substeps = count("substeps", substeps, "'auto' or ", most=guards.MOST_SUBSTEPS)
         self._warn_if_beyond_bound(np.arange(1))
 
     def _compile(self) -> None:
@@ -227,7 +227,9 @@ class Simulation(Observed):
             plan = method.prepare(Preparation(self._oscillators(0), h, holdable, self.layout.by_particle))
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
         # a share of a substep more, or rounding would make three of them two
-        look_every, air_every = (max(1, int(interval / h + 1e-3)) for interval in (SURFACE_INTERVAL, AIR_INTERVAL))
+        look_every, air_every = (
+            int(min(max(1, interval / h + 1e-3), checks.MOST)) for interval in (SURFACE_INTERVAL, AIR_INTERVAL)
+        )
         self._schedule = Schedule(
             h=self.dtype.type(h),
             carried=self.dtype.type(h * method.carried),
@@ -331,7 +333,7 @@ class Simulation(Observed):
         Raises:
             ValueError: an unknown name, or a value that ``Material`` would not take; nothing is changed then.
         """
-        env = self.layout.chosen(envs)
+        env, warn = self.layout.chosen(envs), checks.flag("warn", warn)
         block, lane = self.layout.at(env)
         after = self._parameters.copy()
         after[env], fields = changed(self.material, after[env], properties)

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import indices
+from clothgym.checks import as_array, indices, shown
 from clothgym.contact_memory import SAVED
 from clothgym.elements import SpringArrays
 from clothgym.mesh import NUM_KINDS, ClothMesh
@@ -139,14 +139,14 @@ class Layout(NamedTuple):
         """
         if envs is None:
             return np.arange(self.num_envs)
-        index = np.atleast_1d(np.asarray(envs))
-        if index.dtype == bool:
+        index = as_array(envs)
+        if index is not None and index.dtype == bool:
             if index.shape != (self.num_envs,):
-                raise ValueError(f"a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
+                raise ValueError(f"envs: a mask of environments must have shape {(self.num_envs,)}, not {index.shape}")
             return np.flatnonzero(index)
         index = indices("envs", envs, self.num_envs, "this batch's environments")
         if once and len(index) > 1 and len(np.unique(index)) < len(index):
-            raise ValueError(f"envs={envs!r}: names an environment twice")
+            raise ValueError(f"envs={shown(envs)}: names an environment twice")
         return index
 
 

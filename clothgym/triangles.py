@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, finite, positive, room
+from clothgym.checks import as_array, count, finite, positive, room, shown
 from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
 
 FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
@@ -108,9 +109,11 @@ def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDAr
         import trimesh
     except ImportError:
         raise ImportError(f"{who} reads files with trimesh: pip install 'clothgym[mesh]'") from None
-    if not Path(path).is_file():
-        problem = "it is a folder: name a file in it" if Path(path).is_dir() else "there is no such file: check the path"
-        raise ValueError(f"{str(path)!r}: {problem}")
+    if not isinstance(path, (str, os.PathLike)):
+        raise ValueError(f"path={shown(path)}: must be the name of a file")
+    if not os.path.isfile(path):
+        problem = "it is a folder: name a file in it" if os.path.isdir(path) else "there is no such file: check the path"
+        raise ValueError(f"{shown(str(path))}: {problem}")
     # trimesh reads the file
     advice = f"export the {what} as a triangle mesh, for instance obj or ply"
     try:
@@ -187,15 +190,27 @@ def corners_of(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
     """
     if x.ndim != 2 or x.shape[1] != 3 or not len(x):
         raise ValueError(f"vertices have shape {x.shape}: must be (particles, 3)")
-    corners = np.asarray(triangles)
+    corners = triples(x, triangles)
+    loose = np.setdiff1d(np.arange(len(x)), corners)
+    if len(loose):
+        raise ValueError(f"vertex {loose[0]} belongs to no triangle: remove it ({len(loose)} such vertices)")
+    return corners
+
+
+def triples(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
+    """``triangles`` as int64, (triangles, 3), if they name vertices of x, (vertices, 3).
+
+    Raises:
+        ValueError: other shapes or types, or an index that is out of range.
+    """
+    corners = as_array(triangles)
+    if corners is None:
+        raise ValueError(f"triangles={shown(triangles)}: must be (triangles, 3) integers")
     if corners.ndim != 2 or corners.shape[1] != 3 or not len(corners) or corners.dtype.kind not in "iu":
         raise ValueError(f"triangles have shape {corners.shape} of {corners.dtype}: must be (triangles, 3) integers")
     if corners.min() < 0 or corners.max() >= len(x):
         wrong = int(np.flatnonzero((corners < 0).any(axis=1) | (corners >= len(x)).any(axis=1))[0])
         raise ValueError(f"triangle {wrong} is {corners[wrong].tolist()}: must name vertices from 0 to {len(x) - 1}")
-    loose = np.setdiff1d(np.arange(len(x)), corners)
-    if len(loose):
-        raise ValueError(f"vertex {loose[0]} belongs to no triangle: remove it ({len(loose)} such vertices)")
     return corners.astype(np.int64)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from clothgym._jit import inlined, kernel
+from clothgym.checks import shown
 from clothgym.collisions import Collider, Plane
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
@@ -86,7 +87,7 @@ def draw_target(rng: np.random.Generator, wanted: Any) -> Target:
     """
     known = ("shape", "radius", "height", "center", "yaw")
     if not isinstance(wanted, Mapping):
-        raise ValueError(f"reset option target={wanted!r}: must be a dict with any of {', '.join(known)}")
+        raise ValueError(f"reset option target={shown(wanted)}: must be a dict with any of {', '.join(known)}")
     unknown = set(wanted) - set(known)
     if unknown:
         raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")

@@ -63,6 +63,24 @@ def checked_seeds(seeds: Sequence[Any]) -> list[int | None]:
     return [None if seed is None else checks.count("seed", seed, "None, or ", least=0, most=LARGEST_SEED) for seed in seeds]
 
 
+def batch_seeds(seed: Any, num_envs: int) -> list[int | None]:
+    """A seed for each environment: those given, a sequence of integers and None; or the first, and those that follow it.
+
+    Raises:
+        ValueError: another number of seeds, or one that generators cannot have.
+    """
+    array = None if isinstance(seed, (list, tuple)) else checks.as_array(seed)
+    given = seed if isinstance(seed, (list, tuple)) else array.tolist() if array is not None and array.ndim == 1 else None
+    if given is None:
+        (first,) = checked_seeds([seed])
+        return [None if first is None else first + i for i in range(num_envs)]
+    if len(given) != num_envs:
+        raise ValueError(
+            f"seed={checks.shown(seed)}: {len(given)} seeds for {num_envs} environments: give one each, or one integer"
+        )
+    return checked_seeds(given)
+
+
 def records(count: int, fields: Fields) -> NDArray:
     """Records with these fields, all zero, (count,): kernels read ``record.name``, Python ``records["name"]``."""
     return np.zeros(count, np.dtype(list(fields), align=True))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.attachments import Gripper
-from clothgym.checks import number
+from clothgym.checks import finite, number, shown
 from clothgym.guards import refusal
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
@@ -60,7 +60,7 @@ def chosen_fabric(fabric: Any, own: Material) -> Material:
     if fabric is None or isinstance(fabric, Material):
         return own if fabric is None else fabric
     if not isinstance(fabric, str):
-        raise ValueError(f"fabric={fabric!r}: must be a Material or a preset's name ({', '.join(PRESETS)})")
+        raise ValueError(f"fabric={shown(fabric)}: must be a Material or a preset's name ({', '.join(PRESETS)})")
     return replace(own, **preset_properties(fabric), source=Material.preset(fabric).source)  # type: ignore[arg-type]
 
 
@@ -78,20 +78,17 @@ def checked_ranges(ranges: Mapping[str, Sequence[float]]) -> dict[str, tuple[flo
     """
     checked = {}
     if not isinstance(ranges, Mapping):
-        raise ValueError(f"randomize={ranges!r}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
+        raise ValueError(f"randomize={shown(ranges)}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
     for name, bounds in ranges.items():
         if name not in PROPERTIES:
             raise ValueError(f"randomize: no material property {name!r} (there are: {', '.join(PROPERTIES)})")
-        if (
-            np.shape(bounds) != (2,)
-            or np.asarray(bounds).dtype.kind not in "iuf"
-            or not np.all(np.isfinite(bounds))
-            or bounds[0] > bounds[1]
-        ):
-            raise ValueError(f"randomize: {name}={bounds!r} must be a range [low, high] of finite numbers")
-        for bound in bounds:
-            Material(**{name: float(bound)})  # type: ignore[arg-type]
-        checked[name] = (float(bounds[0]), float(bounds[1]))
+        pair = finite(f"randomize: {name}", bounds)
+        if pair.shape != (2,) or pair[0] > pair[1]:
+            raise ValueError(f"randomize: {name}={shown(bounds)} must be a range [low, high] of finite numbers")
+        low, high = pair.tolist()
+        for bound in (low, high):
+            Material(**{name: bound})  # type: ignore[arg-type]
+        checked[name] = low, high
     return checked
 
 
@@ -103,7 +100,7 @@ def checked_wind(properties: Mapping[str, Any]) -> Wind:
     """
     known = [field.name for field in fields(Wind)]
     if not isinstance(properties, Mapping):
-        raise ValueError(f"wind={properties!r}: must be a dict with any of {', '.join(known)}")
+        raise ValueError(f"wind={shown(properties)}: must be a dict with any of {', '.join(known)}")
     for name in properties:
         if name not in known:
             raise ValueError(f"wind: no property {name!r} (there are: {', '.join(known)})")
@@ -141,17 +138,17 @@ def checked_material_option(
         material = preset_properties(material)
     if not isinstance(material, Mapping):
         raise ValueError(
-            f"reset option material={material!r}: must be a preset's name ({', '.join(PRESETS)}) or a dict of properties"
+            f"reset option material={shown(material)}: must be a preset's name ({', '.join(PRESETS)}) or a dict of properties"
         )
-    method = simulation.integrator
+    method, plain = simulation.integrator, {}
     for name, value in material.items():
         if name not in PROPERTIES:
             raise ValueError(f"reset option material: no property {name!r} (there are: {', '.join(PROPERTIES)})")
-        number(f"reset option material: {name}", value)
+        plain[name] = number(f"reset option material: {name}", value)
         if name in method.ignored or (name in method.shared and simulation.num_envs > 1):
             raise ValueError(f"reset option material: {refusal(method, name)}")
-    check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in material.items()}})
-    return dict(material)
+    check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in plain.items()}})
+    return plain
 
 
 def most_demanding(material: Material, ranges: Mapping[str, tuple[float, float]]) -> Material:

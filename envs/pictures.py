@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import one_of
+from clothgym.checks import one_of, shown
 from clothgym.envs.task import Task
 from clothgym.forces import structural_strain
 
@@ -21,8 +21,8 @@ RENDER_COLORS = ("fabric", "strain", "depth")
 
 def check_render_mode(render_mode: str | None, render_color: str) -> None:
     """Refuse what ``draw`` cannot do."""
-    if render_mode is not None and render_mode not in RENDER_MODES:
-        raise ValueError(f"render_mode={render_mode!r}: must be None or one of {', '.join(RENDER_MODES)}")
+    if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
+        raise ValueError(f"render_mode={shown(render_mode)}: must be None or one of {', '.join(RENDER_MODES)}")
     one_of("render_color", render_color, *RENDER_COLORS)
 
 

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import numbers
 from clothgym.envs.episode import FAILURES, TaskState
 from clothgym.envs.keyboard import actions_of_keys
 from clothgym.envs.pages import check_keywords, completed
@@ -53,10 +54,10 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
 
     @exclusive
     def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
-        if np.shape(action) != self.action_space.shape:
-            raise ValueError(f"action has shape {np.shape(action)}: must be {self.action_space.shape}")
+        if type(action) is not np.ndarray or action.shape != self.action_space.shape:
+            action = numbers("action", action, self.action_space.shape)  # type: ignore[arg-type]
         task = self.task
-        task.advance(np.asarray(action)[None])
+        task.advance(action[None])
         reward, terminated, *_ = task.outcome[0].item()
         brought = task.observation[0].copy(), reward, terminated, False, task.info_of(0)
         self.turn.unfinished = ()

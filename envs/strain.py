@@ -201,7 +201,7 @@ class StrainTask(Task):
         integrator: str | Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
-        if strain_limit is not None or integrators.get(integrator or self.physics.integrator).limits_strain:
+        if strain_limit is not None or integrators.get(self.physics.integrator if integrator is None else integrator).limits_strain:
             what = f"strain_limit={strain_limit!r}" if strain_limit is not None else f"integrator={integrator!r}"
             raise ValueError(
                 f"{what}: a limiter would keep the strain below the threshold whatever the agent does, and the task would be "

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
-from clothgym.checks import finite, number, positive
+from clothgym.checks import finite, number, one_of, positive, shown
 from clothgym.collisions import Box, Capsule, Collider, Sphere
 
 LARGEST = 0.6  # [m]: sizes and distances beyond this leave no room to drape in
@@ -45,15 +45,17 @@ class Target:
     yaw: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.shape not in SHAPES:
-            raise ValueError(f"target shape={self.shape!r}: must be one of {', '.join(SHAPES)}")
+        one_of("target shape", self.shape, *SHAPES)
         for name in ("radius", "height"):
-            if positive(f"target {name}", getattr(self, name)) > LARGEST:
+            object.__setattr__(self, name, positive(f"target {name}", getattr(self, name)))
+            if getattr(self, name) > LARGEST:
                 raise ValueError(f"target {name}={getattr(self, name)!r}: must be at most {LARGEST} m, to stand in the arena")
         center = finite("target center", self.center)
         if center.shape != (2,) or max(map(abs, center.tolist())) > LARGEST:
-            raise ValueError(f"target center={self.center!r}: must be two numbers within {LARGEST} m of the origin")
-        if abs(number("target yaw", self.yaw)) > math.pi / 4 + 1e-9:
+            raise ValueError(f"target center={shown(self.center)}: must be two numbers within {LARGEST} m of the origin")
+        object.__setattr__(self, "center", tuple(center.tolist()))
+        object.__setattr__(self, "yaw", number("target yaw", self.yaw))
+        if abs(self.yaw) > math.pi / 4 + 1e-9:
             raise ValueError(f"target yaw={self.yaw!r}: must be within 45 degrees (pi/4); a box looks the same every 90")
         if self.shape in ("sphere", "box") and not math.isclose(self.height, 2 * self.radius, rel_tol=1e-6):
             raise ValueError(f"target height={self.height!r}: that of a {self.shape} is twice its radius {self.radius!r}")
@@ -64,8 +66,7 @@ class Target:
     def draw(rng: np.random.Generator, side: float, spread: float, shape: str | None = None) -> Target:
         """A target for a sheet of that side [m], its axis within ``spread`` [m] of the origin."""
         shape = shape if shape is not None else SHAPES[int(rng.integers(len(SHAPES)))]
-        if shape not in SHAPES:
-            raise ValueError(f"target shape={shape!r}: must be one of {', '.join(SHAPES)}")
+        one_of("target shape", shape, *SHAPES)
         widths, heights = SIZES[shape]
         radius = side * float(rng.uniform(*widths))
         height = side * float(rng.uniform(*heights)) if heights else 2 * radius
@@ -101,7 +102,7 @@ class Target:
     def changed(self, properties: Mapping[str, Any]) -> Target:
         """The same but for some properties; its height follows from its radius unless it is among them, or a post's."""
         if "radius" in properties and "height" not in properties and self.shape != "post":
-            properties = {**properties, "height": 2 * properties["radius"]}
+            properties = {**properties, "height": 2 * positive("target radius", properties["radius"])}
         return replace(self, **properties) if properties else self
 
 

@@ -18,7 +18,7 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.checks import not_negative, one_of
+from clothgym.checks import not_negative, numbers, one_of, shown
 from clothgym.envs.definition import VELOCITY_BOUND, Observation, TaskDefinition
 from clothgym.envs.episode import TaskState, checked_seeds, names_of, record_of, records
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
@@ -86,7 +86,7 @@ class Task(TaskDefinition):
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
         own_fabric = self.physics.material
         physics = self.physics = replace(self.physics, material=chosen_fabric(fabric, own_fabric))  # type: ignore[misc]
-        self.randomize = checked_ranges(randomize or {})
+        self.randomize = checked_ranges({} if randomize is None else randomize)
         self.wind = physics.wind if wind is None else checked_wind(wind)
         if air_density is None:
             air_density = physics.air_density if wind is None else AIR_DENSITY
@@ -265,7 +265,7 @@ class Task(TaskDefinition):
     def _checked_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """A reset's options, with the properties of a fabric that was named; refuses those that no episode can have."""
         if not isinstance(options, Mapping):
-            raise ValueError(f"reset options={options!r}: must be a dict with any of {', '.join(self.reset_options)}")
+            raise ValueError(f"reset options={shown(options)}: must be a dict with any of {', '.join(self.reset_options)}")
         unknown = set(options) - set(self.reset_options)
         if unknown:
             raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
@@ -326,14 +326,11 @@ class Task(TaskDefinition):
 
     def _checked(self, actions: Any) -> NDArray:
         """Actions as an array of the right shape, float64."""
-        try:
-            array = np.ascontiguousarray(actions, np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(f"action {actions!r}: must be an array of numbers") from None
         shape = (self.num_envs, *self.single_action_space.shape)
-        if array.shape != shape:
-            raise ValueError(f"action has shape {array.shape}: must be {shape}")
-        return array
+        # the usual case, at once
+        if type(actions) is np.ndarray and actions.dtype.kind == "f" and actions.shape == shape:
+            return np.ascontiguousarray(actions, np.float64)
+        return np.ascontiguousarray(numbers("action", actions, shape))
 
     def _score_and_observe(self, envs: NDArray, begins: bool) -> None:
         """Score and observe environments after a step, all of them, or as their episodes begin."""

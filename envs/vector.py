@@ -10,8 +10,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from clothgym.checks import count
-from clothgym.envs.episode import FAILURES, TaskState, checked_seeds
+from clothgym.checks import count, mask, shown
+from clothgym.envs.episode import FAILURES, TaskState, batch_seeds
 from clothgym.envs.pages import check_keywords
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
 from clothgym.envs.task import Task
@@ -44,13 +44,12 @@ class ClothVectorEnv(VectorEnv):
         **kwargs: Any,
     ) -> None:
         check_keywords(self, kwargs)
-        if not isinstance(num_envs, (int, np.integer)) or num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r}: a batch needs at least 1 environment, as an integer")
+        self.num_envs = count("num_envs", num_envs)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError:
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise ValueError(f"autoreset_mode={autoreset_mode!r}: must be one of {known}") from None
+            raise ValueError(f"autoreset_mode={shown(autoreset_mode)}: must be one of {known}") from None
         self.max_episode_steps = None if max_episode_steps is None else count("max_episode_steps", max_episode_steps, "None, or ")
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
@@ -60,8 +59,7 @@ class ClothVectorEnv(VectorEnv):
             "autoreset_mode": self.autoreset_mode,
             "failures": FAILURES,
         }
-        self.task = self.task_class(int(num_envs), **kwargs)
-        self.num_envs = int(num_envs)
+        self.task = self.task_class(self.num_envs, **kwargs)
         self.single_observation_space = self.task.single_observation_space
         self.single_action_space = self.task.single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -73,21 +71,12 @@ class ClothVectorEnv(VectorEnv):
     ) -> tuple[NDArray, dict[str, Any]]:
         """Begin new episodes in all environments, or in those of ``options["reset_mask"]``, (num_envs,) of bool."""
         if not isinstance(options, Mapping | None):
-            raise ValueError(f"reset options={options!r}: must be a dict, or None")
+            raise ValueError(f"reset options={shown(options)}: must be a dict, or None")
         options = dict(options or {})
-        mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
-        if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise ValueError(f"options['reset_mask'] must be {self.num_envs} booleans with at least one True, not {mask!r}")
-        if isinstance(seed, (Sequence, np.ndarray)):
-            seeds = checked_seeds(seed)
-            if len(seeds) != self.num_envs:
-                raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments: give one each, or one integer")
-        else:
-            (first,) = checked_seeds([seed])
-            seeds = [None if first is None else first + i for i in range(self.num_envs)]
-        envs = np.flatnonzero(mask)
+        reset = mask("options['reset_mask']", options.pop("reset_mask", np.ones(self.num_envs, bool)), self.num_envs)
+        seeds, envs = batch_seeds(seed, self.num_envs), np.flatnonzero(reset)
         self.task.reset(envs, [seeds[env] for env in envs], options)
-        return self._observation(), _with_masks(_only(self.task.infos(), mask), mask)
+        return self._observation(), _with_masks(_only(self.task.infos(), reset), reset)
 
     @exclusive
     def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:

@@ -41,12 +41,12 @@ def test_options_are_taken_over():
     [
         ({"name": "xpbd", "iteratons": 4}, "xpbd has no option 'iteratons': it has only iterations"),
         ({"name": "rk4", "stages": 4}, "rk4 has no option 'stages': it has none"),
-        ({"name": "xpbd", "iterations": 0}, "iterations=0 must be an integer of at least 1"),
-        ({"name": "xpbd", "iterations": 1.5}, "iterations=1.5 must be an integer of at least 1"),
-        ({"name": "xpbd", "iterations": True}, "iterations=True must be a finite number"),
-        ({"name": "pbd", "stretch": 1.1}, "stretch=1.1 must be from 0 to 1"),
-        ({"name": "pbd", "stretch": "stiff"}, "stretch='stiff' must be a finite number"),
-        ({"name": "implicit_euler", "tolerance": float("nan")}, "tolerance=nan must be a finite number"),
+        ({"name": "xpbd", "iterations": 0}, "iterations=0: must be an integer of at least 1"),
+        ({"name": "xpbd", "iterations": 1.5}, "iterations=1.5: must be an integer of at least 1"),
+        ({"name": "xpbd", "iterations": True}, "iterations=True: must be a finite number"),
+        ({"name": "pbd", "stretch": 1.1}, "stretch=1.1: must be from 0 to 1"),
+        ({"name": "pbd", "stretch": "stiff"}, "stretch='stiff': must be a finite number"),
+        ({"name": "implicit_euler", "tolerance": float("nan")}, "tolerance=nan: must be a finite number"),
     ],
 )
 def test_wrong_options_are_named(given, match):

@@ -31,10 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import disjoint, kernel
+from clothgym.checks import count, number
 from clothgym.elements import Scratch, room_for_forces
 from clothgym.forces import Oscillators
 
 Properties = frozenset[str]
+MOST_ITERATIONS = 1_000_000
 
 
 class Work(NamedTuple):
@@ -129,14 +131,11 @@ class Integrator:
                 raise ValueError(f"{self.name} has no option {name!r}: it {known}")
             # an option whose default is an integer is a count; the others are shares or tolerances
             whole = isinstance(self.options[name], int)
-            numeric = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, (bool, np.bool_))
-            if not numeric or not np.isfinite(value):
-                raise ValueError(f"{self.name}: {name}={value!r} must be a finite number")
-            if whole and (value != int(value) or value < 1):
-                raise ValueError(f"{self.name}: {name}={value!r} must be an integer of at least 1")
-            if not whole and not 0 <= value <= 1:
-                raise ValueError(f"{self.name}: {name}={value!r} must be from 0 to 1")
-            options[name] = int(value) if whole else float(value)
+            options[name] = value = number(f"{self.name}: {name}", value)
+            if whole:
+                options[name] = count(f"{self.name}: {name}", int(value) if value == int(value) else value, most=MOST_ITERATIONS)
+            elif not 0 <= value <= 1:
+                raise ValueError(f"{self.name}: {name}={value!r}: must be from 0 to 1")
         return replace(self, options=MappingProxyType({**self.options, **options}))
 
     def __reduce__(self) -> tuple[Callable[..., Integrator], tuple[Any, ...]]:

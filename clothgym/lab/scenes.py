@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, finite, positive
+from clothgym.checks import count, finite, positive, shown
 from clothgym.integrators import Integrator
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY, Simulation
-from clothgym.triangles import disc
+from clothgym.triangles import disc, triples
 
 SPECIMEN_RADIUS, SUPPORT_RADIUS = 0.15, 0.09  # specimen and support of the drape test [m], BS 5058 and ISO 9073-9
 SETTLING_DRAG = 20.0  # rate of the linear drag [1/s]: about critical for a skirt or a strip of a few centimeters
@@ -61,7 +61,7 @@ class Cantilever(NamedTuple):
 
 def bending_length(material: Material) -> float:
     """Peirce's ``c = (B/(rho g))^(1/3)`` [m]: a strip twice as long droops by 41.5 degrees."""
-    return float((material.bend_rigidity / (material.density * GRAVITY)) ** (1 / 3))
+    return float((_checked(material).bend_rigidity / (material.density * GRAVITY)) ** (1 / 3))
 
 
 def cusick_drape(
@@ -122,7 +122,10 @@ def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
     On each of ``LINES`` lines the length of the shadow is exactly that of the union of intervals; the lengths are summed by the
     midpoint rule.  positions: [m], (particles, 3).
     """
-    corners = finite("positions", positions)[np.asarray(triangles)][:, :, :2]
+    x = finite("positions", positions)
+    if x.ndim != 2 or x.shape[1] != 3:
+        raise ValueError(f"positions have shape {x.shape}: must be (particles, 3)")
+    corners = x[triples(x, triangles)][:, :, :2]
     low, high = corners[:, :, 1].min(), corners[:, :, 1].max()
     spacing = (high - low) / LINES
     if spacing == 0:
@@ -223,9 +226,15 @@ def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
     return raised
 
 
+def _checked(material: Any) -> Material:
+    if not isinstance(material, Material):
+        raise ValueError(f"material={shown(material)}: must be a Material, for instance Material.preset('cotton')")
+    return material
+
+
 def _with_drag(material: Material) -> Material:
     """The material with the drag under which sheets settle."""
-    return replace(material, air_drag=SETTLING_DRAG * material.density)
+    return replace(_checked(material), air_drag=SETTLING_DRAG * material.density)
 
 
 def _fastest(simulation: Simulation) -> NDArray[np.float64]:

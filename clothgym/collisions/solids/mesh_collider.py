@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,13 +49,16 @@ class MeshCollider(Collider):
     resolution: int = 64
 
     def __post_init__(self) -> None:
-        for name in ("friction", "thickness"):
-            not_negative(f"MeshCollider {name}", getattr(self, name))
-        for name in ("center", "velocity"):
-            vector(f"MeshCollider {name}", getattr(self, name))
         turned("MeshCollider rotation", self.rotation)
-        positive("MeshCollider scale", self.scale)
-        count("MeshCollider resolution", self.resolution)
+        plain: dict[str, Any] = {
+            **{name: not_negative(f"MeshCollider {name}", getattr(self, name)) for name in ("friction", "thickness")},
+            **{name: tuple(vector(f"MeshCollider {name}", getattr(self, name)).tolist()) for name in ("center", "velocity")},
+            "rotation": tuple(finite("MeshCollider rotation", self.rotation).tolist()),
+            "scale": positive("MeshCollider scale", self.scale),
+            "resolution": count("MeshCollider resolution", self.resolution),
+        }
+        for name, value in plain.items():
+            object.__setattr__(self, name, value)
         if not isinstance(self.path, (str, Path, type(None))):
             kind = type(self.path).__name__
             raise ValueError(f"MeshCollider path is of type {kind}: must be a file name, give arrays as vertices=, triangles=")

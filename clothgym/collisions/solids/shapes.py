@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import finite, members, number, vector
+from clothgym.checks import count, finite, members, not_negative, number, shown, vector
 
 # rows of a collider: a point of it; its x, y and z axes; half sides b; radius r with the thickness; friction; velocity; squared
 # distance from the point beyond which nothing touches it; thickness; velocity after the next control step
@@ -55,12 +55,15 @@ class Collider:
             name, value = f"{type(self).__name__} {item.name}", getattr(self, item.name)
             if value is item.default:
                 continue
+            plain: Any
             if item.name == "rotation":
                 turned(name, value)
+                plain = tuple(finite(name, value).tolist())
             elif isinstance(item.default, tuple):
-                vector(name, value)
-            elif number(name, value) < 0 and item.name in ("friction", "thickness"):
-                raise ValueError(f"{name}={value!r}: must be zero or positive")
+                plain = tuple(vector(name, value).tolist())
+            else:
+                plain = (not_negative if item.name in ("friction", "thickness") else number)(name, value)
+            object.__setattr__(self, item.name, plain)
 
     def known_kind(self) -> int:
         """Its kind; a class of somebody else's may have one that no kernel knows, or be a mesh without a grid of distances."""
@@ -187,7 +190,7 @@ def turned(name: str, quaternion: ArrayLike) -> NDArray[np.float64]:
     """
     q = finite(name, quaternion)
     if q.shape != (4,) or not np.linalg.norm(q) > 0:
-        raise ValueError(f"{name}={quaternion!r}: must be a quaternion, four numbers (w, x, y, z) that are not all zero")
+        raise ValueError(f"{name}={shown(quaternion)}: must be a quaternion, four numbers (w, x, y, z) that are not all zero")
     w, x, y, z = q / np.linalg.norm(q)
     return np.array(
         [
@@ -215,8 +218,9 @@ def _axes_along(*direction: float) -> NDArray[np.float64]:
 
 def check_index(colliders: Sequence[Collider], index: int) -> None:
     """Raise ValueError for an index that no collider has."""
-    if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(colliders):
-        raise ValueError(f"index={index!r}: this simulation has {len(colliders)} colliders")
+    if not colliders:
+        raise ValueError(f"index={shown(index)}: must name a collider, and this simulation has 0 colliders")
+    count("index", index, "the place of a collider, ", least=0, most=len(colliders) - 1)
 
 
 def check_replacement(colliders: Sequence[Collider], index: int, others: Sequence[Collider], envs: int) -> None:
@@ -228,7 +232,7 @@ def check_replacement(colliders: Sequence[Collider], index: int, others: Sequenc
     check_index(colliders, index)
     members("colliders", others, Collider, f"{envs} colliders, one for each environment")
     if len(others) != envs:
-        raise ValueError(f"colliders={others!r}: give a sequence of {envs}, one for each environment")
+        raise ValueError(f"colliders={shown(others)}: give a sequence of {envs}, one for each environment")
     for other in others:
         if not colliders[index].fits(other):
             here, there = type(colliders[index]).__name__, type(other).__name__
