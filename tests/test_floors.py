@@ -9,6 +9,7 @@ ROOT = Path(__file__).parent.parent
 FLOORS = {
     "clothgym._jit": 0,
     "clothgym.checks": 0,
+    "clothgym.files": 0,
     "clothgym.progress": 0,
     "clothgym.mesh": 1,
     "clothgym.triangles": 1,

@@ -8,11 +8,13 @@ environment's own ``cost_penalty``.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+
+from clothgym import files
+from clothgym.checks import not_negative
 
 FILE = "multiplier.json"
 CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learned to move
@@ -33,7 +35,12 @@ class LagrangeMultiplier(BaseCallback):
         super().__init__()
         self.path = folder / FILE
         self.cost_limit, self.rate, self.most = cost_limit, rate, most
-        self.multiplier = float(json.loads(self.path.read_text())["multiplier"]) if self.path.exists() else start
+        self.multiplier = start
+        if self.path.exists():
+            advice = "remove it to begin with the price that the configuration names"
+            known = files.read_json(self.path, "multiplier", advice)
+            with files.naming(self.path, "multiplier", advice):
+                self.multiplier = not_negative("multiplier", known["multiplier"])
         self.costs: list[float] = []
 
     def _on_training_start(self) -> None:
@@ -50,5 +57,5 @@ class LagrangeMultiplier(BaseCallback):
             self.training_env.set_attr("cost_penalty", self.multiplier)
             self.logger.record("lagrange/episode_cost", mean)
             self.logger.record("lagrange/multiplier", self.multiplier)
-            self.path.write_text(json.dumps({"multiplier": self.multiplier}) + "\n")
+            files.write_json(self.path, {"multiplier": self.multiplier})
         self.costs = []
