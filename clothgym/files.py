@@ -102,7 +102,7 @@ def read(path: str | Path, most: int = LARGEST) -> bytes:
     """The content of a regular file of at most so many bytes; within ``naming``, which adds the file's name.
 
     Raises:
-        FileNotFoundError: there is none; or another OSError.
+        OSError: there is none, or it cannot be read.
         ValueError: it is a device, a pipe or a folder, or too large.
     """
     about = os.stat(path)
@@ -120,15 +120,16 @@ def naming(path: str | Path, kind: str, advice: str) -> Iterator[None]:
     """What goes wrong while a file is read, as one sentence with its name.
 
     Raises:
-        FileNotFoundError: there is none; or another OSError.
+        FileNotFoundError: there is none.
         ValueError: anything else: libraries raise all kinds of errors on a file that they do not expect.
     """
     try:
         yield
-    except OSError:
+    except FileNotFoundError:
         raise
     except Exception as error:
-        why = str(error).strip().splitlines() or [type(error).__name__]
+        said = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        why = said.strip().splitlines() or [type(error).__name__]
         raise ValueError(f"{str(path)!r} is no {kind} ({why[0][:200]}): {advice}") from error
 
 
@@ -194,7 +195,7 @@ def read_arrays(path: str | Path, kind: str, version: int, advice: str) -> dict[
     """What ``write_arrays`` wrote.
 
     Raises:
-        FileNotFoundError: there is no such file; or another OSError.
+        FileNotFoundError: there is no such file.
         ValueError: it is something else, or damaged; the sentence has its name.
     """
     with naming(path, kind, advice), opened(unmarked(read(path), kind, version)) as archive:
@@ -250,7 +251,7 @@ def read_json(path: str | Path, kind: str, advice: str) -> dict[str, Any]:
     """What ``write_json`` wrote.
 
     Raises:
-        FileNotFoundError: there is no such file; or another OSError.
+        FileNotFoundError: there is no such file.
         ValueError: it is something else, or damaged; the sentence has its name.
     """
     with naming(path, kind, advice):

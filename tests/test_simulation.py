@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
-from clothgym import INTEGRATORS, Material, Plane, Simulation, State, grid
+from clothgym import INTEGRATORS, Material, Plane, Simulation, State, files, grid
 
 NAMES = list(INTEGRATORS)
 MESH = grid(5, 5, 0.2, 0.2)

@@ -20,6 +20,18 @@ FILE = "multiplier.json"
 CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learned to move
 
 
+def known_multiplier(path: Path) -> float:
+    """The multiplier that a run has come to.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    advice = "remove it to begin with the price that the configuration names"
+    content = files.read_json(path, "multiplier", advice)
+    with files.naming(path, "multiplier", advice):
+        return not_negative("multiplier", content.get("multiplier"))
+
+
 class LagrangeMultiplier(BaseCallback):
     """Moves ``cost_penalty`` of the training environments.
 
@@ -35,12 +47,7 @@ class LagrangeMultiplier(BaseCallback):
         super().__init__()
         self.path = folder / FILE
         self.cost_limit, self.rate, self.most = cost_limit, rate, most
-        self.multiplier = start
-        if self.path.exists():
-            advice = "remove it to begin with the price that the configuration names"
-            known = files.read_json(self.path, "multiplier", advice)
-            with files.naming(self.path, "multiplier", advice):
-                self.multiplier = not_negative("multiplier", known["multiplier"])
+        self.multiplier = known_multiplier(self.path) if self.path.exists() else start
         self.costs: list[float] = []
 
     def _on_training_start(self) -> None:
