@@ -177,8 +177,8 @@ def fits(
     name: str,
     given: Any,
     kept: NDArray,
-    low: ArrayLike = -LARGEST,
-    high: ArrayLike = LARGEST,
+    low: Any = -LARGEST,
+    high: Any = LARGEST,
     excused: NDArray | None = None,
     advice: str = "give what get_state() gave",
 ) -> None:
@@ -192,12 +192,13 @@ def fits(
         raise ValueError(f"the state's {name} has shape {given.shape}, this simulation's {kept.shape}: {advice}")
     if kept.dtype.kind == "b":
         return
+    # floating point is compared as float64, integers exactly; NaN is neither above nor below anything
+    numbers: NDArray = np.asarray(given)
     if kept.dtype.kind in "iu":
         holds = np.iinfo(kept.dtype)
-        low, high = np.maximum(low, holds.min), np.minimum(high, holds.max)
-    # NaN is neither
-    numbers: NDArray = np.asarray(given)
-    wrong = np.array(~((numbers >= low) & (numbers <= high)))
+        wrong = np.array((numbers < int(max(low, holds.min))) | (numbers > int(min(high, holds.max))))
+    else:
+        wrong = np.array(~((numbers >= np.float64(low)) & (numbers <= np.float64(high))))
     if excused is not None:
         wrong[excused] = False
     if wrong.any():

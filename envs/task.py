@@ -389,11 +389,11 @@ class Task(TaskDefinition):
         if not isinstance(state.generators, list) or len(state.generators) != self.num_envs:
             raise ValueError(f"the state has not one generator for each of {self.num_envs} environments: {advice}")
         # of episodes that there cannot be
-        for name, kept in memory.items():
+        for name in ("over", "step", *memory):
             low, high = self._ranges.get(name, (-LARGEST, LARGEST))
-            fits(name, state.episode[name], kept, low, high, advice=advice)
-        if np.any(state.episode["over"] & (state.episode["step"] == 0)):
-            raise ValueError("the state is from before the first reset: there is no episode to continue")
+            fits(name, state.episode[name], memory[name], low, high, advice=advice)
+            if name == "step" and np.any(state.episode["over"] & (state.episode["step"] == 0)):
+                raise ValueError("the state is from before the first reset: there is no episode to continue")
         check_properties(self.physics.material, state.episode["material"])
         episodes = self.episode.copy()
         for name in names_of(episodes):
