@@ -27,7 +27,7 @@ from clothgym.adapters.runs import load_last, load_tensors
 from clothgym.adapters.sb3 import make_sb3_vec_env
 from clothgym.checks import number as finite_number
 
-PROGRESS = "progress.jsonl"
+PROGRESS, MODEL = "progress.jsonl", "model.zip"
 SCORES = ("timesteps", "training_seconds", "success_rate", "normalized_performance", "return")  # in each of its lines
 
 
@@ -203,7 +203,8 @@ def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_epis
             raise
         seconds = watch.training_seconds
         watch.evaluate()
-        with files.replacing(folder / "model.zip") as part:
+    if config["timesteps"] > done or not (folder / MODEL).exists():
+        with files.replacing(folder / MODEL) as part:
             model.save(part)
     finish(folder, config, watch.lines, seconds, final_episodes)
 
