@@ -269,7 +269,8 @@ def check_fits(state: State, own: State) -> None:
             raise ValueError(f"the state has {there[1]} {what}, this simulation {here[1]}")
     if not np.array_equal(state.sheet, own.sheet):
         raise ValueError(
-            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's"
+            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's: "
+            f"{advice}"
         )
     # every array: its kind, shape and range
     fits("diverged", state.diverged, own.diverged, advice=advice)
