@@ -259,18 +259,21 @@ def check_fits(state: State, own: State) -> None:
         if not isinstance(getattr(state, name), (np.ndarray, np.generic)):
             raise ValueError(f"the state's {name} is no array: {advice}")
     if state.positions.shape != own.positions.shape:
-        here = f"this simulation (num_envs, particles, 3) = {own.positions.shape}"
-        raise ValueError(f"the state holds positions of shape {state.positions.shape}, {here}")
+        raise ValueError(
+            f"the state holds positions of shape {state.positions.shape}, this simulation (num_envs, particles, 3) = "
+            f"{own.positions.shape}: {advice}"
+        )
     if not np.array_equal(state.anchors, own.anchors):
-        raise ValueError(f"the state has anchors {state.anchors[:1].tolist()}, this simulation {own.anchors[:1].tolist()}")
+        there, here = (np.atleast_1d(one.anchors)[:1].tolist() for one in (state, own))
+        raise ValueError(f"the state has anchors {there}, this simulation {here}: {advice}")
     for name, what in (("attachment_positions", "attachments (anchors, then grippers)"), ("colliders", "colliders")):
-        here, there = getattr(own, name).shape, getattr(state, name).shape
-        if len(there) == 3 and there[1] != here[1]:
-            raise ValueError(f"the state has {there[1]} {what}, this simulation {here[1]}")
+        shape, given = getattr(own, name).shape, getattr(state, name).shape
+        if len(given) == 3 and given[1] != shape[1]:
+            raise ValueError(f"the state has {given[1]} {what}, this simulation {shape[1]}: {advice}")
     if not np.array_equal(state.sheet, own.sheet):
         raise ValueError(
-            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's: "
-            f"{advice}"
+            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this "
+            f"simulation's: {advice}"
         )
     # every array: its kind, shape and range
     fits("diverged", state.diverged, own.diverged, advice=advice)

@@ -5,6 +5,7 @@ import errno
 import io
 import itertools
 import os
+import traceback
 import zipfile
 from pathlib import Path
 
@@ -158,7 +159,9 @@ def test_attacks_end_in_a_sentence_or_do_no_harm(family, count, monkeypatch):
             attack()
             outcomes["fine"] += 1
         except ValueError as error:
-            assert ("/tmp" in str(error) or family == "states") and (": " in str(error) or "; give " in str(error)), text
+            raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
+            ours = raised_in.is_relative_to(ROOT / "clothgym") or raised_in.is_relative_to(ROOT / "envs")
+            assert "/tmp" in str(error) if family == "files" else ours, text
             outcomes["refused"] += 1
     assert outcomes["refused"] > count / 2 and outcomes["fine"] > 0
 

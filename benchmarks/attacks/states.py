@@ -121,7 +121,7 @@ def _edit(state: Any, rng: np.random.Generator) -> None:
             places += [(physics.self_contact, name) for name in physics.self_contact]
     if physics is not state:
         places += [(state.episode, name) for name in state.episode] * 2
-        places += [(state.generators, 0)] * 3 * isinstance(state.generators, list)  # type: ignore[list-item]
+        places += [(state.generators, 0)] * (3 if isinstance(state.generators, list) and state.generators else 0)  # type: ignore[list-item]
         places += [(state.task, name) for name in state.task]
         if rng.random() < 0.02:
             places = [(state, name) for name in ("simulation", "generators")]
