@@ -97,6 +97,22 @@ class Attachments:
         self.blocked = np.zeros((layout.blocks, self.count, layout.lanes), bool)
         self.homes = np.array([g.position for g in self.grippers]).reshape(-1, 3)
 
+    def check(self, state: State) -> None:
+        """Refuse anchors that hold other particles than their own.
+
+        Raises:
+            ValueError: the particle and the anchor.
+        """
+        anchor_of = np.full(state.holder.shape[1], FREE)
+        anchor_of[self.members] = self.member_of
+        wrong = np.argwhere((state.holder >= 0) & (state.holder < len(self.anchors)) & (state.holder != anchor_of))
+        if len(wrong):
+            env, particle = wrong[0].tolist()
+            raise ValueError(
+                f"the state's holder says that anchor {state.holder[env, particle]} holds particle {particle}, which is not its "
+                "own: give what get_state() gave"
+            )
+
     def restore(self, state: State) -> None:
         """Copy the attachments of a state."""
         blocks, dtype = self.layout.to_blocks, self.limits.dtype

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+ALIKE = {"f": "fiu", "i": "iu", "u": "iu", "b": "b"}  # kinds of arrays that can take the place of one, by its kind
 LARGEST = 1e30  # magnitude of a number: its differences over a control step are still finite in float32
 LONGEST = 200  # characters of a value in a message
 SMALLEST = 1e-30  # of what must be positive: its inverse is still finite in float32
@@ -213,3 +214,37 @@ def indices(name: str, value: ArrayLike, end: int, what: str) -> NDArray:
     if array.dtype.kind not in "iu" or array.ndim != 1 or array.min() < 0 or array.max() >= end:
         raise ValueError(f"{name}={shown(value)}: must be integers, {what} are 0 to {end - 1}")
     return array.astype(np.int64)
+
+
+def fits(
+    name: str,
+    given: Any,
+    kept: NDArray,
+    low: Any = -LARGEST,
+    high: Any = LARGEST,
+    excused: NDArray | None = None,
+    advice: str = "give what get_state() gave",
+) -> None:
+    """Check that ``given`` can take the place of ``kept``: an array of that shape and kind, finite and from ``low`` to ``high``.
+
+    excused: environments, (num_envs,), whose numbers may be anything.  An integer must also be one that the kept array can hold.
+    """
+    if not isinstance(given, (np.ndarray, np.generic)) or given.dtype.kind not in ALIKE[kept.dtype.kind]:
+        raise ValueError(f"the state's {name} is no array of {kept.dtype.name}: {advice}")
+    if given.shape != kept.shape:
+        raise ValueError(f"the state's {name} has shape {given.shape}, this simulation's {kept.shape}: {advice}")
+    if kept.dtype.kind == "b":
+        return
+    # floating point is compared as float64, integers exactly; NaN is neither above nor below anything
+    numbers: NDArray = np.asarray(given)
+    if kept.dtype.kind in "iu":
+        holds = np.iinfo(kept.dtype)
+        wrong = np.array((numbers < int(max(low, holds.min))) | (numbers > int(min(high, holds.max))))
+    else:
+        wrong = np.array(~((numbers >= np.float64(low)) & (numbers <= np.float64(high))))
+    if excused is not None:
+        wrong[excused] = False
+    if wrong.any():
+        value, least, most = (np.broadcast_to(each, given.shape)[wrong][0] for each in (given, low, high))
+        why = "a value that is not finite" if not np.isfinite(value) else f"{value:g}: it must be from {least:g} to {most:g}"
+        raise ValueError(f"the state's {name} holds {why}; {advice}")

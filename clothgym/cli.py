@@ -35,6 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         progress.clear()
         print("; ".join(["stopped", *getattr(stop, "__notes__", [])]), file=sys.stderr)
         return STOPPED
+    except OSError as error:  # a full disk, a folder that has gone
+        progress.clear()
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     return 0
 
 
@@ -232,6 +236,7 @@ def _bench(options: argparse.Namespace) -> None:
     if options.select and not options.table:
         options.refuse("argument --select: its groups are those of the table: add --table")
 
+    from clothgym import files
     from clothgym.lab import bench, bench_table
 
     if options.table:
@@ -244,7 +249,7 @@ def _bench(options: argparse.Namespace) -> None:
         results = bench.run(options.quick)
         print(bench.table(results))
     if options.json is not None:
-        options.json.write_text(json.dumps(results, indent=1) + "\n")
+        files.write(options.json, json.dumps(results, indent=1) + "\n")
         print(f"written to {options.json}")
 
 

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import LARGEST, fits
+
 if TYPE_CHECKING:
     from clothgym.state import Layout
 
@@ -127,21 +129,19 @@ def check(state: dict[str, NDArray], layout: Layout, particles: int, sound: NDAr
         ValueError: what is wrong.
     """
     advice = "give what get_state() of such a simulation gave"
-    for name, kept in SAVED.items():
+    for name, kept in sorted(SAVED.items(), key=lambda item: item[1].of in MOST_PER_VERTEX):
         given = state[name]
-        rows = given.shape[1] if kept.of in MOST_PER_VERTEX and given.ndim > 1 else 0
-        fits = given.shape == _public_shape(kept, layout.num_envs, particles, rows)
-        if fits and kept.of in MOST_PER_VERTEX:
-            count = state[kept.of]
-            fits = count.min(initial=0) >= 0 and count.max(initial=0) <= rows <= MOST_PER_VERTEX[kept.of] * particles
-        if not fits:
-            raise ValueError(f"the state's self_contact[{name!r}] has shape {given.shape}, which does not fit: {advice}")
+        rows = given.shape[1] if kept.of in MOST_PER_VERTEX and np.ndim(given) > 1 else 0
+        model: NDArray = np.broadcast_to(
+            np.zeros((), kept.dtype or np.float64), _public_shape(kept, layout.num_envs, particles, rows)
+        )
+        low, high = (0, LARGEST) if kept.of == "environment" else (-LARGEST, LARGEST)
         # what a gap constraint may come no closer than is infinite where it may not move
-        wrong = np.isnan(given) if name == "planes" else ~np.isfinite(given)
-        if wrong[sound].any():
-            raise ValueError(f"the state's self_contact[{name!r}] holds a value that is not finite: {advice}")
-        if kept.of == "environment" and given.min(initial=0) < 0:
-            raise ValueError(f"the state's self_contact[{name!r}] holds {given.min()}: it must not be negative; {advice}")
+        high = np.inf if name == "planes" else high
+        fits(f"self_contact[{name!r}]", given, model, low, high, ~sound if model.dtype.kind == "f" else None, advice)
+        # as many rows as the environments have, and as there is room for
+        if kept.of in MOST_PER_VERTEX and not state[kept.of].max(initial=0) <= rows <= MOST_PER_VERTEX[kept.of] * particles:
+            raise ValueError(f"the state's self_contact[{name!r}] has shape {given.shape}, which does not fit: {advice}")
     members = state["members"]
     for name, vertices in (("particles", state["particles"]), ("members", members[:, :, G_VERTICES:])):
         if np.any((vertices < 0) | (vertices >= particles)):

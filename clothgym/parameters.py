@@ -26,6 +26,16 @@ def of_material(material: Material) -> NDArray[np.float64]:
     return np.array([getattr(material, name) for name in PROPERTIES])
 
 
+def check_properties(material: Material, parameters: NDArray) -> None:
+    """Refuse properties, (envs, properties), that ``Material`` would not accept.
+
+    Raises:
+        ValueError: the property, its value, and what it must be.
+    """
+    for row in np.unique(parameters, axis=0):
+        replace(material, **dict(zip(PROPERTIES, row.tolist())))
+
+
 def changed(
     material: Material, parameters: NDArray, changes: Mapping[str, Any]
 ) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:

@@ -23,7 +23,7 @@ from clothgym.main_loop import Motion, Outcome, Schedule, Solid, compiled
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.observed import Observed
-from clothgym.parameters import AIR_DENSITY, changed, fabric_rows, inverse_masses, of_material
+from clothgym.parameters import AIR_DENSITY, changed, check_properties, fabric_rows, inverse_masses, of_material
 from clothgym.state import Fabric, Layout, State, at_rest, check_fits
 
 GRAVITY = 9.81
@@ -401,7 +401,11 @@ class Simulation(Observed):
             ValueError: the state does not fit; nothing is changed then.
         """
         check_fits(state, self._state())
+        check_properties(self.material, state.parameters)
+        fabric_rows(self.mesh, state.parameters, self.bending.hinged, self.air_density)
         guards.refuse_properties(self.integrator, self.mesh, state.parameters, state.parameters)
+        self._attachments.check(state)
+        self._solids.check(state)
         self._contact.check_memory(state)
         sound = np.flatnonzero(~state.diverged)
         self._contact.check_apart(state.positions[sound], sound)

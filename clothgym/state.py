@@ -11,7 +11,7 @@ which share a spring's indices and rest length, so that nothing is gathered.
 
 from __future__ import annotations
 
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,14 +19,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import as_array, indices, shown
+from clothgym import files
+from clothgym.checks import LARGEST, as_array, fits, indices, shown
 from clothgym.contact_memory import SAVED
 from clothgym.elements import SpringArrays
 from clothgym.mesh import NUM_KINDS, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
-ALIKE = {"f": "fiu", "i": "iu", "u": "iu", "b": "b"}  # kinds of numbers that a state may hold, by the kind that it keeps
+VERSION = 1  # of the format of files
+# least and greatest values in a state; all others lie within LARGEST
+NOT_NEGATIVE = ("free_inverse_mass", "stiffness", "rigidity", "damping_time", "drag_rate", "resistance", "parameters")
+RANGES: dict[str, tuple[float, float]] = {name: (0, LARGEST) for name in NOT_NEGATIVE}
+RANGES |= {"openings": (0, 1), "wanted_openings": (0, 1), "steps": (0, 2**62)}
+MAY_DIVERGE = ("positions", "velocities", "attachment_positions", "attachment_targets")  # with an environment; a reset mends them
 VECTOR = 16  # float32 lanes of the widest vector unit in use; blocks are padded to a multiple of it
 
 
@@ -201,28 +207,40 @@ class State:
         return own | {f"self_contact.{name}": array for name, array in self.self_contact.items()}
 
     def save(self, path: str | Path) -> None:
-        """Write as ``npz`` without pickle."""
-        np.savez(path, **self.arrays())  # type: ignore[arg-type]
+        """Write as ``npz`` without pickle, whole or not at all.
+
+        Raises:
+            OSError: the disk is full, or the folder cannot be written.
+        """
+        files.write_arrays(path, "state", VERSION, self.arrays())
 
     @staticmethod
     def load(path: str | Path) -> State:
-        """Read what ``save`` wrote.
+        """Read what ``save`` wrote; ``Simulation.set_state`` checks that it fits.
 
         Raises:
-            ValueError: the file is no state, or misses arrays, for instance because another version wrote it.
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no state, is damaged, or is of another version.
         """
-        try:
-            loaded = np.load(path, allow_pickle=False)
-            loaded.files  # noqa: B018 - a single array has none
-        except (ValueError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{str(path)!r} is not a state: give a file that State.save wrote") from error
-        with loaded as file:
-            own = [field.name for field in fields(State) if field.name != "self_contact"]
-            missing = [name for name in [*own, *(f"self_contact.{name}" for name in SAVED)] if name not in file]
-            if missing:
-                raise ValueError(f"{str(path)!r} is not a state of this version of clothgym: it lacks {', '.join(missing)}")
-            contact = {name: file[f"self_contact.{name}"] for name in SAVED}
-            return State(**{name: file[name] for name in own}, self_contact=contact)
+        advice = "give a file that State.save wrote"
+        arrays = files.read_arrays(path, "state", VERSION, advice)
+        with files.naming(path, "state", advice):
+            return State.of(arrays)
+
+    @staticmethod
+    def of(arrays: Mapping[str, NDArray]) -> State:
+        """The state of which these are the ``arrays``.
+
+        Raises:
+            ValueError: some are missing, or are none of a state.
+        """
+        own = [field.name for field in fields(State) if field.name != "self_contact"]
+        names = {*own, *(f"self_contact.{name}" for name in SAVED)}
+        if names != set(arrays):
+            lacks, more = ", ".join(sorted(names - set(arrays))), ", ".join(sorted(set(arrays) - names))
+            raise ValueError(f"it lacks {lacks}" if lacks else f"it holds {more}")
+        contact = {name: arrays[f"self_contact.{name}"] for name in SAVED}
+        return State(**{name: arrays[name] for name in own}, self_contact=contact)
 
 
 def check_fits(state: State, own: State) -> None:
@@ -236,38 +254,36 @@ def check_fits(state: State, own: State) -> None:
         raise ValueError(f"state={state!r}: {advice}")
     if not isinstance(state.self_contact, dict) or set(state.self_contact) != set(SAVED):
         raise ValueError(f"the state's self_contact must be a dict of {', '.join(SAVED)}: {advice}")
-    given_arrays, own_arrays = state.arrays(), own.arrays()
-    for name, given in given_arrays.items():
-        kept = np.asarray(own_arrays[name])
-        if not isinstance(given, (np.ndarray, np.generic)) or given.dtype.kind not in ALIKE[kept.dtype.kind]:
-            raise ValueError(f"the state's {name} is no array of {kept.dtype.name}: {advice}")
+    # of another simulation: what differs first, by name
+    for name in ("positions", "attachment_positions", "colliders", "anchors", "sheet"):
+        if not isinstance(getattr(state, name), (np.ndarray, np.generic)):
+            raise ValueError(f"the state's {name} is no array: {advice}")
     if state.positions.shape != own.positions.shape:
-        here = f"this simulation (num_envs, particles, 3) = {own.positions.shape}"
-        raise ValueError(f"the state holds positions of shape {state.positions.shape}, {here}")
+        raise ValueError(
+            f"the state holds positions of shape {state.positions.shape}, this simulation (num_envs, particles, 3) = "
+            f"{own.positions.shape}: {advice}"
+        )
     if not np.array_equal(state.anchors, own.anchors):
-        raise ValueError(f"the state has anchors {state.anchors[:1].tolist()}, this simulation {own.anchors[:1].tolist()}")
+        there, here = (np.atleast_1d(one.anchors)[:1].tolist() for one in (state, own))
+        raise ValueError(f"the state has anchors {there}, this simulation {here}: {advice}")
     for name, what in (("attachment_positions", "attachments (anchors, then grippers)"), ("colliders", "colliders")):
-        here, there = getattr(own, name).shape, getattr(state, name).shape
-        if len(there) == 3 and there[1] != here[1]:
-            raise ValueError(f"the state has {there[1]} {what}, this simulation {here[1]}")
+        shape, given = getattr(own, name).shape, getattr(state, name).shape
+        if len(given) == 3 and given[1] != shape[1]:
+            raise ValueError(f"the state has {given[1]} {what}, this simulation {shape[1]}: {advice}")
     if not np.array_equal(state.sheet, own.sheet):
         raise ValueError(
-            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this simulation's"
+            "the state is of a sheet of another shape or size, or of another bending model or self-collision than this "
+            f"simulation's: {advice}"
         )
-    names = [field.name for field in fields(State) if field.name not in ("self_contact", "sheet")]
-    for name in names:
-        here, there = getattr(own, name).shape, getattr(state, name).shape
-        if there != here:
-            raise ValueError(f"the state's {name} has shape {there}, this simulation's {here}: {advice}")
-    for name in names:
-        given = getattr(state, name)[~state.diverged]
-        if given.dtype.kind == "f" and not np.isfinite(given).all():
-            raise ValueError(f"the state's {name} holds a value that is not finite: {advice}")
-    if state.free_inverse_mass.min() < 0:
-        raise ValueError(f"the state's free_inverse_mass holds {state.free_inverse_mass.min():g}: {advice}")
-    low, high, count = state.holder.min(), state.holder.max(), own.attachment_positions.shape[1]
-    if low < -1 or high >= count:
-        raise ValueError(f"the state's holder names attachments from {low} to {high}, there are {count}: {advice}")
+    # every array: its kind, shape and range
+    fits("diverged", state.diverged, own.diverged, advice=advice)
+    ranges = RANGES | {"holder": (-1, own.attachment_positions.shape[1] - 1)}
+    for field in fields(State):
+        if field.name not in ("self_contact", "sheet"):
+            excused = state.diverged if field.name in MAY_DIVERGE else None
+            given, kept = getattr(state, field.name), getattr(own, field.name)
+            low, high = ranges.get(field.name, (-LARGEST, LARGEST))
+            fits(field.name, given, kept, low, high, excused, advice)
 
 
 def at_rest(

@@ -65,6 +65,7 @@ class TaskDefinition:
         feels_pulls: whether its kernels must know how the sheet pulls at the attachments.
         reset_options: what ``reset(options=...)`` takes.
         arguments: meaning of the task's own keywords, for the page, and of those that mean something else than elsewhere.
+        ranges: least and greatest value of the fields that episodes remember, for ``set_state``; of others any finite number does.
         strain_shown: where the colors of render_color="strain" end.
     """
 
@@ -83,6 +84,7 @@ class TaskDefinition:
     feels_pulls: ClassVar[bool] = False
     reset_options: ClassVar[tuple[str, ...]] = ("material",)
     arguments: ClassVar[Mapping[str, str]] = {}
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     strain_shown: ClassVar[float] = 0.05
 
     # what ``Task`` keeps, and these methods read and write
@@ -100,6 +102,9 @@ class TaskDefinition:
     def remembers(self) -> Fields:
         """Fields of ``episode`` beside those that all tasks have: what its episodes remember."""
         return ()
+
+    def check_episode(self, env: int, own: Any) -> None:
+        """Refuse a record of an episode, whose fields are within ``ranges``, that no episode can have, with a ValueError."""
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         """Draw one environment's episode into ``episode[env]``; returns the sheet's particles at the start [m], (particles, 3).

@@ -65,6 +65,7 @@ class DrapeTask(Task):
     observations = draping.observations(2, "whether each corner is held")
     points_relative_to = draping.RELATIVE_TO
     evaluation = draping.EVALUATION
+    ranges = draping.RANGES
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
 
     def colliders(self) -> list[Collider]:
@@ -75,6 +76,9 @@ class DrapeTask(Task):
 
     def remembers(self) -> Fields:
         return draping.REMEMBERS
+
+    def check_episode(self, env: int, own: Any) -> None:
+        draping.check_target(own)
 
     def constants(self) -> dict[str, Any]:
         return draping.constants(GUIDE_REACH)

@@ -101,6 +101,7 @@ class DrapeGripperTask(GripperTask):
     observations = _observations(2)
     points_relative_to = draping.RELATIVE_TO
     evaluation = draping.EVALUATION
+    ranges: ClassVar = {**draping.RANGES, "picked": (0, 1)}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
         "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
@@ -123,6 +124,9 @@ class DrapeGripperTask(GripperTask):
 
     def remembers(self) -> Fields:
         return [*draping.REMEMBERS, ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
+
+    def check_episode(self, env: int, own: Any) -> None:
+        draping.check_target(own)
 
     def constants(self) -> dict[str, Any]:
         return draping.constants(GUIDE_REACH) | {"places": self.places}

@@ -51,6 +51,7 @@ TARGET_SLOT = 1  # the target's place among ``colliders``
 REMEMBERS: Fields = [
     *[("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2), ("reference", float)],
 ]
+RANGES = {"solid": (0, len(SHAPES) - 1)}
 EVALUATION: Fields = (("coverage", float), ("coverage_reference", float), ("off_center", float), ("rms_speed", float))
 RELATIVE_TO = "the target's top"
 
@@ -106,6 +107,18 @@ def recalled(own: Any) -> Target:
     """The target in an episode's record."""
     *center, height = own["top"].tolist()
     return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
+
+
+def check_target(own: Any) -> None:
+    """Refuse a record whose target cannot be one.
+
+    Raises:
+        ValueError: what is wrong with it.
+    """
+    target = recalled(own)
+    turn = np.array([np.cos(target.yaw), np.sin(target.yaw)])
+    if np.abs(own["turn"] - turn).max() > 1e-9 or own["reference"] != reference_coverage(target, SIDE):
+        raise ValueError("the state's target has another turn or reference than its size and yaw give: give what get_state() gave")
 
 
 def episode_colliders(own: Any) -> dict[int, Collider]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import checks
+from clothgym import checks, files
 from clothgym.state import State
 
 SHARED = ("sheet", "self_contact")  # fields of a simulation's state that are not one array with the environment first
@@ -27,13 +29,74 @@ LARGEST_SEED = 2**128 - 1  # as large as what NumPy draws where none is given
 Fields = Sequence[tuple[Any, ...]]  # (name, type) or (name, type, shape)
 
 
+VERSION = 1  # of the format of files
+
+
 @dataclass
 class TaskState:
-    """All that is needed to continue a batch of episodes bit for bit: physics, episode, random generators."""
+    """All that is needed to continue a batch of episodes bit for bit.
+
+    Attributes:
+        simulation: the physics.
+        episode: what is remembered of the episodes, by name; the environment is the first axis of each.
+        generators: the random generators, one an environment, as JSON.
+        task: what it belongs to, by name: the task, what is observed, and a digest of its arguments.  The digest of the mesh is
+            ``simulation.sheet``.
+    """
 
     simulation: State
     episode: dict[str, NDArray]
     generators: list[str]
+    task: dict[str, str]
+
+    def save(self, path: str | Path) -> None:
+        """Write as ``npz`` without pickle, whole or not at all.
+
+        Raises:
+            OSError: the disk is full, or the folder cannot be written.
+        """
+        arrays = {f"simulation {name}": array for name, array in self.simulation.arrays().items()}
+        arrays |= {f"episode {name}": array for name, array in self.episode.items()}
+        arrays |= {f"task {name}": np.array(text) for name, text in self.task.items()}
+        files.write_arrays(path, "task state", VERSION, arrays | {"generators": np.array(self.generators)})
+
+    @staticmethod
+    def load(path: str | Path) -> TaskState:
+        """Read what ``save`` wrote; ``set_state`` checks that it fits.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no state of a task, is damaged, or is of another version.
+        """
+        advice = "give a file that TaskState.save wrote"
+        arrays = files.read_arrays(path, "task state", VERSION, advice)
+        with files.naming(path, "task state", advice):
+            parts: dict[str, dict[str, NDArray]] = {"simulation": {}, "episode": {}, "task": {}}
+            generators = arrays.pop("generators").tolist()
+            for name, array in arrays.items():
+                part, _, own = name.partition(" ")
+                parts[part][own] = array
+            task = {name: str(text) for name, text in parts["task"].items()}
+            return TaskState(State.of(parts["simulation"]), parts["episode"], generators, task)
+
+
+def generator_of(text: Any) -> np.random.Generator:
+    """The random generator that ``get_state`` has described in JSON.
+
+    Raises:
+        ValueError: the text describes none.
+    """
+    generator = np.random.default_rng(0)
+    try:
+        described = json.loads(text)
+        generator.bit_generator.state = described
+        described_whole = generator.bit_generator.state == described and described["state"]["inc"] % 2 == 1
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        described_whole = False
+    if not described_whole:
+        shown = repr(text) if len(repr(text)) < 100 else f"{repr(text)[:100]}..."
+        raise ValueError(f"the state's generators hold {shown}, which is no PCG64 generator: give what get_state() gave")
+    return generator
 
     def branch(self, count: int, env: int = 0) -> TaskState:
         """One environment's state, ``count`` times: ``vector_env.unwrapped.set_state(env.unwrapped.get_state().branch(8))``.
@@ -51,6 +114,7 @@ class TaskState:
             replace(self.simulation, self_contact=contact, **{name: array[chosen] for name, array in physics.items()}),
             episode={name: array[chosen] for name, array in self.episode.items()},
             generators=[self.generators[one] for one in chosen],
+            task=self.task,
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import vector
+from clothgym.checks import LARGEST, vector
 from clothgym.collisions import Collider, Sphere
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
@@ -108,6 +108,7 @@ class ReachTask(Task):
     points_relative_to = "the goal"
     evaluation = (("goal_distance", float), ("corner_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
+    ranges: ClassVar = {"distance": (NEAREST * SIDE, LARGEST)}
 
     def colliders(self) -> list[Collider]:
         return []  # the floor is out of reach

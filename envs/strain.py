@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym import integrators
 from clothgym._jit import inlined
-from clothgym.checks import not_negative, positive
+from clothgym.checks import LARGEST, not_negative, positive
 from clothgym.collisions import Capsule, Collider, Sphere
 from clothgym.envs import carriers
 from clothgym.envs.definition import Observation
@@ -52,6 +52,7 @@ PASSED, ARRIVED = 0.1, 0.15 * SIDE  # mean distance of the clips from a way-poin
 LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # room of the clips [m]
 MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
+MOST_PULL = float(np.finfo(float).max)  # [N]: of a sheet that is about to diverge any number
 FAR = 10.0  # bound of observed distances, in sides
 
 WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colors of the markers
@@ -190,6 +191,11 @@ class StrainTask(Task):
     evaluation = (("is_safe_success", bool),)
     accounts = (("cost", float), ("episode_cost", float), ("strain_excess", np.float32), ("strain_p95", float), *TENSIONS)
     prices = ("cost",)
+    ranges: ClassVar = {
+        "next": (0, WAYPOINTS - 1),
+        **dict.fromkeys(("after", "way", "episode_cost"), (0.0, LARGEST)),
+        "tension": (0.0, MOST_PULL),
+    }
     feels_pulls = True
 
     def __init__(

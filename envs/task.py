@@ -7,6 +7,7 @@ terminates.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -18,17 +19,18 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.checks import not_negative, numbers, one_of, shown
+from clothgym.checks import LARGEST, fits, not_negative, numbers, one_of, shown
 from clothgym.envs.definition import VELOCITY_BOUND, Observation, TaskDefinition
-from clothgym.envs.episode import TaskState, checked_seeds, names_of, record_of, records
+from clothgym.envs.episode import TaskState, checked_seeds, generator_of, names_of, record_of, records
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
 from clothgym.exclusive import Turn, exclusive
 from clothgym.material import Material
-from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
+from clothgym.parameters import AIR_DENSITY, PROPERTIES, check_properties, of_material
 from clothgym.simulation import Simulation
 
 REWARD_MODES = ("delta", "sparse")
+ROUNDING = 1e-6  # by which a share may leave [0, 1]
 ENVS_A_THREAD = 16  # fewer are not worth another thread
 
 
@@ -168,12 +170,21 @@ class Task(TaskDefinition):
         self.episode["over"] = True
         steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
         self.air = np.zeros((count, steps, 3))
+        # what of it there can be, and to what it belongs
+        share, bound = (-ROUNDING, 1 + ROUNDING), self._bound
+        self._ranges: dict[str, Any] = {
+            "step": (0, self.acting_steps + self.settling_steps), "settling_since": (-1, self.acting_steps), "potential": share,
+            "performance": share, "observation": (-bound, bound), **self.ranges,
+        }  # fmt: skip
         # what all environments share
         self.rules = record_of(
             low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
             side=max(physics.mesh.size), **self.constants(),
         )  # fmt: skip
+        numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
+        digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]
+        self._belongs = {"task": type(self).__name__, "observation mode": self.obs_mode, "arguments": digest}
         # what a step brings
         brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_attachments, self.actions_per_attachment)), ("free", np.uint8, self.num_attachments)]
@@ -400,6 +411,7 @@ class Task(TaskDefinition):
             simulation=self.simulation.get_state(),
             episode={name: value.copy() for name, value in self._memory().items()},
             generators=[json.dumps(g.bit_generator.state) for g in self.generators],
+            task=self._belongs.copy(),
         )
 
     def _memory(self) -> dict[str, NDArray]:
@@ -411,28 +423,44 @@ class Task(TaskDefinition):
         """Continue from a state of the same task with as many environments.
 
         Raises:
-            ValueError: the state is another task's or of another size; nothing is changed then.
+            ValueError: the state is another task's or of another size, or holds what no episode can have; nothing is changed then.
         """
-        memory = self._memory()
-        missing = {
-            name for name in {*memory, *state.episode} if np.shape(memory.get(name, ())) != np.shape(state.episode.get(name, ()))
-        }
-        if missing or len(state.generators) != self.num_envs:
-            raise ValueError(
-                f"the state is of {len(state.generators)} environments of another task, observation mode or size: "
-                f"it differs in {', '.join(sorted(missing)) or 'their number'}"
-            )
-        if np.any(state.episode["over"] & (state.episode["step"] == 0)):
-            raise ValueError("the state is from before the first reset: there is no episode to continue")
+        self._check_state(state)
+        generators = list(map(generator_of, state.generators))
         self.simulation.set_state(state.simulation)
         self.turn.begin(range(self.num_envs))
-        for name, value in memory.items():
+        for name, value in self._memory().items():
             value[...] = state.episode[name]
-        for env, text in enumerate(state.generators):
-            self.generators[env] = np.random.default_rng()
-            self.generators[env].bit_generator.state = json.loads(text)
+        self.generators[:] = generators
         self._seeded[:] = True
         self.turn.unfinished = ()
+
+    def _check_state(self, state: TaskState) -> None:
+        """Refuse a state's episodes, and what it belongs to; ``Simulation.set_state`` sees to the physics."""
+        advice = "give what get_state() gave, or TaskState.load(path)"
+        if not isinstance(state, TaskState) or not all(isinstance(part, dict) for part in (state.episode, state.task)):
+            raise ValueError(f"state={state!r:.100}: {advice}")
+        # of another task
+        for name, here in self._belongs.items():
+            if (there := state.task.get(name)) != here:
+                raise ValueError(f"the state is of another {name} than this environment's: {there!r} instead of {here!r}")
+        memory = self._memory()
+        if set(state.episode) != set(memory):
+            raise ValueError(f"the state's episodes differ in {', '.join(sorted(set(state.episode) ^ set(memory)))}: {advice}")
+        if not isinstance(state.generators, list) or len(state.generators) != self.num_envs:
+            raise ValueError(f"the state has not one generator for each of {self.num_envs} environments: {advice}")
+        # of episodes that there cannot be
+        for name in ("over", "step", *memory):
+            low, high = self._ranges.get(name, (-LARGEST, LARGEST))
+            fits(name, state.episode[name], memory[name], low, high, advice=advice)
+            if name == "step" and np.any(state.episode["over"] & (state.episode["step"] == 0)):
+                raise ValueError("the state is from before the first reset: there is no episode to continue")
+        check_properties(self.physics.material, state.episode["material"])
+        episodes = self.episode.copy()
+        for name in names_of(episodes):
+            episodes[name] = state.episode[name]
+        for env in range(self.num_envs):
+            self.check_episode(env, episodes[env])
 
 
 def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:

@@ -10,6 +10,7 @@ FLOORS = {
     "clothgym._jit": 0,
     "clothgym.checks": 0,
     "clothgym.exclusive": 0,
+    "clothgym.files": 0,
     "clothgym.progress": 0,
     "clothgym.mesh": 1,
     "clothgym.triangles": 1,

@@ -32,25 +32,6 @@ def test_a_replay_equals_the_recording_to_the_bit(make, tmp_path):
         replay.change(gravity=1.0)
 
 
-def test_solids_of_older_recordings_are_read(tmp_path):
-    """They had the sizes of all kinds, and yaw and rotation of their own."""
-    stage = SceneStage("box")
-    stage.recording.save(tmp_path / "new.npz")
-    with np.load(tmp_path / "new.npz") as file:
-        arrays = dict(file)
-    about = json.loads(str(arrays["about"]))
-    none = {"radius": None, "half_sides": None, "height": None, "vertices": None, "triangles": None}
-    older = none | {"center": [0, 0, 0], "color": [1, 2, 3], "yaw": 0.5, "rotation": [1, 0, 0, 0]}
-    solids = {"sphere": {"radius": 0.2}, "capsule": {"radius": 0.1, "height": 0.3}, "box": {"half_sides": [0.1, 0.2, 0.3]}}
-    for kind, sizes in solids.items():
-        about["shapes"] = [json.dumps(older | {"kind": kind} | sizes)]
-        np.savez(tmp_path / "old.npz", **(arrays | {"about": json.dumps(about)}))
-        ((collider, color),) = Recording.load(tmp_path / "old.npz").frames[0].solids
-        assert type(collider).__name__.lower() == kind and color == (1, 2, 3)
-        assert collider.center == pytest.approx((0, 0, 0.18)) and getattr(collider, "yaw", 0.5) == 0.5
-        assert all(getattr(collider, name) == (tuple(size) if name == "half_sides" else size) for name, size in sizes.items())
-
-
 def test_files_that_are_no_recordings_are_refused_and_nothing_is_unpickled(tmp_path):
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     np.savez(tmp_path / "pickle.npz", about=np.array([{"a": 1}], dtype=object))

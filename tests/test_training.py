@@ -1,6 +1,7 @@
 """The scripts, run as a user runs them, on a few steps: a run's folder, resuming, evaluating, and their errors."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import clothgym
+from clothgym import files
 
 ROOT = Path(__file__).parent.parent
 SHORT = """
@@ -49,6 +51,12 @@ ClothReach-v0:
 """
 
 
+CONFIG = {
+    "env": "ClothDrape-v0", "algo": "ppo", "lagrange": {}, "clone": {}, "env_kwargs": {}, "hyperparameters": {}, "num_envs": 4,
+    "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
+}  # fmt: skip
+
+
 def run(script, *arguments, cwd):
     command = [sys.executable, str(ROOT / "training" / script), *map(str, arguments)]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
@@ -67,6 +75,7 @@ def trained(tmp_path_factory):
     options = ("--hyperparams", folder / "short.yml", "--eval-episodes", 4, "--final-episodes", 6)
     done = run("train.py", "--run", folder / "run", *options, cwd=folder)
     assert done.returncode == 0, done.stderr
+    shutil.copytree(folder / "run", folder / "fresh")
     return folder, options
 
 
@@ -133,6 +142,9 @@ WRONG = {
     "evaluate --policy careless": "careless: only ClothStrain-v0 has a careless expert",
     "evaluate --policy learned --env ClothReach-v0": "'learned' was trained on ClothDrape-v0, not on ClothReach-v0",
     "evaluate --policy old": "'old' was trained with clothgym 0.0.1",
+    "evaluate --policy list": "list/config.json' is no configuration of a run (it holds list instead of an object)",
+    "evaluate --policy thin": "thin/config.json' is no configuration of a run (its algo is None, not of type str)",
+    "train --resume none": "(its num_envs is 0, not at least 1): train again",
     "evaluate --episodes 0": "--episodes 0: must be at least 1",
     "evaluate --seed -1": "--seed -1: must be zero or positive",
     "evaluate --env-kwargs []": "must be a JSON object",
@@ -147,7 +159,12 @@ def wrong(tmp_path, monkeypatch, scripts):
     for name, version in (("learned", clothgym.__version__), ("old", "0.0.1")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "checkpoint.pt").touch()
-        (tmp_path / name / "config.json").write_text(json.dumps({"env": "ClothDrape-v0", "clothgym": version, "env_kwargs": {}}))
+        files.write_json(tmp_path / name / "config.json", CONFIG | {"clothgym": version})
+    for name, config in (("list", []), ("thin", {"env": "ClothDrape-v0"}), ("none", CONFIG | {"num_envs": 0})):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "checkpoint.pt").touch()
+        text = config if isinstance(config, list) else files.checked_in({"clothgym": clothgym.__version__} | config)
+        (tmp_path / name / "config.json").write_text(json.dumps(text))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gym, "make_vec", None)
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
@@ -196,7 +213,7 @@ def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, ca
 
     saved = []
     monkeypatch.setattr(learning.policies, "save_checkpoint", lambda folder, model: saved.append(folder))
-    config = {"num_envs": 2, "clone": {}, "algo": "ppo", "timesteps": 100}
+    config = CONFIG | {"num_envs": 2}
     with pytest.raises(SystemExit) as caught, endings.stopped(lambda: ": go on"):
         learning.train(tmp_path, config, Learner(), 0, 1, 1)
     assert caught.value.code == 130 and saved == [tmp_path]
@@ -212,7 +229,105 @@ def test_a_checkpoint_is_never_unpickled(trained, tmp_path):
     (tmp_path / "evil" / "config.json").write_text((folder / "run" / "config.json").read_text())
     (tmp_path / "evil" / "checkpoint.pt").write_bytes(pickle.dumps(Path("/tmp")))
     done = run("evaluate.py", "--policy", tmp_path / "evil", "--episodes", 2, cwd=tmp_path)
-    assert done.returncode == 2 and "cannot be read as a checkpoint" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "is no checkpoint" in done.stderr and "Traceback" not in done.stderr
+
+
+# --- what is damaged ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def broken(trained, tmp_path):
+    """A copy of a finished run, to be damaged."""
+    shutil.copytree(trained[0] / "fresh", tmp_path / "run")
+    return tmp_path / "run"
+
+
+def flip(path, place=1000):
+    content = bytearray(path.read_bytes())
+    content[place] ^= 4
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    "damage", [flip, lambda path: path.write_bytes(path.read_bytes()[:2000]), Path.unlink, lambda path: flip(path, -9)]
+)
+def test_the_checkpoint_before_takes_the_place_of_a_damaged_one(broken, damage):
+    from clothgym.adapters import runs
+
+    # as a second evaluation would have left it
+    state = runs.load_tensors(broken / "checkpoint.pt")
+    runs.save_tensors(broken / "checkpoint.pt", state | {"num_timesteps": 900})
+    assert runs.load_last(broken)["num_timesteps"] == 900
+    damage(broken / "checkpoint.pt")
+    with pytest.warns(UserWarning, match="using the one before it, checkpoint_before.pt, of step 800"):
+        assert runs.load_last(broken)["num_timesteps"] == 800
+    flip(broken / "checkpoint_before.pt")
+    with pytest.raises(ValueError, match="checkpoint_before.pt' is no checkpoint .it is damaged.*: train again"):
+        runs.load_last(broken)
+
+
+def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken):
+    import torch
+
+    from clothgym.adapters import runs
+
+    state = runs.load_tensors(broken / "best.pt")
+    name = next(iter(state["policy"]))
+    nan = state["policy"] | {name: state["policy"][name] * torch.nan}
+    for other, said in (
+        ({"policy": state["policy"]}, "does not hold policy, optimizer"),
+        (state | {"policy": nan}, "no finite number"),
+        (state | {"num_timesteps": -3}, "fewer than no steps"),
+    ):
+        runs.save_tensors(broken / "best.pt", other)
+        with pytest.raises(ValueError, match=f"best.pt' is no checkpoint .*{said}"):
+            runs.learned(broken, "ClothDrape-v0")
+    config = files.read_json(broken / "config.json", "", "")
+    runs.save_tensors(broken / "best.pt", state)
+    for layers in ([16], [8, 8], [10**9]):
+        config["hyperparameters"]["policy_kwargs"]["net_arch"] = layers
+        files.write_json(broken / "config.json", config)
+        with pytest.raises(ValueError, match="config.json' is no configuration of the network in this run"):
+            runs.learned(broken, "ClothDrape-v0")
+
+
+def test_a_resumed_run_says_what_it_drops(broken, trained):
+    """A broken line and one from after the checkpoint, a damaged best policy and a damaged checkpoint."""
+    _, options = trained
+    lines = (broken / "progress.jsonl").read_text().splitlines()
+    later = json.dumps(files.checked_in(files.checked_out(json.loads(lines[0])) | {"timesteps": 5000}))
+    (broken / "progress.jsonl").write_text("\n".join([*lines, lines[0].replace("800", "900"), later, lines[0][:30]]))
+    flip(broken / "best.pt")
+    (broken / "checkpoint.pt").rename(broken / "checkpoint_before.pt")
+    resumed = run("train.py", "--resume", broken, "--timesteps", 1200, *options[2:], cwd=broken.parent)
+    assert resumed.returncode == 0, resumed.stderr
+    assert "best.pt' is no checkpoint (it is damaged" in resumed.stderr and "using the one before it" in resumed.stderr
+    assert [n for n in range(9) if f"line {n} is broken, and is dropped" in resumed.stderr] == [2, 4]
+    kept = [json.loads(line)["timesteps"] for line in (broken / "progress.jsonl").read_text().splitlines()]
+    assert kept == [800, 1200]
+    assert not [path for path in broken.rglob("*") if ".part" in path.name or ".new" in path.name]
+
+
+def test_a_run_without_a_checkpoint_begins_anew(scripts, tmp_path, monkeypatch, capsys):
+    import learning
+    import train
+
+    files.write_json(tmp_path / "config.json", CONFIG)
+    args = train.Args(resume=tmp_path)
+    monkeypatch.setattr(learning, "build", lambda folder, config, seed: "a new learner")
+    assert learning.learner(args.folder, args.config, resume=True) == ("a new learner", 0)
+    assert "has no checkpoint yet: beginning anew" in capsys.readouterr().out
+
+
+def test_a_full_disk_ends_a_script_with_one_sentence(scripts, tmp_path, capsys):
+    import endings
+
+    remedy = endings.stopped(lambda: ": go on with  --resume run")
+    with pytest.raises(SystemExit) as caught, remedy, files.replacing(tmp_path / "it"):
+        raise OSError(28, "No space left on device")
+    said = capsys.readouterr().err
+    assert caught.value.code == 1 and len(said.splitlines()) == 1
+    assert said.startswith("error: ") and "is whole" in said and said.endswith(": go on with  --resume run\n")
 
 
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
@@ -261,7 +376,7 @@ def test_the_multiplier_follows_the_excess_of_the_cost_and_is_never_below_zero(s
         rollout(callback, costs)
         seen.append(callback.multiplier)
         assert env.env.cost_penalty == seen[-1] == callback.multiplier
-        assert json.loads((tmp_path / "multiplier.json").read_text()) == {"multiplier": seen[-1]}
+        assert files.read_json(tmp_path / "multiplier.json", "multiplier", "") == {"multiplier": seen[-1]}
     assert seen == pytest.approx([0.2, 0.2, 0.1, 0.05, 0.0, 1.0, 1.5, 1.5, 1.3])
     # another one in the same folder goes on with it, and so do its environments from the first step on
     other = make_sb3_vec_env("ClothStrain-v0", 3)
@@ -285,7 +400,7 @@ def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
     scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert scores["references"]["careless"]["cost"] > 3 > scores["references"]["expert"]["cost"]
     assert json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[-1])["cost"] >= 0
-    path.write_text(json.dumps({"multiplier": 3.0}))
+    files.write_json(path, {"multiplier": 3.0})
     resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 2400, *options[2:6], cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
     assert json.loads(path.read_text())["multiplier"] == pytest.approx(3.0 + 0.01 * 10)

@@ -19,9 +19,12 @@ def refused() -> Iterator[None]:
 
 @contextmanager
 def stopped(remedy: Callable[[], str] = lambda: "") -> Iterator[None]:
-    """Ctrl+C: a word, what to do next, and the status that shells have for it."""
+    """Ctrl+C: a word, what to do next, and the status that shells have for it.  A full disk: a sentence, and what to do next."""
     try:
         yield
     except KeyboardInterrupt:
         print(f"\nstopped{remedy()}", file=sys.stderr)
         raise SystemExit(130) from None
+    except OSError as error:
+        print(f"error: {error}{remedy()}", file=sys.stderr)
+        raise SystemExit(1) from None

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +21,7 @@ from endings import refused, stopped
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from clothgym import files
 from clothgym.registration import checked_id
 
 HELD_OUT = 1_000_000
@@ -147,11 +147,9 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write through a scratch file, so that a crash leaves no half of one."""
+    """Write a file, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_suffix(".json.new")
-    scratch.write_text(json.dumps(content, indent=1, default=float) + "\n")
-    os.replace(scratch, path)
+    files.write(path, json.dumps(content, indent=1, default=float) + "\n")
 
 
 def main(args: Args) -> None:

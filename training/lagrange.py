@@ -8,14 +8,28 @@ environment's own ``cost_penalty``.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from clothgym import files
+from clothgym.checks import not_negative
+
 FILE = "multiplier.json"
 CLIP = 10.0  # an untrained policy breaks the constraint all the time: its excess must not freeze it before it has learned to move
+
+
+def known_multiplier(path: Path) -> float:
+    """The multiplier that a run has come to.
+
+    Raises:
+        ValueError: the file is damaged.
+    """
+    advice = "remove it to begin with the price that the configuration names"
+    content = files.read_json(path, "multiplier", advice)
+    with files.naming(path, "multiplier", advice):
+        return not_negative("multiplier", content.get("multiplier"))
 
 
 class LagrangeMultiplier(BaseCallback):
@@ -33,7 +47,7 @@ class LagrangeMultiplier(BaseCallback):
         super().__init__()
         self.path = folder / FILE
         self.cost_limit, self.rate, self.most = cost_limit, rate, most
-        self.multiplier = float(json.loads(self.path.read_text())["multiplier"]) if self.path.exists() else start
+        self.multiplier = known_multiplier(self.path) if self.path.exists() else start
         self.costs: list[float] = []
 
     def _on_training_start(self) -> None:
@@ -50,5 +64,5 @@ class LagrangeMultiplier(BaseCallback):
             self.training_env.set_attr("cost_penalty", self.multiplier)
             self.logger.record("lagrange/episode_cost", mean)
             self.logger.record("lagrange/multiplier", self.multiplier)
-            self.path.write_text(json.dumps({"multiplier": self.multiplier}) + "\n")
+            files.write_json(self.path, {"multiplier": self.multiplier})
         self.costs = []

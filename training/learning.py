@@ -10,29 +10,41 @@ from pathlib import Path
 from typing import Any
 
 import evaluate
+import lagrange
 import numpy as np
 import policies
 import torch
 from clone import clone, demonstrations
+from endings import refused
 from lagrange import LagrangeMultiplier
 from report import draw_learning_curve, film
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecMonitor
 
-from clothgym.adapters.runs import load_tensors
+from clothgym import files
+from clothgym.adapters.runs import load_last, load_tensors
 from clothgym.adapters.sb3 import make_sb3_vec_env
+from clothgym.checks import number as finite_number
+
+PROGRESS, MODEL = "progress.jsonl", "model.zip"
+SCORES = ("timesteps", "training_seconds", "success_rate", "normalized_performance", "return")  # in each of its lines
 
 
 class HeldOutEvaluation(BaseCallback):
-    """Every so many rollouts: score the policy on held-out seeds, append a line to progress.jsonl, save a checkpoint."""
+    """Every so many rollouts: score the policy on held-out seeds, add a line to progress.jsonl, save a checkpoint.
 
-    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int) -> None:
+    done: environment steps of the checkpoint that it goes on from; evaluations after it are dropped.
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int, done: int) -> None:
         super().__init__()
         self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
         self.rollouts = 0
-        self.best = max((_rank(line, config) for line in _lines(folder)), default=-math.inf)
-        self.trained_before = float(_lines(folder)[-1]["training_seconds"]) if _lines(folder) else 0.0
+        self.lines = [line for line in read_progress(folder) if line["timesteps"] <= done]
+        ranks = [_rank(line, config) for line in self.lines] if (folder / policies.BEST).exists() else []
+        self.best = max(ranks, default=-math.inf)
+        self.trained_before = self.lines[-1]["training_seconds"] if self.lines else 0.0
         self.evaluating = 0.0
         self.started = time.perf_counter()
 
@@ -80,8 +92,8 @@ class HeldOutEvaluation(BaseCallback):
         if _rank(line, self.config) >= self.best:
             self.best = _rank(line, self.config)
             policies.save_checkpoint(self.folder, self.model, policies.BEST)
-        with open(self.folder / "progress.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
+        self.lines.append(line)
+        files.write(self.folder / PROGRESS, "".join(json.dumps(files.checked_in(one)) + "\n" for one in self.lines))
         for key in line.keys() - {"timesteps", "training_seconds"}:
             self.logger.record(f"held_out/{key}", line[key])
         self.evaluating += time.perf_counter() - begun
@@ -121,34 +133,64 @@ def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
     return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
 
 
-def _lines(folder: Path) -> list[dict[str, float]]:
-    path = folder / "progress.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+def read_progress(folder: Path) -> list[dict[str, float]]:
+    """The held-out evaluations of a run; a line that is broken is dropped with a word."""
+    path, lines = folder / PROGRESS, []
+    if not path.exists():
+        return []
+    with files.naming(path, "list of evaluations", "remove it to go on without"):
+        texts = files.read(path, files.LARGEST_JSON).decode(errors="replace").splitlines()
+    for number, text in enumerate(texts, 1):
+        try:
+            line = files.checked_out(json.loads(text))
+            lines.append({name: finite_number(name, line[name]) for name in (*SCORES, *(set(line) - set(SCORES)))})
+        except (ValueError, KeyError, RecursionError):
+            print(f"{path}: line {number} is broken, and is dropped", file=sys.stderr)
+    return lines
 
 
 def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, int]:
     """The learner of a new run, or of one that goes on, and the environment steps that it has done.
 
     Raises:
-        ValueError, TypeError: the environment or the learner does not take one of its options, or the checkpoint is invalid.
+        ValueError, TypeError: the environment or the learner does not take one of its options, or no checkpoint can be read.
     """
-    done = int(load_tensors(folder)["num_timesteps"]) if resume else 0
+    state = load_last(folder) if resume and policies.has_checkpoint(folder) else None
+    done = int(state["num_timesteps"]) if state is not None else 0
     model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
-    if resume:
-        policies.load_checkpoint(folder, model)
+    if state is not None:
+        policies.load_checkpoint(folder, model, state)
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
+        drop_damaged_best(folder)
+    elif resume:
+        print(f"{folder} has no checkpoint yet: beginning anew")
     return model, done
+
+
+def drop_damaged_best(folder: Path) -> None:
+    """Remove a best policy that cannot be read, with a word: the next evaluation is the best then."""
+    best = folder / policies.BEST
+    try:
+        load_tensors(best)
+    except FileNotFoundError:
+        return
+    except ValueError as error:
+        best.unlink()
+        print(f"{error}; it is removed, and the best from now on takes its place", file=sys.stderr)
 
 
 def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_episodes: int, final_episodes: int) -> None:
     """Learn, with held-out evaluations on the way, and score what was learned."""
     per_rollout = config["num_envs"] * model.n_steps
-    watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), eval_episodes)
+    if done == 0:
+        (folder / lagrange.FILE).unlink(missing_ok=True)  # of a run that was interrupted before its first checkpoint
+    with refused():
+        watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), eval_episodes, done)
+        callbacks: list[BaseCallback] = [watch]
+        if config["algo"] == "ppo_lagrange":
+            callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
     if config["clone"] and done == 0:
         watch.trained_before += learn_from_expert(model, config)
-    callbacks: list[BaseCallback] = [watch]
-    if config["algo"] == "ppo_lagrange":
-        callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
     seconds = watch.trained_before
     if config["timesteps"] > done:
         try:
@@ -161,8 +203,10 @@ def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_epis
             raise
         seconds = watch.training_seconds
         watch.evaluate()
-        model.save(folder / "model.zip")
-    finish(folder, config, seconds, final_episodes)
+    if config["timesteps"] > done or not (folder / MODEL).exists():
+        with files.replacing(folder / MODEL) as part:
+            model.save(part)
+    finish(folder, config, watch.lines, seconds, final_episodes)
 
 
 def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
@@ -176,7 +220,7 @@ def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
     return time.perf_counter() - begun
 
 
-def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) -> None:
+def finish(folder: Path, config: dict[str, Any], lines: list[dict[str, float]], seconds: float, episodes: int) -> None:
     """Final score beside the references, learning curve and film."""
     scores = {}
     names = ["noop", "random", "expert", str(folder)]
@@ -189,6 +233,6 @@ def finish(folder: Path, config: dict[str, Any], seconds: float, episodes: int) 
     print(f"{config['env']}, {episodes} held-out episodes\n{evaluate.table(scores)}")
     learned = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
     evaluate.write_json(folder / "evaluation.json", learned | {"timesteps": config["timesteps"], "references": scores})
-    draw_learning_curve(folder, _lines(folder), {name: scores[name]["success_rate"] for name in ("noop", "expert")})
+    draw_learning_curve(folder, lines, {name: scores[name]["success_rate"] for name in ("noop", "expert")})
     film(folder / "policy.gif", config["env"], policies.learned(folder, config["env"]), config["env_kwargs"])
     print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")

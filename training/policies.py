@@ -7,20 +7,20 @@ and is read with ``weights_only=True``.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, learned, load_tensors, read_config
+from clothgym import files
+from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, has_checkpoint, learned, read_config, save_tensors
 from clothgym.registration import ACTORS, actor_named
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
-__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "learned", "read_config"]
+__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "has_checkpoint", "learned", "read_config"]
 
 
 def noop(env: Any, observations: NDArray) -> NDArray:
@@ -93,24 +93,24 @@ def parsed_kwargs(text: str) -> dict[str, Any]:
 
 
 def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
-    """Write the learner's tensors; a crash in the middle leaves the previous checkpoint whole."""
-    import torch
-
+    """Write the learner's tensors; the checkpoint before is kept, whatever happens."""
     state = {
         "policy": model.policy.state_dict(),
         "optimizer": model.policy.optimizer.state_dict(),
         "num_timesteps": model.num_timesteps,
         "num_updates": model._n_updates,
     }
-    scratch = folder / f"{name}.new"
-    torch.save(state, scratch)
-    os.replace(scratch, folder / name)
+    save_tensors(folder / name, state)
 
 
-def load_checkpoint(folder: Path, model: PPO) -> None:
-    """Put a run's tensors and counters into a learner built from its configuration."""
-    state = load_tensors(folder)
-    model.policy.load_state_dict(state["policy"])
-    model.policy.optimizer.load_state_dict(state["optimizer"])
+def load_checkpoint(folder: Path, model: PPO, state: dict[str, Any]) -> None:
+    """Put a run's tensors and counters into a learner built from its configuration.
+
+    Raises:
+        ValueError: they are of another network than its configuration describes.
+    """
+    with files.naming(folder, "run whose checkpoint is of the network in its configuration", "train again"):
+        model.policy.load_state_dict(state["policy"])
+        model.policy.optimizer.load_state_dict(state["optimizer"])
     model.num_timesteps = int(state["num_timesteps"])
     model._n_updates = int(state["num_updates"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import matplotlib
 import numpy as np
 import policies
 
+from clothgym import files
 from clothgym.render import write_video
 
 matplotlib.use("Agg")
@@ -22,7 +24,7 @@ INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
 def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references: dict[str, float]) -> None:
     """Held-out success and performance over training time, with the references as level lines; below it the cost, if any."""
     minutes = [line["training_seconds"] / 60 for line in lines]
-    costly = "cost" in lines[0]
+    costly = all("cost" in line for line in lines) and bool(lines)
     figure, panels = plt.subplots(
         1 + costly, 1, figsize=(6.4, 5.4 if costly else 3.8), layout="constrained", sharex=True, squeeze=False
     )
@@ -40,8 +42,10 @@ def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references:
     panels[-1, 0].set(xlabel="training time [minutes]")
     for panel in panels[:, 0]:
         panel.spines[["top", "right"]].set_visible(False)
-    figure.savefig(folder / "learning_curve.png", dpi=150)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=150)
     plt.close(figure)
+    files.write(folder / "learning_curve.png", picture.getvalue())
 
 
 def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, stride: int = 1) -> None:

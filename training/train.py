@@ -6,10 +6,10 @@
     python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored again
 
-The folder holds: config.json, checkpoint.pt (the last) and best.pt (by held-out success), which hold tensors only, model.zip
-(Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), evaluation.json (the final
-score, of best.pt), learning_curve.png, policy.gif, and the TensorBoard log.  Hyperparameters are read from
-hyperparams/ALGO.yml, in the format of rl_zoo3.
+The folder holds: config.json, checkpoint.pt (the last), checkpoint_before.pt and best.pt (by held-out success), which hold tensors
+only, model.zip (Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line),
+evaluation.json (the final score, of best.pt), learning_curve.png, policy.gif, and the TensorBoard log.  Hyperparameters are read
+from hyperparams/ALGO.yml, in the format of rl_zoo3.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import evaluate
 import numpy as np
 import policies
 import tyro
@@ -27,6 +26,7 @@ import yaml
 from endings import refused, stopped
 
 import clothgym
+from clothgym import files
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
@@ -77,7 +77,7 @@ class Args:
 
     def resumed_run(self, folder: Path) -> tuple[Path, dict[str, Any]]:
         """Folder and configuration of the run to go on with."""
-        config = policies.read_config(folder)
+        config = policies.read_config(folder, begun=False)
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
         if self.timesteps is not None:
@@ -114,7 +114,7 @@ class Args:
         bare = self.env.rpartition(":")[2]
         name = bare if self.algo == "ppo" else f"{bare}_{self.algo}"
         folder = self.run or Path("runs") / f"{name}_{self.seed}"
-        if (folder / policies.CHECKPOINT).exists():
+        if policies.has_checkpoint(folder):
             raise ValueError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
         return folder, config
 
@@ -127,7 +127,7 @@ def main(args: Args) -> None:
         model, done = learner(folder, config, args.resume is not None)
     if args.resume is None:
         folder.mkdir(parents=True, exist_ok=True)
-        evaluate.write_json(folder / policies.CONFIG, config)
+        files.write_json(folder / policies.CONFIG, config)
     train(folder, config, model, done, args.eval_episodes, args.final_episodes)
 
 
@@ -136,7 +136,7 @@ if __name__ == "__main__":
     given = tyro.cli(Args)
 
     def remedy() -> str:
-        left = (given.folder / policies.CHECKPOINT).exists()
+        left = (given.folder / policies.CONFIG).exists()
         return f": go on with  python training/train.py --resume {given.folder}" if left else ""
 
     with stopped(remedy):

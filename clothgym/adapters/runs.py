@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+import io
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,70 +12,159 @@ import gymnasium as gym
 from numpy.typing import NDArray
 
 import clothgym
+from clothgym import files
+from clothgym.registration import checked_id
 
-CHECKPOINT, BEST, CONFIG = "checkpoint.pt", "best.pt", "config.json"
+# the last checkpoint and the one before it, the best, and what they were trained with
+CHECKPOINT, BEFORE, BEST, CONFIG = "checkpoint.pt", "checkpoint_before.pt", "best.pt", "config.json"
+VERSION = 1  # of the format of checkpoints
+ADVICE = "train again, or take another run"
+FIELDS = {
+    "env": str, "algo": str, "lagrange": dict, "clone": dict, "env_kwargs": dict, "hyperparameters": dict, "num_envs": int,
+    "timesteps": int, "seed": int, "threads": int,
+}  # fmt: skip
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observations) -> actions
 
 
-def read_config(folder: Path, env_id: str | None = None) -> dict[str, Any]:
-    """How a run's learner is built.
+# --- configurations -----------------------------------------------------------------------------------------------------------
+
+
+def read_config(folder: Path, env_id: str | None = None, begun: bool = True) -> dict[str, Any]:
+    """How a run's learner is built; begun: whether there must be a checkpoint.
 
     Raises:
         FileNotFoundError: the folder holds no run.
-        ValueError: it was trained with another version, or on another environment than this.
+        ValueError: it was trained with another version, or on another environment than this, or its configuration is damaged.
     """
-    folder = folder.parent if folder.name == CHECKPOINT else folder
-    if not (folder / CONFIG).is_file() or not (folder / CHECKPOINT).is_file():
+    folder = _folder(folder)
+    if not (folder / CONFIG).is_file() or (begun and not has_checkpoint(folder)):
         raise FileNotFoundError(
             f"{str(folder)!r} is not the folder of a training run, it lacks {CONFIG} or {CHECKPOINT}: "
             "train one with  python training/train.py --env ClothDrape-v0"
         )
-    config = json.loads((folder / CONFIG).read_text())
+    config = files.read_json(folder / CONFIG, "configuration of a run", ADVICE)
     if config.get("clothgym") != clothgym.__version__:
         raise ValueError(
             f"{str(folder)!r} was trained with clothgym {config.get('clothgym')}, this is {clothgym.__version__}: "
             "its scores would not be comparable; train again, or install that version"
         )
+    with files.naming(folder / CONFIG, "configuration of a run", ADVICE):
+        for name, kind in FIELDS.items():
+            if type(config.get(name)) is not kind:
+                raise ValueError(f"its {name} is {config.get(name)!r:.60}, not of type {kind.__name__}")
+        for name in ("num_envs", "timesteps", "threads"):
+            if config[name] < 1:
+                raise ValueError(f"its {name} is {config[name]}, not at least 1")
+        checked_id(config["env"])
     if env_id not in (None, config["env"]):
         raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
-    # runs from before there was a choice of learners were PPO's
-    return {"algo": "ppo", "lagrange": {}, "clone": {}} | config
+    return config
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Whether a run has a checkpoint to go on from."""
+    return any((folder / name).is_file() for name in (CHECKPOINT, BEFORE))
+
+
+def _folder(path: Path) -> Path:
+    """A run's folder, or that of its checkpoint."""
+    return path.parent if path.name == CHECKPOINT else path
+
+
+# --- checkpoints --------------------------------------------------------------------------------------------------------------
+
+
+def save_tensors(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint, whole or not at all; the last one is kept as BEFORE.
+
+    Raises:
+        OSError: the disk is full, or the folder cannot be written.
+    """
+    import torch
+
+    archive = io.BytesIO()
+    torch.save(state, archive)
+    with files.replacing(path, path.with_name(BEFORE) if path.name == CHECKPOINT else None) as part:
+        part.write_bytes(files.marked(archive.getvalue(), "checkpoint", VERSION))
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """What ``save_tensors`` wrote: finite tensors and numbers only.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file cannot be read as that.
+    """
+    import torch
+
+    with files.naming(path, "checkpoint", ADVICE):
+        content = files.unmarked(files.read(path), "checkpoint", VERSION)
+        files.opened(content).close()
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+        kinds = {"policy": dict, "optimizer": dict, "num_timesteps": int, "num_updates": int}
+        if not isinstance(state, dict) or any(not isinstance(state.get(name), kind) for name, kind in kinds.items()):
+            raise ValueError(f"it does not hold {', '.join(kinds)}")
+        if min(state["num_timesteps"], state["num_updates"]) < 0:
+            raise ValueError("it counts fewer than no steps")
+        if not all(isinstance(value, torch.Tensor) and torch.isfinite(value).all() for value in state["policy"].values()):
+            raise ValueError("its policy holds what is no finite number")
+        return state
+
+
+def load_last(folder: Path) -> dict[str, Any]:
+    """The last checkpoint of a run, or the one before if that is damaged, with a warning.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: none can be read.
+    """
+    folder = _folder(folder)
+    try:
+        return load_tensors(folder / CHECKPOINT)
+    except (ValueError, FileNotFoundError) as error:
+        if not (folder / BEFORE).is_file():
+            raise
+        state = load_tensors(folder / BEFORE)
+        warnings.warn(f"{error}; using the one before it, {BEFORE}, of step {state['num_timesteps']:,}", stacklevel=2)
+        return state
+
+
+# --- policies -----------------------------------------------------------------------------------------------------------------
 
 
 def learned(folder: Path, env_id: str) -> Policy:
     """The deterministic policy of a run: the best of its held-out evaluations, or the last while there is none.
 
     Raises:
-        FileNotFoundError, ValueError: no run, or one of another version or environment.
+        FileNotFoundError, ValueError: no run, or one that is damaged, of another version or environment.
         ImportError: Stable-Baselines3 is missing; the message says how to get it.
     """
+    folder = _folder(folder)
     config = read_config(folder, env_id)
     try:
         from stable_baselines3.common.policies import ActorCriticPolicy
     except ImportError as error:
         raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
-    env = gym.make_vec(env_id, num_envs=1, **config["env_kwargs"])
-    policy = ActorCriticPolicy(
-        env.single_observation_space, env.single_action_space, lambda _: 0.0, **config["hyperparameters"].get("policy_kwargs", {})
-    )
-    env.close()
     best = folder / BEST
-    policy.load_state_dict(load_tensors(folder, BEST if best.exists() else CHECKPOINT)["policy"])
+    tensors = load_tensors(best)["policy"] if best.exists() else load_last(folder)["policy"]
+    kwargs = config["hyperparameters"].get("policy_kwargs", {})
+    env = gym.make_vec(env_id, num_envs=1, **config["env_kwargs"])
+    with files.naming(folder / CONFIG, "configuration of the network in this run", ADVICE):
+        # no layer is wider than the tensors are, before it is made
+        widths = list(_numbers(kwargs))
+        if len(widths) > 100 or max(widths, default=0) > max(max(tensor.shape, default=1) for tensor in tensors.values()):
+            raise ValueError("policy_kwargs describe a larger one than the checkpoint holds")
+        policy = ActorCriticPolicy(env.single_observation_space, env.single_action_space, lambda _: 0.0, **kwargs)
+        policy.load_state_dict(tensors)
+    env.close()
     policy.set_training_mode(False)
     return lambda env, observations: policy.predict(observations, deterministic=True)[0]
 
 
-def load_tensors(folder: Path, name: str = CHECKPOINT) -> dict[str, Any]:
-    """What a run has saved: tensors and numbers only.
-
-    Raises:
-        ValueError: the file cannot be read as that.
-    """
-    import torch
-
-    folder = folder.parent if folder.name == CHECKPOINT else folder
-    path = folder / name
-    try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        raise ValueError(f"{str(path)!r} cannot be read as a checkpoint ({error}): train again") from error
+def _numbers(value: Any) -> Iterator[float]:
+    """All numbers in JSON."""
+    if isinstance(value, (list, dict)):
+        for one in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(one)
+    elif isinstance(value, (int, float)):
+        yield value

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import progress
+from clothgym import files, progress
 from clothgym.guards import BURST
 from clothgym.lab import compare_pictures
 from clothgym.lab.bench import machine
@@ -27,6 +27,7 @@ from clothgym.lab.compare_plan import plan as plan
 from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 from clothgym.simulation import Simulation
 
+VERSION = 1  # of the format of files
 VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; fewer, but so many, once they have taken so long [s]
 
 
@@ -131,27 +132,26 @@ class Record:
         self.sheets: dict[str, NDArray] = {}
         if fresh or not (self.path.exists() and self.sheets_path.exists()):
             return
-        earlier = json.loads(self.path.read_text())
+        try:
+            earlier = files.read_json(self.path, "comparison", "it is measured again")
+            sheets = files.read_arrays(self.sheets_path, "comparison", VERSION, "it is measured again")
+        except ValueError as error:
+            print(error, file=sys.stderr)
+            return
         # rows of another machine, version or scene cannot be compared
         here = [(r["scene"], {k: v for k, v in r["machine"].items() if k != "date"}) for r in (earlier, self.results)]
         if here[0] != here[1]:
             print(f"{self.path} is of another scene, version or machine: measuring again", file=sys.stderr)
             return
-        self.results = earlier
-        with np.load(self.sheets_path, allow_pickle=False) as file:
-            self.sheets = dict(file)
+        self.results, self.sheets = earlier, sheets
 
     def find(self, setting: Setting) -> Row | None:
         return next((row for row in self.results["rows"] if setting.matches(row)), None)
 
     def write(self) -> None:
         """Write sheets first, so that each row that is there has its sheet."""
-        part = self.sheets_path.with_name("part.npz")
-        np.savez(part, **self.sheets)  # type: ignore[arg-type]
-        part.replace(self.sheets_path)
-        part = self.path.with_suffix(".part")
-        part.write_text(json.dumps(self.results, indent=1) + "\n")
-        part.replace(self.path)
+        files.write_arrays(self.sheets_path, "comparison", VERSION, self.sheets)
+        files.write_json(self.path, self.results)
 
 
 def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
@@ -183,7 +183,7 @@ def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
         record.write()
     progress.clear()
     results = record.results | {"rows": rows}
-    (folder / "table.txt").write_text(table(results) + "\n")
+    files.write(folder / "table.txt", table(results) + "\n")
     compare_pictures.draw_work_precision(results, folder / "work_precision.png")
     pictured = [(setting, record.find(setting) or {}, record.sheets.get(sheet_name(setting))) for setting in shown]
     compare_pictures.draw_sheets(scene, record.sheets["reference"], pictured, folder / "sheets.png")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -12,17 +11,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import positive
+from clothgym import files
+from clothgym.checks import finite, members, positive
 from clothgym.collisions import MeshCollider
 from clothgym.material import spring_stiffness
-from clothgym.mesh import SHEAR, ClothMesh, Hinges, Springs, frozen
+from clothgym.mesh import NUM_KINDS, SHEAR, ClothMesh, Hinges, Springs, frozen
 from clothgym.parameters import PROPERTIES
 from clothgym.render import Camera, Drawn
-from clothgym.render.solids import KINDS
+from clothgym.render.solids import KINDS, check_color
 from clothgym.simulation import Simulation
 
 TOUCHING = 1e-3  # distance from where it would rest within which a particle touches a solid [m]
-MESH = ("rest_positions", "triangles", "area")
+VERSION = 1  # of the format of files
+MOST_SOLIDS, MOST_TEXT, FINEST = 10_000, 2**24, 128  # shapes of solids in a file, characters and cells of one
+# arrays of a file: the kind of their numbers, and their shape by the sizes of the recording
+ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "time": ("f", ("frames",)),
+    "positions": ("f", ("frames", "sheets", "particles", 3)),
+    "stiffness": ("f", ("frames", "sheets", NUM_KINDS)),
+    "touching": ("b", ("frames", "sheets", "particles")),
+    "solids": ("f", ("rows", 5)),
+    "mesh: rest_positions": ("f", ("particles", 3)),
+    "mesh: triangles": ("i", ("triangles", 3)),
+    "mesh: area": ("f", ("particles",)),
+    "springs: particles": ("i", ("springs", 2)),
+    "springs: rest_length": ("f", ("springs",)),
+    "springs: kind": ("i", ("springs",)),
+    "springs: weight": ("f", ("springs",)),
+    "hinges: particles": ("i", ("hinges", 4)),
+    "hinges: weight": ("f", ("hinges",)),
+    "hinges: rest_angle": ("f", ("hinges",)),
+    "hinges: slopes": ("f", ("hinges", 4)),
+}
+MESH = tuple(name.removeprefix("mesh: ") for name in ARRAYS if name.startswith("mesh: "))
 
 
 @dataclass(frozen=True)
@@ -124,10 +145,11 @@ class Recording:
     frames: list[Frame] = field(default_factory=list)
 
     def save(self, path: str | Path) -> None:
-        """Write as ``npz`` without pickle.
+        """Write as ``npz`` without pickle, whole or not at all.
 
         Raises:
             ValueError: there are no frames.
+            OSError: the disk is full, or the folder cannot be written.
         """
         if not self.frames:
             raise ValueError(f"{str(path)!r}: there are no frames to save yet")
@@ -139,7 +161,7 @@ class Recording:
             for solid in frame.solids
         ]
         arrays: dict[str, Any] = {
-            "time": [frame.time for frame in frames],
+            "time": np.array([frame.time for frame in frames], np.float64),
             "positions": [frame.positions for frame in frames],
             "stiffness": [frame.stiffness for frame in frames],
             "touching": [frame.touching for frame in frames],
@@ -156,7 +178,7 @@ class Recording:
         mesh = {f"mesh: {name}": getattr(self.mesh, name) for name in MESH}
         mesh |= {f"springs: {name}": value for name, value in self.mesh.springs._asdict().items()}
         mesh |= {f"hinges: {name}": value for name, value in self.mesh.hinges._asdict().items()}
-        np.savez_compressed(path, about=json.dumps(about), **arrays, **mesh)
+        files.write_arrays(path, "recording", VERSION, {"about": np.array(json.dumps(about)), **arrays, **mesh}, compressed=True)
 
     @staticmethod
     def load(path: str | Path) -> Recording:
@@ -164,15 +186,12 @@ class Recording:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: the file is not a recording, or a broken one.
+            ValueError: the file is not a recording, is damaged, or is of another version.
         """
-        try:
-            if not zipfile.is_zipfile(path) and Path(path).stat():  # a missing file raises here
-                raise ValueError("not an npz file")
-            with np.load(path, allow_pickle=False) as file:
-                return _from_arrays(dict(file))
-        except (KeyError, AttributeError, TypeError, IndexError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise ValueError(f"{str(path)!r} is no recording ({error}): give a file that the playground saved") from error
+        advice = "give a file that the playground saved"
+        arrays = files.read_arrays(path, "recording", VERSION, advice)
+        with files.naming(path, "recording", advice):
+            return _from_arrays(arrays)
 
 
 def _column(values: list[Any]) -> NDArray[np.float64]:
@@ -185,27 +204,26 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
     def fields_of(kind: str) -> dict[str, NDArray]:
         return {key.removeprefix(f"{kind}: "): value for key, value in arrays.items() if key.startswith(f"{kind}: ")}
 
-    about = json.loads(str(arrays["about"]))
+    about = json.loads(str(arrays.pop("about")))
+    members("labels", about["labels"], str, "names of the sheets")
+    _check_arrays(arrays, len(about["labels"]))
     sheet = {name: frozen(value) for name, value in fields_of("mesh").items()}
     mesh = ClothMesh(
-        size=tuple(about["size"]),
+        size=tuple(positive("size", side) for side in about["size"]),  # type: ignore[arg-type]
         springs=Springs(**{name: frozen(value) for name, value in fields_of("springs").items()}),
         hinges=Hinges(**{name: frozen(value) for name, value in fields_of("hinges").items()}),
         shape=tuple(about["grid"]) if about["grid"] else None,
         **sheet,
     )
+    if mesh.shape is not None and (len(mesh.shape) != 2 or min(mesh.shape) < 2 or np.prod(mesh.shape) != mesh.num_particles):
+        raise ValueError(f"a grid of {mesh.shape} has not {mesh.num_particles} particles")
+    if len(about["shapes"]) > MOST_SOLIDS:
+        raise ValueError(f"it has {len(about['shapes']):,} shapes of solids, at most {MOST_SOLIDS:,} are read")
     positions, count = arrays["positions"], len(arrays["time"])
-    if positions.ndim != 4 or positions.shape[::2] != (count, mesh.num_particles) or positions.shape[3] != 3 or not count:
-        raise ValueError(f"positions have shape {positions.shape}, not ({count}, sheets, {mesh.num_particles}, 3)")
-    for name, members in (("triangles", mesh.triangles), ("springs", mesh.springs.particles)):
-        if members.size and (members.min() < 0 or members.max() >= mesh.num_particles):
-            raise ValueError(f"{name} name particles that there are not")
-    if len(about["labels"]) != positions.shape[1]:
-        raise ValueError(f"it has {positions.shape[1]} sheets and names for {len(about['labels'])}")
     shapes = [_from_text(text) for text in about["shapes"]]
     solids: list[list[Drawn]] = [[] for _ in range(count)]
     for number, shape, *center in arrays["solids"].tolist():
-        solids[int(number)].append(shapes[int(shape)].at(center))
+        solids[_place(number, count)].append(shapes[_place(shape, len(shapes))].at(center))
     readings, terms = fields_of("readings"), fields_of("terms")
     frames = [
         Frame(
@@ -219,10 +237,48 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
         )
         for k in range(count)
     ]
-    camera = Camera(**about["camera"])
-    return Recording(
-        str(about["title"]), mesh, positive("time_step", about["time_step"]), camera, about["labels"], about["strained"], frames
-    )
+    time_step, strained = (positive(name, about[name]) for name in ("time_step", "strained"))
+    return Recording(str(about["title"]), mesh, time_step, Camera(**about["camera"]), about["labels"], strained, frames)
+
+
+def _check_arrays(arrays: Mapping[str, NDArray], sheets: int) -> None:
+    """Refuse arrays that do not fit together, or that hold what no recording can.
+
+    Raises:
+        ValueError: the array, and what is wrong with it.
+    """
+    sizes: dict[str | int, int] = {"sheets": sheets}
+    if lacking := sorted(set(ARRAYS) - set(arrays)):
+        raise ValueError(f"it lacks {', '.join(lacking)}")
+    for name, (kind, shape) in ARRAYS.items():
+        array = arrays[name]
+        for axis, length in zip(shape, array.shape):
+            sizes.setdefault(axis, axis if isinstance(axis, int) else length)
+        if array.dtype.kind != kind or array.shape != tuple(sizes.get(axis, -1) for axis in shape):
+            raise ValueError(f"{name} have shape {array.shape} and kind {array.dtype}, not {shape}")
+        if kind == "f":
+            finite(name, array)
+    if min(sizes["frames"], sizes["sheets"]) == 0:
+        raise ValueError("it has no frames")
+    # what is named is there
+    for name, end in (("mesh: triangles", "particles"), ("springs: particles", "particles"), ("hinges: particles", "particles")):
+        if arrays[name].size and (arrays[name].min() < 0 or arrays[name].max() >= sizes[end]):
+            raise ValueError(f"{name} name particles that there are not")
+    kinds, lengths = arrays["springs: kind"], arrays["springs: rest_length"]
+    if np.any((kinds < 0) | (kinds >= NUM_KINDS)) or np.any(lengths <= 0):
+        raise ValueError("springs have a kind that there is not, or no length")
+    # readings of every frame; nan where there were none, and anything where a sheet has burst
+    for name in sorted(set(arrays) - set(ARRAYS)):
+        each = {"readings": (sizes["frames"], sizes["sheets"]), "terms": (sizes["frames"],)}
+        if arrays[name].shape != each.get(name.partition(": ")[0]) or arrays[name].dtype.kind != "f":
+            raise ValueError(f"{name} is no reading of its frames")
+
+
+def _place(value: float, end: int) -> int:
+    """A place in a list of that length."""
+    if not (value == int(value) and 0 <= value < end):
+        raise ValueError(f"solids name frame or shape {value:g}, of {end}")
+    return int(value)
 
 
 def _as_text(solid: Drawn) -> str:
@@ -235,10 +291,14 @@ def _as_text(solid: Drawn) -> str:
 
 
 def _from_text(text: str) -> Drawn:
+    if not isinstance(text, str) or len(text) > MOST_TEXT:
+        raise ValueError("the description of a solid is no text, or too long")
     given: dict[str, Any] = json.loads(text)
     kind = KINDS[given["kind"]]
-    # in older files each solid has the sizes of all kinds, its own and others
-    own = {item.name: _tuple(given[item.name]) for item in fields(kind) if item.name in given}
+    own = {item.name: _tuple(given[item.name]) for item in fields(kind)}
+    if own.get("path") is not None or own.get("resolution", 0) > FINEST:
+        raise ValueError("a mesh must be in the recording itself, and be no finer than those that are saved")
+    check_color("color", given["color"])
     return Drawn(kind(**own), _tuple(given["color"]))
 
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import itertools
-import os
+import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from clothgym import files
 
 
 def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
@@ -31,7 +34,7 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
         raise ImportError("a .png needs pillow: pip install 'clothgym[video]'") from error
     content = io.BytesIO()
     Image.fromarray(image).save(content, "png", optimize=True)
-    replace_file(path, content.getvalue())
+    files.write(path, content.getvalue())
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
@@ -42,6 +45,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
 
     Raises:
         ValueError: another ending, no frames, frames of different sizes, or an fps that is not positive.
+        OSError: the disk is full, or the folder cannot be written; then nothing is kept.
         ImportError: pillow (for a gif) or imageio-ffmpeg (for an mp4) is missing.
     """
     path = Path(path)
@@ -53,21 +57,17 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     first = next(images, None)
     if first is None:
         raise ValueError("frames are empty: a video needs at least one")
-    scratch = path.with_name(f"{path.stem}.part{path.suffix}")
-    try:
-        (_write_gif if path.suffix == ".gif" else _write_mp4)(scratch, first, images, fps)
-    except BaseException as error:
-        if scratch.exists():
-            error.add_note(f"the frames before it are kept in {scratch}")
-        raise
-    os.replace(scratch, path)
-
-
-def replace_file(path: Path, content: bytes) -> None:
-    """Write a file beside ``path``, then rename it: there is never half a file of that name."""
-    scratch = path.with_name(f".{path.name}.part")
-    scratch.write_bytes(content)
-    os.replace(scratch, path)
+    kept = path.with_name(f"{path.stem}.part{path.suffix}")
+    with files.replacing(path) as scratch:
+        try:
+            (_write_gif if path.suffix == ".gif" else _write_mp4)(scratch, first, images, fps)
+        except OSError:
+            raise
+        except BaseException as error:
+            if scratch.exists():
+                scratch.replace(kept)
+                error.add_note(f"the frames before it are kept in {kept}")
+            raise
 
 
 def _checked(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
@@ -99,8 +99,9 @@ def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np
         palette = Image.fromarray(_with_rare_colors(sample)).quantize(256, method=Image.Quantize.MEDIANCUT)
         pages = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
         # a gif counts in hundredths of a second; players slow down anything below two of them
-        hundredths = max(2, round(100 / fps))
-        pages[0].save(path, save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
+        hundredths, film = max(2, round(100 / fps)), io.BytesIO()
+        pages[0].save(film, "gif", save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
+        path.write_bytes(film.getvalue())
 
 
 def _with_rare_colors(sample: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -126,3 +127,17 @@ def _write_mp4(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np
             writer.send(np.ascontiguousarray(np.pad(image, extra, mode="edge")))
     finally:
         writer.close()
+        if not _is_whole(path):
+            raise OSError(errno.EIO, "ffmpeg could not finish the film, for instance as the disk is full")
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether an ``.mp4`` has its index, which ffmpeg writes last (ISO/IEC 14496-12: boxes of a size and a name)."""
+    with open(path, "rb") as file:
+        while len(head := file.read(16)) >= 8:
+            size, name = struct.unpack(">I4s", head[:8])
+            size = struct.unpack(">Q", head[8:])[0] if size == 1 and len(head) == 16 else size
+            if name == b"moov" or size < 8:
+                return name == b"moov"
+            file.seek(size - len(head), io.SEEK_CUR)
+    return False

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clothgym import files
 from clothgym.checks import finite, one_of, positive
-from clothgym.render.export import replace_file
 from clothgym.render.gltf import Part, glb
 from clothgym.render.shading import CORAL
 from clothgym.render.solids import Color, Drawable, check_color, drawn
@@ -78,7 +78,7 @@ class MeshSequence:
         """
         parts = _parts(_checked_frames(np.asarray(positions)[None], self._cloth), [solids], self._cloth)
         path = self.folder / f"frame_{self.written:05d}.{self.kind}"
-        replace_file(path, glb(parts) if self.kind == "glb" else _obj(parts))
+        files.write(path, glb(parts) if self.kind == "glb" else _obj(parts))
         self.written += 1
         return path
 
@@ -123,7 +123,7 @@ def write_animation(
         raise ValueError(f"animation path={str(path)!r}: must end in .glb")
     cloth = _checked_cloth(triangles, uv, color)
     frames = _checked_frames(positions, cloth)
-    replace_file(path, glb(_parts(frames, _checked_solids(solids, len(frames)), cloth), positive("fps", fps)))
+    files.write(path, glb(_parts(frames, _checked_solids(solids, len(frames)), cloth), positive("fps", fps)))
 
 
 def _parts(frames: NDArray[np.float32], solids: Sequence[Sequence[Drawable]], cloth: _Cloth) -> list[Part]:

@@ -11,7 +11,16 @@ from clothgym.checks import vectors
 from clothgym.collisions.solids.mesh_collider import MeshCollider
 from clothgym.collisions.solids.particle_contact import Contacts, contacts
 from clothgym.collisions.solids.penetration import deepest
-from clothgym.collisions.solids.shapes import COLLIDER_ROWS, R_AFTER, R_POINT, R_VELOCITY, Collider, check_index, check_replacement
+from clothgym.collisions.solids.shapes import (
+    COLLIDER_ROWS,
+    R_AFTER,
+    R_POINT,
+    R_VELOCITY,
+    Collider,
+    check_index,
+    check_replacement,
+    check_rows,
+)
 from clothgym.collisions.solids.signed_distance import Shapes
 from clothgym.elements import SurfaceArrays
 from clothgym.state import Layout, State
@@ -35,6 +44,11 @@ class Solids:
     def described(self) -> NDArray[np.float64]:
         """Rows of the colliders as given, (colliders, COLLIDER_ROWS)."""
         return np.array([c.rows() for c in self.colliders]).reshape(-1, COLLIDER_ROWS)
+
+    def check(self, state: State) -> None:
+        """Refuse numbers that no collider has, see ``check_rows``."""
+        for name in ("colliders", "collider_homes"):
+            check_rows(name, getattr(state, name))
 
     def restore(self, state: State) -> None:
         """Take over what a state holds of the colliders."""

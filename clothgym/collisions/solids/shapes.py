@@ -22,6 +22,8 @@ from clothgym.checks import count, finite, members, not_negative, number, shown,
 R_POINT, R_AXES, R_HALF, R_RADIUS, R_FRICTION, R_VELOCITY, R_REACH2, R_THICKNESS, R_AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
 COLLIDER_ROWS = 25
 
+STRAIGHT = 1e-4  # by how much products of a collider's axes, in float32, may differ from those of unit vectors at right angles
+
 KIND_PLANE, KIND_ROUNDED_BOX, KIND_MESH = 0, 1, 2
 
 Vector = tuple[float, float, float]
@@ -214,6 +216,20 @@ def _axes_along(*direction: float) -> NDArray[np.float64]:
     x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x /= np.linalg.norm(x)
     return np.concatenate([x, np.cross(z, x), z])
+
+
+def check_rows(name: str, rows: NDArray) -> None:
+    """Refuse numbers that no collider has, (..., COLLIDER_ROWS), finite; name: of the state's array.
+
+    Raises:
+        ValueError: axes that are no unit vectors at right angles, or a negative size, friction or thickness.
+    """
+    axes = rows[..., R_AXES : R_AXES + 9].reshape(*rows.shape[:-1], 3, 3).astype(np.float64)
+    if rows.size and np.abs(axes @ np.swapaxes(axes, -1, -2) - np.eye(3)).max() > STRAIGHT:
+        raise ValueError(f"the state's {name} holds axes that are no unit vectors at right angles: give what get_state() gave")
+    sizes = rows[..., [*range(R_HALF, R_HALF + 3), R_RADIUS, R_FRICTION, R_REACH2, R_THICKNESS]]
+    if np.any(sizes < 0):
+        raise ValueError(f"the state's {name} holds {sizes.min():g} as a size, friction or thickness: give what get_state() gave")
 
 
 def check_index(colliders: Sequence[Collider], index: int) -> None:
