@@ -1,6 +1,7 @@
-"""The command line: what there is, a page to play with it, exports, its speed here, how integrators compare, compiling.
+"""The command line: lists, the playground's page, exports, comparisons of integrators, benchmarks, and compilation.
 
-Options are checked before anything is compiled: values as they are parsed, names where their tables are, which takes a second.
+Options are checked before anything is compiled.  Values are checked during parsing, and names against their tables.  The latter
+takes a second.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import clothgym
 from clothgym import progress
 from clothgym.registration import ACTORS, ENVIRONMENTS, actor_named
 
-STOPPED = 130  # the exit status of what Ctrl+C has ended, as shells have it
+STOPPED = 130  # exit status after Ctrl+C, as in shells
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; its exit status.  What was given wrongly ends with a sentence and status 2."""
+    """Run a command, and return its exit status.  Wrong arguments print an error and exit with status 2."""
     parser = _parser()
     options = parser.parse_args(arguments)
     if options.command is None:
@@ -58,57 +59,55 @@ def _parser() -> argparse.ArgumentParser:
 
     command(_list, "list", "environments, scenes, integrators and fabrics")
 
-    view = command(_view, "view", "a page in the browser, where cloth can be touched")
+    view = command(_view, "view", "interactive cloth in the browser")
     view.add_argument(
         "what", nargs="?", default="", metavar="SCENE", help="a scene or an environment's id (default: patch); see list"
     )
-    view.add_argument("--host", default="127.0.0.1", help="address to listen at (default: this machine alone can reach it)")
-    view.add_argument(
-        "--port", type=_integer(0, 65535), default=8080, help="port, or the next that is free; 0 for any (default: 8080)"
-    )
+    view.add_argument("--host", default="127.0.0.1", help="address to listen on (default: only this machine can reach it)")
+    view.add_argument("--port", type=_integer(0, 65535), default=8080, help="port, or the next free one; 0 for any (default: 8080)")
     view.add_argument(
         "--policy", type=_actor, nargs="+", default=[], metavar="POLICY",
-        help="who acts in an environment: expert (default), noop, random, or the folders of training runs",
+        help="policy in an environment: expert (default), noop, random, or folders of training runs",
     )  # fmt: skip
-    view.add_argument("--replay", type=_readable, metavar="FILE", help="a recording that the page saved (.npz), to be shown again")
+    view.add_argument("--replay", type=_readable, metavar="FILE", help="replay a recording (.npz) saved from the page")
 
     export = command(_export, "export", "a scene or an environment as a picture, a film or meshes for Blender")
     export.add_argument("name", metavar="NAME", help="a scene or an environment's id, see list")
     export.add_argument(
-        "--out", required=True, type=_writable, help=".png, .gif, .mp4 or .glb; without an ending a folder of meshes"
+        "--out", required=True, type=_writable, help=".png, .gif, .mp4 or .glb; without an extension, a folder of meshes"
     )
-    export.add_argument("--kind", choices=("obj", "glb"), default="obj", help="of the meshes in a folder (default: obj)")
-    export.add_argument("--seconds", type=_positive, help="5 of a scene, and all of an episode by default")
-    export.add_argument("--fps", type=_positive, help="frames a second (30 by default, or as many as there are)")
-    export.add_argument("--size", type=_integer(1), help="pixels of a side")
+    export.add_argument("--kind", choices=("obj", "glb"), default="obj", help="format of the meshes in a folder (default: obj)")
+    export.add_argument("--seconds", type=_positive, help="duration (default: 5 s of a scene, or a whole episode)")
+    export.add_argument("--fps", type=_positive, help="frames per second (default: 30, or as many as there are)")
+    export.add_argument("--size", type=_integer(1), help="side length in pixels")
     export.add_argument("--seed", type=_integer(0), default=0)
-    export.add_argument("--color", choices=("fabric", "strain"), default="fabric", help="of pictures and films (default: fabric)")
     export.add_argument(
-        "--policy", type=_actor, default="expert", help="who acts: expert (default), noop, random, or a run's folder"
+        "--color", choices=("fabric", "strain"), default="fabric", help="colors of pictures and films (default: fabric)"
     )
+    export.add_argument("--policy", type=_actor, default="expert", help="policy: expert (default), noop, random, or a run's folder")
     export.add_argument(
-        "--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help="settings: gravity=3 fabric=silk wind=4 ..."
+        "--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help="settings, such as gravity=3 fabric=silk wind=4"
     )
 
     compare = command(_compare, "compare", "one scene, several integrators: errors, costs and pictures")
     compare.add_argument("--scene", default="stiff_sheet", metavar="NAME", help="see --list (default: stiff_sheet)")
-    compare.add_argument("--list", action="store_true", help="the scenes, and what each breaks")
-    compare.add_argument("--integrators", nargs="+", metavar="NAME", help="those to compare; all by default")
-    compare.add_argument("--out", type=_writable, metavar="DIR", help="folder of the results (default: runs/compare_SCENE)")
+    compare.add_argument("--list", action="store_true", help="list the scenes and their difficulties")
+    compare.add_argument("--integrators", nargs="+", metavar="NAME", help="integrators to compare (default: all)")
+    compare.add_argument("--out", type=_writable, metavar="DIR", help="folder for the results (default: runs/compare_SCENE)")
     compare.add_argument("--quick", action="store_true", help="fewer settings")
-    compare.add_argument("--fresh", action="store_true", help="measure again what the folder has")
+    compare.add_argument("--fresh", action="store_true", help="repeat measurements that the folder already has")
 
     bench = command(_bench, "bench", "measure speed on this machine")
-    bench.add_argument("--json", type=_writable, metavar="FILE", help="write the results there too")
+    bench.add_argument("--json", type=_writable, metavar="FILE", help="also write the results to this file")
     extent = bench.add_mutually_exclusive_group()
     extent.add_argument("--quick", action="store_true", help="fewer cases, in a minute or two")
-    extent.add_argument(
-        "--table", action="store_true", help="what everything costs, beside what is wanted and what the machine allows"
+    extent.add_argument("--table", action="store_true", help="costs of all parts, beside their goals and the machine's limits")
+    bench.add_argument(
+        "--select", nargs="+", default=[], metavar="GROUP", help="groups of the table, such as springs, strict or start"
     )
-    bench.add_argument("--select", nargs="+", default=[], metavar="GROUP", help="of the table: springs, strict, start, ...")
 
-    warmup = command(_warm_up, "warmup", "compile kernels now, so that nothing has to later")
-    warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; some minutes")
+    warmup = command(_warm_up, "warmup", "compile kernels now instead of at first use")
+    warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; takes some minutes")
     return parser
 
 
@@ -145,7 +144,7 @@ def _actor(text: str) -> str:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """``NAME=VALUE`` with a number where it is one."""
+    """``NAME=VALUE``, with the value parsed as JSON where possible."""
     name, equals, value = text.partition("=")
     if not equals:
         raise argparse.ArgumentTypeError(f"{text!r}: must be NAME=VALUE, for instance gravity=3")
@@ -163,7 +162,7 @@ def _readable(text: str) -> Path:
 
 
 def _writable(text: str) -> Path:
-    """A file or a folder that can be made, or written to."""
+    """A path that can be created or written to."""
     path = Path(text)
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r}: there is no folder {str(path.parent)!r}; make it, or name another")
@@ -205,7 +204,7 @@ def _warm_up(options: argparse.Namespace) -> None:
     from clothgym.simulation import Simulation
 
     def episode(env_id: str, **kwargs: Any) -> None:
-        """To the evaluation, which has kernels of its own."""
+        """Play to the evaluation, which has its own kernels."""
         env = gym.make(env_id, render_mode="rgb_array", **kwargs)
         env.reset(seed=0)
         while not env.step(env.unwrapped.expert_action())[2]:  # type: ignore[attr-defined]
@@ -217,7 +216,7 @@ def _warm_up(options: argparse.Namespace) -> None:
         Simulation(grid(3, 3, 0.1, 0.1), integrator=integrator, bending=bending, strain_limit=limit, substeps=1000).step()
 
     begun = time.perf_counter()
-    # wind and slipping have kernels of their own
+    # wind and slipping have their own kernels
     cases: list[tuple[Callable[..., None], str, dict[str, Any]]] = [(episode, env_id, {}) for env_id in ENVIRONMENTS]
     cases += [(episode, "ClothReach-v0", {"wind": {"gust": 0.5}}), (episode, "ClothDrapeGripper-v0", {"slip_force": 1.0})]
     for integrator in INTEGRATORS:
@@ -295,7 +294,7 @@ def _export(options: argparse.Namespace) -> None:
         said = export(options.name, options.out, settings=dict(options.set), say=_frames, **given)
     except (ValueError, OSError, ImportError) as error:
         options.refuse(str(error))
-    except RuntimeError as error:  # the sheet has burst
+    except RuntimeError as error:  # the sheet blew up
         progress.clear()
         raise SystemExit("\n".join([str(error), *getattr(error, "__notes__", [])])) from None
     progress.clear()

@@ -1,15 +1,15 @@
-"""Floor 4: strain limiting: structural and shear springs beyond a threshold are shortened to it after each substep.
+"""Floor 4: strain limiting.  After each substep, structural and shear springs beyond a threshold are shortened to it.
 
 Provot 1995, Deformation constraints in a mass-spring model to describe rigid cloth behavior.
 
 A sweep visits the springs.  If one is too long, two free ends move by equal amounts, a single free end moves alone, and two held
-ends stay.  One sweep is not enough, as each correction stretches the neighbors.  Sweeps go on until no spring is ``TOLERANCE``
-beyond the threshold, or ``SWEEPS`` are done.  The strain that is left at the end of the control step, after contact, is reported.
-In the same visit the ends of a spring at its limit lose their relative velocity apart, by an impulse between their masses.  This
-removes kinetic energy and never adds any.
+ends stay.  One sweep is not enough, because each correction stretches the neighbors.  Sweeps continue until no spring exceeds the
+threshold by more than ``TOLERANCE``, or ``SWEEPS`` are done.  The remaining strain is reported at the end of the control step,
+after contact.  In the same visit, an impulse stops the ends of a spring at its limit from separating.  This can only remove kinetic
+energy.
 
-Equal displacements of unequal masses, which the border of a sheet has, shift the center of mass and slow the rotation of a free
-sheet.  That is Provot's rule, and not a law of mechanics.
+Particles on the border of a sheet have smaller masses than inner ones.  Equal displacements of unequal masses shift the center of
+mass and slow the rotation of a free sheet.  This is Provot's rule, not a law of mechanics.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from clothgym._jit import disjoint, kernel, placeholder, specialize
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
-TOLERANCE = 0.005  # strain beyond the threshold that ends the sweeps
+TOLERANCE = 0.005  # strain beyond the threshold at which the sweeps end
 SWEEPS = 100  # at most, in a substep
 # rows of a report
 BEFORE, AFTER, USED = 0, 1, 2
@@ -38,7 +38,7 @@ def checked_limit(value: float | None) -> float | None:
     """A limit on strain, or None.
 
     Raises:
-        ValueError: a value that is not positive, or above 1, as if in percent.
+        ValueError: a value that is not positive, or above 1, as a percentage would be.
     """
     if value is None:
         return None
@@ -50,7 +50,7 @@ def checked_limit(value: float | None) -> float | None:
 class Limiting(NamedTuple):
     """What strain limiting did in the last control step, (num_envs,) each.
 
-    before: largest strain that it met.  after: largest strain at the end of the control step.  sweeps: most sweeps of a substep.
+    before: largest strain before limiting.  after: largest strain at the end of the control step.  sweeps: most in one substep.
     """
 
     before: NDArray
@@ -59,10 +59,10 @@ class Limiting(NamedTuple):
 
 
 def _limit_strain(x, v, w, weave, limit, report):
-    """Shorten springs that are longer than ``1 + limit`` rest lengths to that length, in place.
+    """Shorten springs longer than ``1 + limit`` rest lengths to that length, in place.
 
     x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  weave: see ``elements.Weave``.  report: rows BEFORE,
-    AFTER and USED, (3, lanes); BEFORE and USED keep the largest values of the control step.
+    AFTER and USED, (3, lanes).  BEFORE and USED keep the largest values of the control step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
@@ -86,13 +86,13 @@ def _limit_strain(x, v, w, weave, limit, report):
 
 
 def _measure_strain(x, weave, report):
-    """Report the largest strain at the end of a control step, after contact, which does not respect the limit."""
+    """Report the largest strain at the end of a control step.  Contact comes before and ignores the limit."""
     largest_strain(x, weave, report[AFTER])
 
 
 @disjoint
 def _raise_to_stretch(x, y, z, o, weight, inverse, out):
-    """``out <- max(out, |d|^2/r^2)`` for the springs of one kind on a grid, by their first ends, (particles,).
+    """``out <- max(out, |d|^2/r^2)`` for the springs of one kind on a grid, at their first ends, (particles,).
 
     x, y, z: components of positions, (particles,).  o: the kind's offset.  inverse: ``1/r^2`` [1/m^2].
     """
@@ -142,10 +142,11 @@ def _largest_in_lanes(x, weave, largest):
 
 @kernel
 def _sweep_springs(x, v, w, springs, limit, enough, largest):
-    """Visit each structural and shear spring, in the lanes whose largest strain is beyond ``enough``.
+    """Visit each structural and shear spring, in the lanes whose largest strain exceeds ``enough``.
 
     With direction n from i to j and greatest length L, ``x_i <- x_i + s (|d| - L) n`` and ``x_j <- x_j - (1 - s) (|d| - L) n``.
-    If both ends are free s is 1/2 (Provot 1995).  Then the impulse ``max(n . (v_j - v_i), 0)/(w_i + w_j)`` along n on both ends.
+    If both ends are free, s is 1/2 (Provot 1995).  Then both ends get the impulse ``max(n . (v_j - v_i), 0)/(w_i + w_j)`` along n,
+    with opposite signs.
     """
     ends, rest_length, kind, _ = springs
     one, zero, half = x.dtype.type(1), x.dtype.type(0), x.dtype.type(0.5)
@@ -194,8 +195,10 @@ def no_measure(x, weave, report):
 
 @cache
 def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
-    """The limiter by the names under which the main loop calls it; limits: whether there is a limit; by_particle: whether the
-    particles of one grid are adjacent in memory."""
+    """The limiter's kernels, under the names that the main loop uses.
+
+    limits: whether there is a limit.  by_particle: whether the particles of one grid are adjacent in memory.
+    """
     if not limits:
         return {"restrain": no_limit, "remeasure": no_measure}
     largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")

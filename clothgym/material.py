@@ -1,4 +1,4 @@
-"""Floor 1: the properties of a fabric in SI units, and the spring constants of a sheet that follow from them."""
+"""Floor 1: the properties of a fabric in SI units, and the spring constants of a sheet made of it."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ class Material:
         density: mass per area [kg/m^2].
         stretch_stiffness: Young's modulus times thickness [N/m].
         shear_stiffness: shear modulus times thickness [N/m].
-        bend_rigidity: plate rigidity B [N m]: a cylinder of curvature kappa stores B kappa^2 / 2 per area.  Skip springs
+        bend_rigidity: plate rigidity B [N m].  A cylinder of curvature kappa stores B kappa^2 / 2 per area.  Skip springs
             (``bending="springs"``) have no rigidity in the flat state.  They store this energy where the radius of curvature is two
             grid spacings.
-        damping_time: Kelvin-Voigt retardation time [s]; times a spring's stiffness, it is the constant of the spring's damper.
-        drag_coefficient: C_D of the fabric face on to the wind, see ``forces.add_lane_air_forces``; a square plate has 1.2.
-        skin_friction: C_F of the fabric edge on to the wind, by the area of one side.
-        air_drag: linear drag, force per area and velocity [N s/m^3], whatever the wind is.  Real air has none.  It damps slow
+        damping_time: Kelvin-Voigt retardation time [s].  A spring's damper constant is this time multiplied by its stiffness.
+        drag_coefficient: C_D of the fabric face-on to the wind, see ``forces.add_lane_air_forces``; a square plate has 1.2.
+        skin_friction: C_F of the fabric edge-on to the wind, by the area of one side.
+        air_drag: linear drag, force per area and velocity [N s/m^3], independent of the wind.  Real air has none.  It damps slow
             swings, which the quadratic law hardly damps.  0.72 gives the force of that law at 1 m/s.
         source: where the values come from.
 
     Raises:
-        ValueError: a property that is not finite or negative, or a density or stretch stiffness of zero.
+        ValueError: a property that is negative or not finite, or a density or stretch stiffness of zero.
     """
 
     density: float = 0.150
@@ -52,10 +52,10 @@ class Material:
 
     @staticmethod
     def preset(name: str, **changes: float) -> Material:
-        """A measured fabric by name, with some properties changed if wanted: ``Material.preset("cotton", density=0.2)``.
+        """A measured fabric, with optional changes to its properties: ``Material.preset("cotton", density=0.2)``.
 
         Raises:
-            ValueError: no such preset or property (the message lists the right ones), or a value that is out of range.
+            ValueError: an unknown preset or property (the message lists the known ones), or a value out of range.
         """
         known("material preset", name, PRESETS)
         for change in changes:
@@ -117,12 +117,12 @@ PRESETS: dict[str, Material] = {
 def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: NDArray) -> NDArray[np.float64]:
     """Spring constants by kind [N/m], (kinds, ...), that give a sheet the fabric's moduli.
 
-    The edges of a triangle mesh are of one kind.  With the weights of Van Gelder their stiffness is Young's modulus.  Poisson's
-    ratio is then 1/3, and the shear modulus follows from these, whatever that of the fabric is (see ``triangles.triangle_mesh``).
+    The edges of a triangle mesh are of one kind.  With Van Gelder's weights their stiffness is Young's modulus.  Poisson's ratio is
+    then 1/3.  The shear modulus follows from these two and ignores that of the fabric (see ``triangles.triangle_mesh``).
 
-    On a grid with cells a x b and diagonals d, springs k_x, k_y, k_d (both diagonals) and skip springs k_b make a sheet with
-    ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)``, ``C12 = C66 = 2 k_d a b/d^2`` and Young's modulus ``C11 - C12^2/C11``.  This
-    holds for small strains; the tests check it on stretched and sheared sheets.  Poisson's ratio is then ``C12/C11``.
+    Let a grid have cells a x b with diagonals d, springs k_x, k_y, k_d (both diagonals) and skip springs k_b.  The sheet then has
+    ``C11 = (k_x + 4 k_bx) a/b + 2 k_d a^3/(b d^2)`` and ``C12 = C66 = 2 k_d a b/d^2``.  Its Young's modulus is ``C11 - C12^2/C11``
+    and its Poisson's ratio ``C12/C11``.  This holds for small strains; the tests check it on stretched and sheared sheets.
 
     stretch, shear [N/m] and bend [N m] have the same shape ``(...)``.
 

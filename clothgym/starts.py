@@ -1,12 +1,14 @@
-"""Floor 6: crumpled, folded and rumpled sheets to start from, and the maneuvers that make them, for tests and benchmarks, too.
+"""Floor 6: crumpled, folded and rumpled initial sheets, and the maneuvers that make them.
 
-A maneuver is a batch of sheets above a floor, one seed for each environment, and a script for their anchors or grippers:
+Tests and benchmarks use the maneuvers, too.
+
+A maneuver is a batch of sheets above a floor, with a script for their anchors or grippers.  Each environment has a seed:
 
     heap = MANEUVERS["heap"](grid(25, 25, 1.0, 1.0), seeds=range(5), self_collision="strict")
     while not heap.over:
         heap.step()
 
-Lengths scale with the sheet's side, its larger extent at rest; durations suit a sheet of about one meter.
+Lengths scale with the sheet's side, which is its larger extent at rest.  Durations suit a sheet of about one meter.
 """
 
 from __future__ import annotations
@@ -28,11 +30,11 @@ from clothgym.mesh import ClothMesh
 from clothgym.simulation import Simulation
 
 FRICTION = 0.5  # coefficient between cloth and floor
-TILT = np.radians(3)  # angle by which a seed tilts the start, about [rad]
-ROUGHNESS = 1e-3  # and displacement of each particle, about, in lengths of the shortest spring
+TILT = np.radians(3)  # approximate angle by which a seed tilts the start [rad]
+ROUGHNESS = 1e-3  # approximate displacement of each particle, in lengths of the shortest spring
 SETTLING_DRAG = 5.0  # rate of the linear drag under which starts come to rest [1/s]
 REST_SPEED = 5e-3  # rms speed below which a start is at rest [m/s]
-LONG_SETTLING, TREMBLING = 20.0, 0.05  # after so long [s] this speed counts as rest [m/s]: squeezed folds keep trembling
+LONG_SETTLING, TREMBLING = 20.0, 0.05  # after this time [s], this speed [m/s] counts as rest: squeezed folds keep trembling
 
 
 class Maneuver:
@@ -41,9 +43,9 @@ class Maneuver:
     Args:
         mesh: the sheet, flat at rest.
         material: the fabric.
-        seeds: one for each environment; a seed varies the start slightly, and whatever is drawn at random.
-        thickness: distance between layers at the start, and that anchors leave between layers [m].
-        options: of ``Simulation``, ``self_collision`` for instance.
+        seeds: one for each environment.  A seed varies the start slightly, and all random choices.
+        thickness: distance between layers, at the start and where anchors place them [m].
+        options: for ``Simulation``, such as ``self_collision``.
 
     Attributes:
         simulation: the batch.  seconds: duration [s].
@@ -95,19 +97,20 @@ class Maneuver:
         self.frames += 1
 
     def _anchors(self) -> NDArray:
-        """Particles that are anchored, in the order of ``held``."""
+        """Anchored particles, in the order of ``held``."""
         return np.zeros(0, np.int64)
 
     def _start(self) -> tuple[NDArray, float]:
-        """Positions at the start [m], (particles, 3), and the height of the lowest above the floor [m]."""
+        """Initial positions [m], (particles, 3), and the height of the lowest particle above the floor [m]."""
         raise NotImplementedError
 
     def _steer(self, time: float) -> None:
-        """Move the anchors or grippers to their targets for this time [s]."""
+        """Move the anchors or grippers to their targets at this time [s]."""
 
     def _varied(self, x: NDArray, height: float) -> NDArray:
-        """The start of each environment: slightly tilted and uneven, with its lowest particle at ``height``, (num_envs, particles,
-        3).
+        """The start of each environment, slightly tilted and uneven [m], (num_envs, particles, 3).
+
+        The lowest particle is at ``height`` [m].
         """
         short = self.mesh.springs.rest_length.min()
         sheets = []
@@ -118,7 +121,7 @@ class Maneuver:
         return np.array(sheets)
 
     def _near(self, x: float, y: float) -> int:
-        """The particle nearest to a point of the sheet's bounding box: (1, 1) is a corner, (1, 0) the middle of a side."""
+        """The particle nearest to a point of the bounding box; (1, 1) is a corner, and (1, 0) the middle of a side."""
         place = np.array([x, y, 0]) * np.ptp(self.rest, axis=0) / 2
         return int(np.argmin(np.linalg.norm(self.rest - place, axis=1)))
 
@@ -135,7 +138,7 @@ class EdgeDrop(Maneuver):
 class ZFold(Maneuver):
     """A sheet folded in zigzag falls.
 
-    Its height rises evenly along the sheet, so it is the graph of a function over an upright plane and does not intersect itself.
+    Its height rises evenly along the sheet.  It is the graph of a function over an upright plane, so it does not intersect itself.
     """
 
     seconds = 5.0
@@ -147,11 +150,11 @@ class ZFold(Maneuver):
     def _start(self) -> tuple[NDArray, float]:
         along, lowest = self.rest[:, 0] - self.rest[:, 0].min(), 0.1 * self.side
         length = np.ptp(self.rest[:, 0])
-        # creases at even distances, on a grid along columns of particles
+        # creases at equal distances; on a grid they follow columns of particles
         creases = np.linspace(0, length, self.leaves + 1)
         spacing = float(np.median(self.mesh.springs.rest_length[self.mesh.springs.kind <= 2]))
         if self.mesh.shape is None:
-            slope = 0.5  # creases cut through triangles, which a smaller slope would shorten much more
+            slope = 0.5  # creases cut through triangles, and a smaller slope would shorten these much more
         else:
             columns = np.unique(along.round(9))
             creases = np.unique(columns[np.abs(columns[:, None] - creases).argmin(axis=0)])
@@ -187,8 +190,8 @@ class Fold(Maneuver):
     """A sheet on the floor is folded in half by its corners, in alternating directions."""
 
     carrying, holding, resting = 1.5, 0.3, 0.7  # [s]
-    # for each fold the direction of the side that is carried, and the directions of the particles held there; later folds hold the
-    # corners of all layers, and the ends of creases, which were the middle of a side
+    # for each fold: the direction of the carried side, and the directions of the particles held there; later folds hold the corners
+    # of all layers, and the ends of creases, which were the middle of a side
     FOLDS = (
         ((0, 1), ((-1, 1), (1, 1))),
         ((1, 0), ((1, -1), (1, 0), (1, 1))),
@@ -214,7 +217,7 @@ class Fold(Maneuver):
 
     def _varied(self, x: NDArray, height: float) -> NDArray:
         sheets = super()._varied(x, height)
-        sheets[:, :, 2] = height  # flat: standing on a corner it would slip
+        sheets[:, :, 2] = height  # flat, because a sheet standing on a corner would slip
         return sheets
 
     def _steer(self, time: float) -> None:
@@ -224,7 +227,7 @@ class Fold(Maneuver):
         direction, held = self.FOLDS[int(fold)]
         anchors = [self.directions.index(d) for d in held]
         step = self.simulation.time_step
-        # a new fold attaches its anchors where their particles are; afterwards they are released
+        # a new fold attaches its anchors at their particles; at its end it releases them
         if passed <= step:
             for anchor in anchors:
                 self.simulation.attach(None, [anchor])
@@ -244,16 +247,16 @@ class Fold(Maneuver):
         self.simulation.move_anchors(self.targets)
 
     def _crease(self, direction: NDArray) -> NDArray[np.float64]:
-        """Position of each crease along the direction [m], (num_envs,): near the middle of the sheet as it lies."""
+        """Position of each crease along the direction [m], (num_envs,), near the middle of the current sheet."""
         along = self.simulation.positions[:, :, :2].astype(np.float64) @ direction
         return (along.max(axis=1) + along.min(axis=1)) / 2 + self.miss
 
 
 class Wring(Maneuver):
-    """Two opposite edges are twisted against each other, each by particles around its middle, and moved closer.
+    """Two opposite edges are twisted against each other and moved closer.  Particles around the middle of each edge are held.
 
-    turns: of one edge against the other.  turning: duration of the twist [s]; then the edges are held.  share: of each edge that is
-    held.  approach: share of their distance by which the edges come closer.
+    turns: of one edge against the other.  turning: duration of the twist [s]; afterwards the edges stay in place.  share: held part
+    of each edge.  approach: share of their distance by which the edges come closer.
     """
 
     holding = 2.0  # [s]
@@ -267,7 +270,7 @@ class Wring(Maneuver):
 
     def _anchors(self) -> NDArray:
         x, y = self.rest[:, 0], self.rest[:, 1]
-        # on a disc the rim within a fifth of the radius
+        # on a disc, the part of the rim within a fifth of the radius of the extreme point
         reach = 1e-6 if self.mesh.shape is not None else 0.1 * self.side
         width = (0.5 * self.share + 1e-6) * self.side
         edges = [np.flatnonzero((end * x >= x.max() - reach) & (np.abs(y) <= width)) for end in (-1, 1)]
@@ -289,7 +292,7 @@ class Wring(Maneuver):
 
 
 class Drag(Maneuver):
-    """A sheet above the floor is dragged by a corner from one random point to the next, at ``speed`` [m/s]."""
+    """A sheet above the floor is dragged by a corner at ``speed`` [m/s], from one random point to the next."""
 
     def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
         self.speed, self.seconds = positive("speed", speed), positive("seconds", seconds)
@@ -304,7 +307,7 @@ class Drag(Maneuver):
 
     def _steer(self, time: float) -> None:
         for env, random in enumerate(self.random):
-            # the length of path in this control step, which may pass several points
+            # path length of this control step, which may pass several points
             left = self.speed * self.simulation.time_step
             while left > 0:
                 way = self.goal[env] - self.target[env]
@@ -320,7 +323,7 @@ class Drag(Maneuver):
 class PickAndDrop(Maneuver):
     """A sheet on the floor is picked up at a random point, carried and dropped, ``picks`` times.
 
-    lift: lowest and highest height to which it is lifted, in sides.  carry: largest distance along x and y, in sides.
+    lift: lowest and highest lift, in sides.  carry: largest distance along x and y, in sides.
     """
 
     grippers = (Gripper(speed=1.0),)
@@ -387,16 +390,16 @@ def make(
     Args:
         mesh: the sheet, flat at rest.
         material: the fabric.
-        kind: "crumpled" (lifted high at a random point and dropped, twice), "folded" (in half, twice) or "rumpled" (lifted a
-            little, twice).
+        kind: "crumpled", "folded" or "rumpled".  A crumpled sheet was lifted high at a random point and dropped, twice.  A
+            folded one was folded in half twice.  A rumpled one was lifted slightly and dropped, twice.
         count: number of sheets.
         seed: sheet i of seed s is the first sheet of seed s + i.
         thickness: of the cloth in self-contact [m].
-        options: of ``Simulation``; ``self_collision`` is "strict" with that thickness unless given.
+        options: for ``Simulation``; by default ``self_collision`` is "strict" with this thickness.
 
     Raises:
-        ValueError: an unknown kind, or what ``Simulation`` refuses.
-        RuntimeError: a sheet that moves faster than ``TREMBLING`` after ``LONG_SETTLING``, or that intersects itself.
+        ValueError: an unknown kind, or options that ``Simulation`` refuses.
+        RuntimeError: a sheet that still moves faster than ``TREMBLING`` after ``LONG_SETTLING``, or that intersects itself.
     """
     one_of("kind", kind, *STARTS)
     checks.count("count", count)
@@ -407,7 +410,7 @@ def make(
         maneuver.step()
     simulation = maneuver.simulation
     simulation.set_parameters(air_drag=SETTLING_DRAG * simulation.material.density)
-    # take each sheet when it comes to rest, which does not depend on the others
+    # take each sheet when it comes to rest, independently of the others
     x, moving = simulation.positions, np.ones(count, bool)
     while moving.any():
         late = maneuver.time > maneuver.seconds + LONG_SETTLING
@@ -433,7 +436,7 @@ def make(
 
 
 def _eased(share: float) -> float:
-    """Smooth progress from 0 to 1 for a share of the duration from 0 to 1."""
+    """Smooth progress, from 0 to 1, at a share of the duration from 0 to 1."""
     return (1 - float(np.cos(np.pi * share))) / 2
 
 

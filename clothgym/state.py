@@ -251,7 +251,7 @@ def check_fits(state: State, own: State) -> None:
     """
     advice = "give what get_state() gave, or State.load(path)"
     if not isinstance(state, State):
-        raise ValueError(f"state={state!r}: {advice}")
+        raise ValueError(f"state={shown(state)}: {advice}")
     if not isinstance(state.self_contact, dict) or set(state.self_contact) != set(SAVED):
         raise ValueError(f"the state's self_contact must be a dict of {', '.join(SAVED)}: {advice}")
     # of another simulation: what differs first, by name

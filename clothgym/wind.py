@@ -1,4 +1,4 @@
-"""Floor 1: steady wind and gusts: a random series of air velocities."""
+"""Floor 1: wind, a random series of air velocities from steady wind and gusts."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ class Wind:
 
     Attributes:
         speed: range of the steady wind's speed [m/s].
-        direction: range of the direction in which it blows, as an angle from the x axis [rad].
+        direction: range of the direction in which it blows, measured from the x axis [rad].
         gust: root mean square of each of the three components of the gusts [m/s].
         gust_time: correlation time of the gusts [s].
 
-    Gusts are a first-order Markov process, ``u' = u r + sqrt(1 - r^2) gust xi`` with ``r = exp(-dt/gust_time)``: Dryden's
-    longitudinal turbulence (MIL-F-8785C, 3.7.1), of scale ``gust_time`` times the speed.
+    Gusts are a first-order Markov process, ``u' = u r + sqrt(1 - r^2) gust xi`` with ``r = exp(-dt/gust_time)``.  This is Dryden's
+    longitudinal turbulence (MIL-F-8785C, 3.7.1).  Its scale is ``gust_time`` times the speed.
 
     Raises:
-        ValueError: not a range [low, high], a speed or gust below zero, or a time that is not positive.
+        ValueError: an invalid range [low, high], a negative speed or gust, or a time that is not positive.
     """
 
     speed: Sequence[float] = (0.0, 0.0)
@@ -46,7 +46,7 @@ class Wind:
         object.__setattr__(self, "gust_time", positive("wind gust_time", self.gust_time))
 
     def series(self, rng: np.random.Generator, steps: int, time_step: float) -> NDArray[np.float64]:
-        """Velocities of the air in successive control steps [m/s], (steps, 3): a steady wind plus gusts; time_step: [s]."""
+        """Air velocities in successive control steps, steady wind plus gusts [m/s], (steps, 3).  time_step: [s]."""
         speed, direction = rng.uniform(self.speed[0], self.speed[1]), rng.uniform(self.direction[0], self.direction[1])
         noise = rng.standard_normal((steps, 3))
         out = np.empty((steps, 3))
@@ -56,9 +56,9 @@ class Wind:
 
 @kernel
 def gusts(noise, rms, keep, out):
-    """``u <- u r + sqrt(1 - r^2) gust xi`` from step to step into ``out``, (steps, 3), see ``Wind``.
+    """``u <- u r + sqrt(1 - r^2) gust xi`` at each step, into ``out``, (steps, 3); see ``Wind``.
 
-    It starts from its stationary distribution.  noise: xi, (steps, 3).  rms: gust [m/s].  keep: r.
+    The process starts from its stationary distribution.  noise: xi, (steps, 3).  rms: gust [m/s].  keep: r.
     """
     fresh = np.sqrt(1 - keep * keep)
     for c in range(noise.shape[1]):

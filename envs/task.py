@@ -439,7 +439,7 @@ class Task(TaskDefinition):
         """Refuse a state's episodes, and what it belongs to; ``Simulation.set_state`` sees to the physics."""
         advice = "give what get_state() gave, or TaskState.load(path)"
         if not isinstance(state, TaskState) or not all(isinstance(part, dict) for part in (state.episode, state.task)):
-            raise ValueError(f"state={state!r:.100}: {advice}")
+            raise ValueError(f"state={shown(state)}: {advice}")
         # of another task
         for name, here in self._belongs.items():
             if (there := state.task.get(name)) != here:

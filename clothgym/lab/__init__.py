@@ -1,1 +1,1 @@
-"""Floor 8: what people run, and nothing below imports: laboratory tests, comparisons of integrators, benchmarks."""
+"""Floor 8: laboratory tests, comparisons of integrators, and benchmarks.  Lower floors do not import it."""

@@ -1,7 +1,7 @@
-"""How fast it is here: the bare core, the environments, and the start.
+"""Speed on this machine: the bare core, the environments, and the start.
 
-Units: a frame is a control step of 1/60 s in the core and of the task's own length in an environment; frames, particle
-substeps and environment steps are summed over the batch; nanoseconds are per spring, substep and environment, on one thread.
+A frame is one control step: 1/60 s in the core, and the task's own length in an environment.  Frames, particle substeps and
+environment steps are summed over the batch.  Nanoseconds are per spring, substep and environment, on one thread.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Case = tuple[str, Callable[[], list[Row]]]  # what is measured, and its rows
 
 
 def machine() -> Row:
-    """The machine and the versions."""
+    """Description of the machine, and the versions of the packages."""
     name = platform.processor() or platform.machine()
     if os.path.exists("/proc/cpuinfo"):
         with open("/proc/cpuinfo") as file:
@@ -55,7 +55,7 @@ def machine() -> Row:
 
 
 def seconds_per_call(call: Callable[[], object], budget: float = 0.5) -> float:
-    """Median time of a call after one to warm up [s]; as many calls as fit the budget [s], three at least."""
+    """Median time of a call after one warm-up call [s].  At least three calls are timed, and as many as fit the budget [s]."""
     call()
     times: list[float] = []
     while len(times) < 3 or sum(times) < budget:
@@ -66,7 +66,7 @@ def seconds_per_call(call: Callable[[], object], budget: float = 0.5) -> float:
 
 
 def core_cases(quick: bool) -> Iterator[Case]:
-    """A sheet of a meter, hanging from two corners in air at 60 Hz, with automatic substeps."""
+    """A 1 m sheet that hangs from two corners in air at 60 Hz, with automatic substeps."""
     for integrator in INTEGRATORS:
         for side in (17, 25) if quick else (13, 17, 25, 35, 50):
             for num_envs in (1, 64) if quick else (1, 16, 64, 256):
@@ -95,7 +95,7 @@ def core_row(integrator: str, side: int, num_envs: int, threads: int, budget: fl
 
 
 def env_cases(quick: bool) -> Iterator[Case]:
-    """Environment steps a second with random actions, resets and rewards included, by batch size."""
+    """Environment steps per second by batch size, with random actions, resets and rewards included."""
     for env_id in ENVIRONMENTS:
         yield f"{env_id}, alone", partial(env_row, env_id)
         for num_envs in (64, 256) if quick else (16, 64, 256, 1024):
@@ -131,7 +131,7 @@ FIRST_STEP = "import gymnasium as gym; e = gym.make('clothgym:{}'); e.reset(seed
 
 
 def start_cases(quick: bool) -> Iterator[Case]:
-    """Seconds from the start of Python to its end, whole process: the first step cold and warm, and bare imports."""
+    """Wall time of whole Python processes [s]: the first step with a cold and a warm cache, and bare imports."""
     runs = 3 if quick else 7
     for code in ("import numba, gymnasium", "import clothgym"):
         yield code, partial(import_row, code, runs)
@@ -160,7 +160,7 @@ def _process_seconds(code: str, runs: int, **environment: str) -> float:
 
 
 def run(quick: bool = False) -> dict[str, Any]:
-    """All measurements, with the machine's description."""
+    """All measurements, with a description of the machine."""
     sections = {"start": start_cases, "environments": env_cases, "core": core_cases}
     results: dict[str, Any] = {"machine": machine()}
     for name, cases_of in sections.items():

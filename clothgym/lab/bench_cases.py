@@ -1,4 +1,4 @@
-"""Rows of the table that take milliseconds each: passes over one sheet, or over several in lanes."""
+"""Table rows that take milliseconds each: passes over one sheet, or over several in lanes."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from clothgym.triangles import disc
 
 SIDES, BATCHES = (17, 25, 50, 100), (16, 64, 128)
 STEP = 1e-5  # substep of the passes, too short to be unstable [s]
-ENOUGH = 1_500_000  # springs times substeps times environments in a call, about
+ENOUGH = 1_500_000  # approximate product of springs, substeps and environments in a call
 DRAPE_SUBSTEPS = 50  # in a control step of ClothDrape-v0
-SHARED = 1.15  # goal: time of a plain step times this
+SHARED = 1.15  # goal, in times of a plain step
 NUMBERS = 13  # float32 values of a particle that a substep reads and writes: x, v, f, external force, and w
 
 
 def hanging(mesh: ClothMesh, num_envs: int = 1, damping_time: float = 1e-4, **world: Any) -> Simulation:
-    """Slightly uneven sheets that hang upright by their upper corners, a disc by particles of its rim."""
+    """Slightly uneven sheets that hang upright by their upper corners.  A disc hangs by particles of its rim."""
     held = mesh.corners[2:] if mesh.shape is not None else (mesh.num_particles - 4, mesh.num_particles - 1)
     fabric = Material.preset("cotton", damping_time=damping_time, air_drag=0.72)
     world = {"anchors": held, "air_density": 0.0, "threads": 1, "on_divergence": "ignore", **world}
@@ -56,7 +56,7 @@ def bare(
     group: str, what: str, mesh: ClothMesh, num_envs: int = 1, passes: int = 1, work: Work | None = None, wanted: str = "",
     goal: tuple[float, Case] | None = None, **world: Any,
 ) -> Case:  # fmt: skip
-    """A case of substeps alone: ns of a pass over the springs, per spring and environment."""
+    """A case of substeps alone, in ns per spring and environment of a pass."""
     springs = len(mesh.springs.kind)
     substeps = max(8, ENOUGH // (springs * num_envs * passes))
     simulation = hanging(mesh, num_envs, time_step=substeps * STEP, substeps=substeps, **world)
@@ -73,7 +73,7 @@ def bare(
 
 @cache
 def plain(side: int) -> Case:
-    """The plain step, with which all others are compared."""
+    """The plain step, the reference for all other cases."""
     sheet = PlainSheet(side)
     steps = max(8, ENOUGH // sheet.springs)
     work, visits = pass_of(grid(side, side, 1.0, 1.0)), steps * sheet.springs
@@ -97,7 +97,7 @@ def control_step(
     world: dict[str, Any] | None = None,
     **shown: Any,
 ) -> Case:
-    """A case of control steps of that sheet without solids, in us per environment; ahead: warm-up steps."""
+    """A case of control steps of ClothDrape-v0's sheet without solids, in us per environment.  ahead: warm-up steps."""
     simulation = hanging(DRAPE, num_envs, time_step=1 / 30, substeps=DRAPE_SUBSTEPS, **(world or {}))
     simulation.step(1 + ahead)
     visits = DRAPE_SUBSTEPS * DRAPE_SPRINGS * num_envs
@@ -109,12 +109,12 @@ def control_step(
 
 @cache
 def base(num_envs: int) -> Case:
-    """That sheet with springs alone."""
+    """ClothDrape-v0's sheet with springs alone."""
     return control_step("springs", "control step of ClothDrape-v0's sheet, springs alone", num_envs, "us", pass_of(DRAPE), goal=115)
 
 
 def _each(num_envs: int) -> str:
-    """How a row calls a batch."""
+    """Name of a batch in a row."""
     return "one" if num_envs == 1 else f"each of {num_envs}"
 
 

@@ -1,4 +1,4 @@
-"""Rows of the table that take seconds each: episodes of the tasks, maneuvers, MuJoCo, and whole processes."""
+"""Table rows that take seconds each: episodes of the tasks, maneuvers, MuJoCo, and whole processes."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from clothgym.starts import Fold, Maneuver, ZFold
 
 DRAPE = "ClothDrape-v0"
 MANY, STEPS = 128, 100  # environments and steps of an episode
-LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a hundred
+LETS_GO = 0.81  # upper bound of random actions, so that they release in one step of a hundred
 SPACING, LEAF = 1 / 24, 8  # of the sheets that grow [m], and cells of a leaf
 FRAME, THICKNESS = 1 / 60, 0.008
 
 
 def make(env_id: str, num_envs: int | None = None, **options: Any) -> Any:
-    """An environment or a batch.  Options that an older task lacks are patched in (``contact``) or left out (``physics``)."""
+    """An environment or a batch.  If an older task lacks an option, it is patched in (``contact``) or left out (``physics``)."""
     if num_envs is not None:
         options |= {"num_envs": num_envs, "threads": 1}
         options.setdefault("autoreset_mode", "SameStep")
@@ -56,7 +56,7 @@ def make(env_id: str, num_envs: int | None = None, **options: Any) -> Any:
 
 
 class Stopwatch:
-    """Adds up the processor time of this thread spent in a simulation's steps [s]."""
+    """Sums the processor time that this thread spends in a simulation's steps [s]."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.seconds = 0.0
@@ -73,7 +73,7 @@ class Stopwatch:
 
 
 def play(variants: dict[str, Row], expert: bool, num_envs: int = MANY, steps: int = STEPS, rounds: int = 2) -> dict[str, float]:
-    """Time of an environment step by variant [us]; variants take turns, and the fastest round of each step counts."""
+    """Time of an environment step by variant [us].  Variants take turns, and the fastest round of each step counts."""
     best: dict[str, NDArray] = {name: np.full(steps, np.inf) for name in variants}
     envs = {name: make(DRAPE, num_envs, **options).unwrapped for name, options in variants.items()}
     for turn in range(rounds):
@@ -147,7 +147,7 @@ def env() -> list[Row]:
 
 
 def overhead() -> list[Row]:
-    """Cost of everything but physics: the time of environment steps less that of the simulation in them."""
+    """Cost of everything but physics: the time of environment steps minus that of the simulation."""
     rows = []
     for env_id in ENVIRONMENTS:
         ways: list[tuple[str, int, float, Callable[[], Any]]] = [
@@ -165,7 +165,7 @@ def overhead() -> list[Row]:
 
 
 def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> float:
-    """Microseconds of an environment step without its physics, resets included, the median of rounds, with random actions."""
+    """Median time of an environment step without its physics [us], with random actions, resets included."""
     random, adapted = np.random.default_rng(0), not isinstance(one, gym.Env | gym.vector.VectorEnv)
     simulation = (one.env if adapted else one).unwrapped.task.simulation
     one.reset() if adapted else one.reset(seed=0)
@@ -182,7 +182,7 @@ def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> floa
         beat("beside the physics")
         return total
 
-    act(110 if num_envs > 1 else 1)  # until the ends of episodes are spread over time
+    act(110 if num_envs > 1 else 1)  # until episodes end at different times
     watch, taken = Stopwatch(simulation), []
     for _ in range(rounds):
         before = watch.seconds
@@ -194,7 +194,7 @@ def beside_physics(one: Any, num_envs: int, steps: int, rounds: int = 3) -> floa
 
 
 def frames(maneuvers: Mapping[str, Maneuver], count: int) -> dict[str, float]:
-    """Mean time of a frame of each, physics alone [ms]; they take turns frame by frame."""
+    """Mean time of a frame of each maneuver, physics alone [ms].  They take turns frame by frame."""
     watches = {name: Stopwatch(maneuver.simulation) for name, maneuver in maneuvers.items()}
     for frame in range(count):
         for maneuver in maneuvers.values():
@@ -286,7 +286,7 @@ def process_seconds(code: str, cache: str) -> float:
     """Processor time of a whole process [s], or wall time where the system does not report it."""
     begun, before = time.perf_counter(), os.times()
     environment = os.environ | {"CLOTHGYM_CACHE_DIR": cache}
-    # bytecode is written as it is for most people: else each process compiles every module of Python again
+    # bytecode is written, as is usual; otherwise each process compiles every Python module again
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=environment)
     after = os.times()

@@ -1,11 +1,11 @@
-"""What the table's rows are compared with: a plain step of one sheet, and the limits of the machine.
+"""References for the table's rows: a plain step of one sheet, and the limits of the machine.
 
-The plain step vectorizes over the particles of one grid: springs of one kind join each particle with the one a constant number of
-places further on, so each kind is one loop, and the force on a particle is one sum over the kinds.  It has no contact, no
+The plain step vectorizes over the particles of one grid.  A spring of one kind joins each particle to the one at a constant offset
+in memory.  So each kind is one loop, and the force on a particle is one sum over the kinds.  The plain step has no contact, no
 attachments and no options.
 
-A roofline: for each spring the operations, the roots and the bytes moved of a pass are counted.  A machine that does a given number
-of each per second cannot be faster than the slowest of the three allows (Williams, Waterman and Patterson 2009).
+The limits are a roofline (Williams, Waterman and Patterson 2009).  The operations, roots and bytes of a pass are counted for each
+spring.  A machine does a given number of each per second, and the slowest of the three bounds the speed.
 
 Kernels here call nothing from other files, so their cache depends on this file alone.
 """
@@ -29,7 +29,7 @@ TINY = 1e-30  # for springs that wrap around the end of a row: they have no stif
 
 @inlined
 def _pull(x0, x1, x2, y0, y1, y2, v0, v1, v2, w0, w1, w2, stiffness, rest, tau, f0, f1, f2, count):
-    """Forces of the springs of one kind on their first ends [N]; first ends at ``x``, ``v``, second ends at ``y``, ``w``."""
+    """Forces of one kind of springs on their first ends [N].  First ends are at ``x``, ``v``; second ends at ``y``, ``w``."""
     one, tiny = rest.dtype.type(1), rest.dtype.type(TINY)
     r, t = rest[0], tau[0]
     for p in range(count):
@@ -44,10 +44,10 @@ def _pull(x0, x1, x2, y0, y1, y2, v0, v1, v2, w0, w1, w2, stiffness, rest, tau, 
 def plain_steps(x, v, f, push, w, places, stiffness, rest, tau, parts, gravity, h, keep, steps):
     """``steps`` semi-implicit steps of ``h`` [s].
 
-    x [m], v [m/s], f, push [N]: (3, particles); push: external forces.  w [1/kg]: (particles,).  places: from one end of a spring
-    to the other, by kind, (kinds,).  stiffness [N/m]: of the spring that starts at a particle, (kinds, particles).  rest [m]:
-    (kinds,).  tau: damping time [s], (1,).  parts: scratch, (3, kinds, margin + particles), zero in the margin, which is at least
-    the largest of places.
+    x [m], v [m/s], f, push [N]: (3, particles); push: external forces.  w [1/kg]: (particles,).  places: offset from one end of
+    a spring to the other, by kind, (kinds,).  stiffness [N/m]: of the spring that starts at a particle, (kinds, particles).  rest
+    [m]: (kinds,).  tau: damping time [s], (1,).  parts: scratch, (3, kinds, margin + particles), zero in the margin.  The margin is
+    at least the largest of places.
     """
     n = x.shape[1]
     margin = parts.shape[2] - n
@@ -78,10 +78,10 @@ def plain_steps(x, v, f, push, w, places, stiffness, rest, tau, parts, gravity, 
 
 
 class PlainSheet:
-    """A sheet of 1 m and 150 g that hangs by two corners, and its plain steps of 10 microseconds.
+    """A 1 m sheet of 150 g that hangs by two corners, with plain steps of 10 microseconds.
 
     Attributes:
-        springs: their number, without those that wrap around.
+        springs: number of springs, without those that wrap around.
         bytes: size of all its arrays.
     """
 
@@ -117,14 +117,14 @@ class PlainSheet:
 
 # --- what the machine can do --------------------------------------------------------------------------------------------------
 
-LINKS = 3  # multiply-adds of an element between its load and its store: few, so that many chains are in flight at once
+LINKS = 3  # multiply-adds of an element between its load and its store; few, so that many chains run at once
 LEVELS = ("L1", "L2", "L3", "memory")
 SIZES = {"L1": 32 << 10, "L2": 512 << 10, "L3": 16 << 20}  # where the system does not report them [bytes]
 
 
 @apart
 def multiply_and_add(a, factor, term, rounds):
-    """``LINKS`` multiply-adds of each element in registers, ``rounds`` times: one chain for each element."""
+    """``LINKS`` multiply-adds of each element in registers, ``rounds`` times; each element is one chain."""
     for _ in range(rounds):
         for i in range(a.shape[0]):
             t = a[i]
@@ -151,7 +151,7 @@ def stream(a, b, c, factor, rounds):
 
 
 def seconds(call: Callable[[], object], repeats: int = 5) -> float:
-    """Shortest processor time of several calls in this thread, after one to warm up [s]."""
+    """Shortest processor time of several calls in this thread, after one warm-up call [s]."""
     call()
     times = []
     for _ in range(repeats):
@@ -172,9 +172,9 @@ def cache_sizes() -> dict[str, int]:
 
 
 def measure_limits() -> dict[str, Any]:
-    """Operations, inverse roots (a root and a division), and bytes from each level per second and core, in float32.
+    """Rates of one core in float32 [1/s]: operations, inverse roots (a root and a division), and bytes from each memory level.
 
-    The three arrays that are streamed through fill half a cache together, and in memory six times the last cache.
+    Three arrays are streamed.  Together they fill half a cache, or in memory six times the size of the last cache.
     """
     f4 = np.float32
     a = np.full(1024, 0.5, f4)
@@ -197,9 +197,9 @@ def measure_limits() -> dict[str, Any]:
 class Work(NamedTuple):
     """Work for each element (a spring, a hinge, a particle or a triangle), in float32.
 
-    operations: additions and multiplications.  roots: inverse roots, and other divisions.  numbers: loaded and stored in all;
-    streamed: those that no loop has just touched, which come from the cache level that holds the whole sheet.  formula: the counts
-    in words.
+    operations: additions and multiplications.  roots: inverse roots, and other divisions.  numbers: all loads and stores.
+    streamed: those of data that no loop has just touched; they come from the cache level that holds the whole sheet.  formula: the
+    counts in words.
     """
 
     operations: float
@@ -214,7 +214,7 @@ class Work(NamedTuple):
         return Work(*counts, f"{count:g} x ({self.formula})")
 
     def plus(self, other: Work) -> Work:
-        """The work of both."""
+        """The sum of both works."""
         operations, roots = self.operations + other.operations, self.roots + other.roots
         numbers, streamed = self.numbers + other.numbers, self.streamed + other.streamed
         return Work(operations, roots, numbers, streamed, f"{self.formula} + {other.formula}")
@@ -240,14 +240,14 @@ DAMPED_PROJECTION = Work(52, 2, 24, 24, "spring: 9 d and u, 6 |d|^2, 5 u.d, 11 f
 
 
 def level_of(size: float, sizes: dict[str, int]) -> str:
-    """The first level that holds that many bytes."""
+    """The first memory level that holds ``size`` bytes."""
     return next((level for level in LEVELS[:-1] if size <= sizes[level]), "memory")
 
 
 def stand(ns: float, work: Work, springs: int, size: float, limits: dict[str, Any]) -> dict[str, Any]:
-    """How close a substep is to the limits: its share of each, and which is largest.
+    """How close a substep is to the limits: its share of each, and the largest share.
 
-    ns: time for each spring.  work: of the whole substep.  springs: their number.  size: working set [bytes].
+    ns: time per spring.  work: of the whole substep.  springs: number of springs.  size: working set [bytes].
     """
     level = level_of(size, limits["cache bytes"])
     numbers = work.numbers if level == "L1" else work.streamed

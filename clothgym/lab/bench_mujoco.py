@@ -1,4 +1,4 @@
-"""A sheet of half a meter that falls 5 cm onto its edge, in MuJoCo 4 and here: frames per second."""
+"""A half-meter sheet falls 5 cm onto its edge, in MuJoCo 4 and in clothgym: frames per second."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def mujoco_model(contact: str, steps: int) -> Any:
 
 
 def start_of(model: Any) -> Any:
-    """Data at the start, with the sheet slightly uneven."""
+    """Initial data, with a slightly uneven sheet."""
     import mujoco
 
     data = mujoco.MjData(model)

@@ -1,11 +1,12 @@
-"""The table of speeds: what each thing costs, beside its goal and the limits of the machine.
+"""The table of speeds: the cost of each case, beside its goal and the limits of the machine.
 
     python -m clothgym bench --table                                    # all of it, about a quarter of an hour
     python -m clothgym bench --table --select springs bending           # some groups; --json FILE writes the rows too
 
-All on one thread, by its processor time ("start": of whole processes).  Cases that take milliseconds take turns, round after round,
-and the median counts: other load of the machine affects all alike, so ratios are more reliable than times.  Cases that take seconds
-take turns with what they are compared with, frame by frame, and each of their rows has the time of a plain step meanwhile.
+All cases run on one thread and are timed by its processor time ("start": by that of whole processes).  Cases that take
+milliseconds take turns in rounds, and the median counts.  Other load on the machine affects them all alike, so ratios are more
+reliable than times.  A case that takes seconds takes turns, frame by frame, with the case it is compared to.  Each of its rows also
+has the time of a plain step in the same period.
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ class Case:
     """A case that takes milliseconds.
 
     Attributes:
-        group: of rows; what: a description.
-        call: what is timed.
+        group: of rows.
+        what: a description.
+        call: the timed function.
         scale: factor from seconds of a call to ``unit``.
         wanted: the goal in words, if it is not a number.
-        over, beyond: a case to which the result is the ratio, or the difference.
-        goal: at most this, or this factor times the result of another case.
-        visits: springs times substeps times environments in a call, for ns a spring.
+        over, beyond: another case; the result is the ratio to ``over``, or the difference from ``beyond``.
+        goal: largest result wanted, or a factor and another case whose result it multiplies.
+        visits: product of springs, substeps and environments in a call, for ns per spring.
         work, springs, size: of a substep, see ``bench_limits.stand``; with ``beyond``, of the difference.
     """
 
@@ -76,14 +78,14 @@ class Case:
 
 
 def row_of(group: str, what: str, now: float, unit: str, goal: float | None = None, wanted: str = "", least: bool = False) -> Row:
-    """A row of the table; goal: the largest result wanted, or the smallest if ``least``."""
+    """A row of the table.  goal: the largest result wanted, or the smallest if ``least``."""
     reached = None if goal is None else bool(now >= goal if least else now <= goal)
     wanted = wanted or ("" if goal is None else f"{goal:g}")
     return {"group": group, "what": what, "now": now, "unit": unit, "goal": goal, "wanted": wanted, "reached": reached}
 
 
 def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
-    """Median processor time of a call of each case [s]; the cases take turns, starting with another one in each round."""
+    """Median processor time of a call of each case [s].  The cases take turns, and each round starts with a different one."""
     times: dict[Case, list[float]] = {case: [] for case in cases}
     for case in cases:
         case.call()
@@ -98,7 +100,7 @@ def in_turns(cases: Sequence[Case], rounds: int) -> dict[Case, float]:
 
 
 def with_what_they_need(cases: Iterable[Case]) -> list[Case]:
-    """The cases, and those that they are compared with, once each."""
+    """The cases and those that they are compared with, each listed once."""
     found: dict[Case, None] = {}
 
     def add(case: Case) -> None:
@@ -115,7 +117,7 @@ def with_what_they_need(cases: Iterable[Case]) -> list[Case]:
 
 
 class Pace:
-    """The speed of the machine during a long measurement, from plain steps in between, to compare two runs."""
+    """The machine's speed during a long measurement, sampled by plain steps.  It makes two runs comparable."""
 
     def __init__(self) -> None:
         self.sheet = PlainSheet(25)
@@ -144,7 +146,7 @@ def beat(text: str) -> None:
 
 
 def run(select: Sequence[str] = (), rounds: int | None = None) -> dict[str, Any]:
-    """All rows of those groups, or of all, with the machine and its limits.
+    """All rows of the selected groups, or of all groups, with the machine and its limits.
 
     Raises:
         ValueError: an unknown group.

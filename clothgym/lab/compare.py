@@ -1,8 +1,9 @@
-"""One scene, several integrators: what each costs, and how far it is from the converged solution.
+"""One scene, several integrators: the cost of each, and its distance from the converged solution.
 
-The reference is the same sheet with the same material, solved by ``rk4`` in float64 with many substeps; a run with half as many
-shows how well it has converged.  Errors are root-mean-square distances of particles at the end of the scene.  Costs are processor
-time of one thread, the median of several control steps, with the integrators in turn, so that disturbances affect all alike.
+The reference is the same sheet with the same material, solved by ``rk4`` in float64 with many substeps.  A run with half as many
+shows how well it has converged.  Errors are root-mean-square distances of particles at the end of the scene.  A cost is the
+processor time of one thread, the median of several control steps.  The integrators take turns, so that disturbances affect all
+alike.
 """
 
 from __future__ import annotations
@@ -28,14 +29,14 @@ from clothgym.lab.compare_scenes import FRAME, SCENES, Scene
 from clothgym.simulation import Simulation
 
 VERSION = 1  # of the format of files
-VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; fewer, but so many, once they have taken so long [s]
+VISITS, AT_LEAST, ENOUGH = 7, 3, 0.5  # timed control steps of each setting; the fewest, once they have taken this long [s]
 
 
 # --- one setting --------------------------------------------------------------------------------------------------------
 
 
 def rms_mm(a: NDArray, b: NDArray) -> float:
-    """Root of the mean squared distance of particles [mm]; positions [m], (particles, 3)."""
+    """Root-mean-square distance of particles [mm].  a, b: positions [m], (particles, 3)."""
     return float(1e3 * np.sqrt(np.mean(np.sum((a.astype(np.float64) - b) ** 2, axis=1))))
 
 
@@ -59,7 +60,7 @@ def reference(scene: Scene) -> tuple[NDArray, Row]:
 
 
 def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple[Row, NDArray | None]:
-    """A row of the table without costs, and the sheet at the end [m], (particles, 3), if the run was stable."""
+    """A row of the table without costs, and the final sheet [m], (particles, 3), or None if the run was unstable."""
     s = setting.simulation(scene)
     largest, _ = s.largest_substep()
     row: Row = setting._asdict() | {
@@ -85,7 +86,7 @@ def measure(scene: Scene, setting: Setting, truth: NDArray, about: Row) -> tuple
 
 
 def costs(scene: Scene, settings: Sequence[Setting], num_envs: int) -> list[float]:
-    """Median time of a control step of each setting's batch [s]; the batches take turns."""
+    """Median time of a control step of each setting's batch [s].  The batches take turns."""
     batches = [setting.simulation(scene, num_envs) for setting in settings]
     times: list[list[float]] = [[] for _ in batches]
     for s in batches:
@@ -93,14 +94,14 @@ def costs(scene: Scene, settings: Sequence[Setting], num_envs: int) -> list[floa
     for visit in range(VISITS):
         for s, taken in zip(batches, times):
             if visit < AT_LEAST or sum(taken) < ENOUGH:
-                begun = time.thread_time()  # processor time: other work of the machine is not counted
+                begun = time.thread_time()  # processor time excludes other work of the machine
                 s.step()
                 taken.append(time.thread_time() - begun)
     return [statistics.median(taken) for taken in times]
 
 
 def add_costs(scene: Scene, rows: Sequence[Row]) -> None:
-    """Measure the costs of these rows together, and add them."""
+    """Measure the costs of these rows together, and add them to the rows."""
     settings = [Setting(*(row[name] for name in Setting._fields)) for row in rows]
     together, alone = costs(scene, settings, LANES), costs(scene, settings, 1)
     for row, setting, batch, single in zip(rows, settings, together, alone):
@@ -118,7 +119,7 @@ def add_costs(scene: Scene, rows: Sequence[Row]) -> None:
 
 
 class Record:
-    """The results in a folder: written after each row, and read by the next run."""
+    """The results in a folder.  They are written after each row, and the next run reads them."""
 
     def __init__(self, folder: Path, scene: Scene, fresh: bool) -> None:
         self.path, self.sheets_path = folder / "results.json", folder / "sheets.npz"
@@ -149,13 +150,13 @@ class Record:
         return next((row for row in self.results["rows"] if setting.matches(row)), None)
 
     def write(self) -> None:
-        """Write sheets first, so that each row that is there has its sheet."""
+        """Write the sheets first, so that each written row has its sheet."""
         files.write_arrays(self.sheets_path, "comparison", VERSION, self.sheets)
         files.write_json(self.path, self.results)
 
 
 def run(plan: Plan, folder: Path, fresh: bool = False) -> Row:
-    """Measure what the folder lacks, draw the pictures, and return the results.
+    """Measure the rows that the folder lacks, draw the pictures, and return the results.
 
     Raises:
         ImportError: matplotlib is missing; nothing has been measured.

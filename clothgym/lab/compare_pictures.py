@@ -18,7 +18,7 @@ INK, QUIET = "#2b2d42", "#8d99ae"
 REFERENCE = "#c4bdb2"
 STYLES = (("-", "o"), ("--", "s"), (":", "^"))
 PANEL, ACROSS, DPI = 300, 5, 100  # pixels of a sheet's picture, sheets in a row, pixels of an inch
-FLOATING = 1e-4  # lower end of the error axis: below is the rounding of float32 [mm]
+FLOATING = 1e-4  # lower end of the error axis, at the rounding of float32 [mm]
 
 
 def pyplot() -> Any:
@@ -38,7 +38,7 @@ def pyplot() -> Any:
 
 
 def draw_work_precision(results: Row, path: Path) -> None:
-    """Error over cost: a color for each integrator, a line for each choice of its options."""
+    """Plot error over cost: a color for each integrator, and a line for each choice of its options."""
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(9.6, 5.0), layout="constrained")
     axes.set(xscale="log", yscale="log")
@@ -85,7 +85,7 @@ def draw_work_precision(results: Row, path: Path) -> None:
 
 
 def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting, Row, NDArray | None]], path: Path) -> None:
-    """The reference, and the sheet of each integrator in its color; the picture of an unstable one is empty.
+    """Draw the reference, and the sheet of each integrator in its color.  An unstable one gets an empty picture.
 
     reference, sheets: positions [m], (particles, 3).
     """

@@ -1,4 +1,4 @@
-"""What a comparison measures: which integrators, options and substeps on which scene."""
+"""The plan of a comparison: integrators, options and substeps on a scene."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class Setting(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A scene and the integrators to try on it; ``quick`` tries fewer settings."""
+    """A scene and the integrators to try on it.  With ``quick``, fewer settings are tried."""
 
     scene: Scene
     names: tuple[str, ...]
     quick: bool = False
 
     def settings(self) -> list[Setting]:
-        """All settings, by integrator, option and substeps; then the scene's variants, with the substeps of the picture."""
+        """All settings by integrator, option and substeps.  The scene's variants follow, with the substeps of the picture."""
         scene = self.scene
         tried = [n for place, n in enumerate(scene.substeps) if n == scene.shown or place % 2 or not self.quick]
         of = {name: CHOICES.get(name, ({},))[: 1 if self.quick else None] for name in self.names}
@@ -59,7 +59,7 @@ class Plan(NamedTuple):
 
 
 def plan(scene: str, names: Sequence[str] | None = None, quick: bool = False) -> Plan:
-    """What is to be measured; all integrators if no names are given.
+    """The plan for a scene, with all integrators if no names are given.
 
     Raises:
         ValueError: an unknown scene or integrator; the message lists the known ones.
@@ -73,5 +73,5 @@ def sheet_name(setting: Setting) -> str:
 
 
 def described(options: Mapping[str, int], variant: str = "") -> str:
-    """Options and variant as shown in a table."""
+    """Options and variant, as a table shows them."""
     return ", ".join([f"{name.replace('_', ' ')} {value}" for name, value in options.items()] + [variant] * bool(variant))

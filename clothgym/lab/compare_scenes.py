@@ -1,4 +1,4 @@
-"""Scenes that bring out differences between integrators, each named for what it strains."""
+"""Scenes that show differences between integrators.  Each is named after its difficulty."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ class Scene:
     """A grid of cloth, its start, and when it is evaluated.
 
     Attributes:
-        breaks: what happens and which methods have trouble with it, as a sentence.
+        breaks: what happens, and which methods have trouble with it.
         size: rows, columns, width [m], height [m].
         material: the fabric; ``damping_time`` and ``air_drag`` are the scene's own.
         held: particles that stay where they are.
         seconds: from the start to the evaluation [s].
-        substeps: numbers of substeps in a control step of 1/60 s to try.
-        shown: the one of ``substeps`` for which the picture is drawn.
+        substeps: numbers of substeps to try, in a control step of 1/60 s.
+        shown: the entry of ``substeps`` that the picture uses.
         reference_substeps: of the converged run.
         eye, target: of the picture's camera [m].
         altitude: height of the sheet's center above the floor at the start [m].
         upright: starts in the plane y = 0 instead of flat.
-        gravity: [m/s^2], downwards.
+        gravity: downward [m/s^2].
         spin: angular velocity about the vertical through the center at the start [rad/s].
         bending: see ``Simulation``.
         spring_constant: of all springs, instead of the material's [N/m].
         heavy: particles whose mass is multiplied by ``heavier``.
-        variants: other models of the same sheet, as arguments of ``Simulation`` by label, compared with the same reference.
+        variants: other models of the same sheet, as arguments of ``Simulation`` by label; they share the reference.
         settled: whether it is at rest at the end, so that its strain is static.
         conserves: whether energy and angular momentum should be conserved.
     """
@@ -237,7 +237,7 @@ SCENES: dict[str, Scene] = {
 
 
 def scene_named(name: str) -> Scene:
-    """The scene of that name.
+    """The scene with this name.
 
     Raises:
         ValueError: an unknown name; the message lists the known ones.

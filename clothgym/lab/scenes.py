@@ -1,4 +1,4 @@
-"""Two tests by which textile laboratories characterize fabrics: Cusick's drape test and the cantilever.
+"""Two standard tests of textile laboratories: Cusick's drape test and the cantilever.
 
 Both run until the sheet is at rest.  Linear drag damps the motion (``SETTLING_DRAG``); the shape at rest does not depend on it.
 """
@@ -47,7 +47,7 @@ class Drape(NamedTuple):
 class Cantilever(NamedTuple):
     """Results of a cantilever test.
 
-    droop: angle of the chord from clamp to tip below the horizontal [deg]; elastica: the same of the heavy elastica [deg].
+    droop: angle of the chord from clamp to tip below the horizontal [deg].  elastica: the same for the heavy elastica [deg].
     weight: of the strip relative to its rigidity, ``G = rho g L^3/B``.  speed: of the fastest particle at the end [m/s].
     positions: [m], (particles, 3).
     """
@@ -74,18 +74,18 @@ def cusick_drape(
     dtype: str = "float32",
     seconds: float = 6.0,
 ) -> Drape:
-    """Let a round specimen of 15 cm radius hang over a disc of 9 cm, and measure its shadow.
+    """Hang a round specimen of 15 cm radius over a disc of 9 cm, and measure its shadow.
 
     The instrument clamps the specimen between two discs; here the particles above the disc are anchored.  Each environment
-    starts from its own heights, drawn with ``seed``, ``seed + 1``, ..., and may come to rest in other folds.
+    starts from its own heights, drawn with ``seed``, ``seed + 1``, ..., and may settle into different folds.
 
     Args:
         material: the fabric; its own ``air_drag`` is replaced.
-        rings: of the specimen's mesh, a multiple of 5, so that one lies on the edge of the support.
+        rings: of the specimen's mesh; a multiple of 5 puts a ring on the edge of the support.
         seconds: longest simulated time [s]; ``Drape.speed`` shows whether the sheet was at rest.
 
     Raises:
-        ValueError: rings that are not a multiple of 5, or what ``Simulation`` refuses.
+        ValueError: rings that are not a multiple of 5, or a material that ``Simulation`` refuses.
     """
     if count("rings", rings) % 5:
         raise ValueError(f"rings={rings!r}: must be a multiple of 5, so that a ring lies on the support's edge")
@@ -108,7 +108,7 @@ def cusick_drape(
         simulation.set_parameters(gravity=(0.0, 0.0, -GRAVITY * (step + 1) / loading))
         simulation.step()
     passed = LOADING + _settle(simulation, seconds)
-    # all areas are of the mesh, whose rings are polygons, so that a flat sheet has exactly 1
+    # all areas are those of the mesh, whose rings are polygons, so a flat sheet has exactly 1
     inside = np.all(mesh.triangles < held, axis=1)
     support = projected_area(mesh.rest_positions, mesh.triangles[inside])
     shadows = np.array([projected_area(one, mesh.triangles) for one in simulation.positions])
@@ -119,8 +119,8 @@ def cusick_drape(
 def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
     """Area of the triangles' shadow on the ground [m^2], with overlaps counted once.
 
-    On each of ``LINES`` lines the length of the shadow is exactly that of the union of intervals; the lengths are summed by the
-    midpoint rule.  positions: [m], (particles, 3).
+    On each of ``LINES`` lines the length of the shadow is exactly that of the union of intervals.  The midpoint rule sums the
+    lengths.  positions: [m], (particles, 3).
     """
     x = finite("positions", positions)
     if x.ndim != 2 or x.shape[1] != 3:
@@ -160,10 +160,10 @@ def cantilever(
     dtype: str = "float32",
     seconds: float = 6.0,
 ) -> Cantilever:
-    """Clamp a strip at one end, let the other hang over, and measure how far it droops (Peirce 1930, ASTM D1388).
+    """Clamp a strip at one end, and measure how far the other end droops (Peirce 1930, ASTM D1388).
 
-    The last two columns of held particles are the clamp.  Its hinges bend over half a cell on either side, so its edge is taken
-    half a cell behind the last held column.
+    The last two columns of held particles are the clamp.  Its hinges bend over half a cell on either side.  The clamp's edge is
+    therefore half a cell behind the last held column.
 
     Args:
         material: the fabric; its own ``air_drag`` is replaced.
@@ -194,12 +194,12 @@ def cantilever(
 
 
 def elastica_droop(weight: float) -> float:
-    """Chord angle of a heavy inextensible strip, clamped level [deg]: ``theta'' = -G (1 - s) cos(theta)`` on 0 <= s <= 1, with
-    theta = 0 at the clamp and theta' = 0 at the tip.
+    """Chord angle of a heavy inextensible strip, clamped level [deg].
 
+    It solves ``theta'' = -G (1 - s) cos(theta)`` on 0 <= s <= 1, with theta = 0 at the clamp and theta' = 0 at the tip.
     weight: ``G = rho g L^3/B``.
     """
-    from scipy.integrate import solve_bvp  # imported here: it would double the time of a warm start
+    from scipy.integrate import solve_bvp  # imported here because it would double the time of a warm start
 
     s = np.linspace(0, 1, 200) ** 2  # a heavy strip bends near the clamp
     bent = np.pi / 2 * (1 - np.exp(-s * positive("weight", weight) ** (1 / 3) / 2))
@@ -215,7 +215,7 @@ def elastica_droop(weight: float) -> float:
 
 
 def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
-    """A flat specimen with slight waves in its overhanging rim, the same on any mesh [m], (particles, 3)."""
+    """A flat specimen with slight waves in its overhanging rim [m], (particles, 3).  The waves do not depend on the mesh."""
     random = np.random.default_rng(seed)
     waves = np.arange(2, MOST_WAVES + 1)
     height, phase = random.normal(scale=ASYMMETRY, size=len(waves)), random.uniform(0, 2 * np.pi, len(waves))
@@ -245,7 +245,7 @@ def _fastest(simulation: Simulation) -> NDArray[np.float64]:
 def _settle(simulation: Simulation, seconds: float) -> float:
     """Step until all sheets are at rest, for ``seconds`` at most.  Returns the simulated time [s]."""
     tenth = max(1, round(0.1 / simulation.time_step))
-    # at least half a second: a sheet that starts flat is slow at first, too
+    # at least half a second, because a sheet that starts flat is slow at first, too
     passed = 0.0
     while passed < positive("seconds", seconds) and (passed < 0.5 or _fastest(simulation).max() > REST_SPEED):
         simulation.step(tenth)
