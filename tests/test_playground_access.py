@@ -2,17 +2,20 @@
 
 import contextlib
 import http.client
+import socket
 import threading
+import time
 
 import numpy as np
 import pytest
 
 from clothgym.playground import access, server
+from clothgym.playground.files import made
 from clothgym.playground.null import NullClient
-from clothgym.playground.page import MOST_SUBSTEPS, Page
-from clothgym.playground.stage import FRAME_BUDGET, SceneStage
+from clothgym.playground.page import FRAME_BUDGET, MOST_ORDERS, MOST_SUBSTEPS, Page
+from clothgym.playground.stage import SceneStage
 
-PROTOCOL = "viser-v1.1.1"
+DEADLINE = 60.0  # seconds for what is waited for
 
 
 @pytest.fixture(scope="module")
@@ -32,16 +35,60 @@ def asked(port, host=None, origin=None, path="/", cookie=None):
         return answer.status, answer.headers, answer.read().decode(errors="replace")
 
 
-def visited(port, origin, host="127.0.0.1", path="/"):
-    """The status with which a websocket is answered: 101 for one that may come in."""
-    from websockets.exceptions import InvalidStatus
+def connected(port, origin=None, path="/"):
+    """A websocket."""
+    import viser
     from websockets.sync.client import connect
 
+    protocols = [f"viser-v{viser.__version__}"]
+    return connect(f"ws://127.0.0.1:{port}{path}", subprotocols=protocols, origin=origin, open_timeout=20, proxy=None)
+
+
+def visited(port, origin, path="/"):
+    """The status with which a websocket is answered: 101 for one that may come in."""
+    from websockets.exceptions import InvalidStatus
+
     try:
-        with connect(f"ws://{host}:{port}{path}", subprotocols=[PROTOCOL], origin=origin, open_timeout=20, proxy=None):
+        with connected(port, origin, path):
             return 101
     except InvalidStatus as refused:
         return refused.response.status_code
+
+
+def answered(port, *lines):
+    """The whole answer to a request of these lines."""
+    with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
+        client.sendall(b"\r\n".join([*lines, b"Connection: close", b"", b""]))
+        return b"".join(iter(lambda: client.recv(65536), b""))
+
+
+def come(client):
+    """Say where the visitor looks from, as a page does first: then the visit begins."""
+    import msgspec
+
+    size = {"near": 0.1, "far": 10.0, "fov": 0.6, "image_height": 9, "image_width": 9}
+    place = {"wxyz": [1, 0, 0, 0], "position": [1, -1, 1], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
+    client.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **place, **size}))
+
+
+def until(what):
+    """The first true outcome."""
+    end = time.monotonic() + DEADLINE
+    while time.monotonic() < end:
+        outcome = what()
+        if outcome:
+            return outcome
+        threading.Event().wait(0.005)
+    raise AssertionError("it did not happen in time")
+
+
+STRANGE = [
+    [b"GET / HTTP/1.1"],
+    [b"GET / HTTP/1.1", b"Host: HOST", b"Host: HOST"],
+    [b"GET //[ HTTP/1.1", b"Host: HOST"],
+    [b"GET / HTTP/1.1", b"Host: HOST", b"Origin: http://["],
+    [b"GET / HTTP/1.1", b"Host: HOST", b"Upgrade: websocket", b"Upgrade: websocket"],
+]
 
 
 # --- whose requests pass ------------------------------------------------------------------------------------------------------
@@ -91,8 +138,19 @@ def test_beyond_loopback_a_token_is_needed_and_the_page_remembers_it():
         assert asked(port, cookie=cookie.split(";")[0])[0] == 200
         assert visited(port, None, path=f"/?token={token}") == 101
         assert visited(port, "http://evil.example", path=f"/?token={token}") == 403
+        # no answer to a stranger holds the token, whatever is asked
+        for lines in STRANGE:
+            assert token.encode() not in answered(port, *lines)
     finally:
         playground.stop()
+
+
+@pytest.mark.parametrize("lines", STRANGE)
+def test_a_malformed_request_is_refused_and_leaves_no_traceback(running, lines, caplog):
+    port = running.access.port
+    lines = [line.replace(b"HOST", b"127.0.0.1:%d" % port) for line in lines]
+    assert answered(port, *lines).startswith(b"HTTP/1.1 400")
+    assert not any(record.exc_info for record in caplog.records)
 
 
 def test_a_viser_that_cannot_be_guarded_is_not_opened(monkeypatch):
@@ -117,6 +175,45 @@ def test_a_full_playground_says_so(running, monkeypatch):
     assert visited(running.access.port, None) == 503
 
 
+def test_websockets_that_begin_no_visit_fill_it_too(running, monkeypatch):
+    monkeypatch.setattr(server, "MOST_VISITS", 2)
+    port = running.access.port
+    until(lambda: visited(port, None) == 101)  # those of other tests have gone
+    with connected(port), connected(port):
+        assert visited(port, None) == 503 == asked(port)[0] and not running.visits
+    until(lambda: visited(port, None) == 101)
+
+
+def test_a_visit_ends_with_its_visitor_whose_thread_counts_until_it_does(running, monkeypatch):
+    inside, ready = threading.Event(), threading.Event()
+
+    def long_step(stage):
+        inside.set()
+        assert ready.wait(DEADLINE)
+        return stage.frame
+
+    monkeypatch.setattr(SceneStage, "advance", long_step)
+    monkeypatch.setattr(server, "MOST_VISITS", 1)
+    port = running.access.port
+    try:
+        until(lambda: visited(port, None) == 101)
+        with connected(port) as client:
+            come(client)
+            assert inside.wait(DEADLINE)
+            (visit,) = running.visits.values()
+            for _ in range(1000):
+                visit.page.order("press", "step")
+        # they have left in the midst of a step, with orders still to come
+        assert visit.closed.wait(DEADLINE)
+        until(lambda: not running.visits)
+        assert visit.thread.is_alive() and visited(port, None) == 503
+    finally:
+        ready.set()
+    visit.thread.join(DEADLINE)
+    assert not visit.thread.is_alive() and visit.frames <= 1
+    until(lambda: visited(port, None) == 101)
+
+
 # --- what a browser may send --------------------------------------------------------------------------------------------------
 
 
@@ -139,6 +236,11 @@ def test_sliders_stay_within_their_ranges_whatever_is_sent(value):
     handles[""].turn("reset")
     visitor.tick()
     settings, stage = visitor.stage.settings, visitor.stage
+    if value not in (1e9, -1e12, "1e9"):
+        # neither the lowest nor the largest: nothing changes
+        assert settings == SceneStage("patch").settings.changed(substeps=settings.substeps) and stage.seed == 0
+        assert any("Not possible: gravity m/s²=" in said for said in client.notifications)
+        assert handles["gravity m/s²"].value == settings.gravity
     assert 1 <= settings.substeps <= MOST_SUBSTEPS and 0 <= settings.stretch_stiffness <= 2000
     assert 0 <= settings.gravity <= 9.81 and 0 <= settings.wind <= 12 and 0 <= visitor.moment < len(stage.recording.frames)
     assert np.isfinite(stage.frame.positions).all()
@@ -154,21 +256,55 @@ def test_a_choice_that_is_none_changes_nothing(label):
     assert visitor.stage.settings == before and visitor.stage.name == "patch" and visitor.playing
 
 
-def test_a_frame_is_cut_short_where_it_takes_too_long(monkeypatch):
-    stage = SceneStage("patch")
+@pytest.mark.parametrize("name", ["patch", "ClothReach-v0"])
+def test_a_handle_is_dragged_no_farther_than_can_be_seen(name):
+    visitor, _ = page()
+    stage = visitor._open_stage(name)
+    stage.drag(0, [1e30, -1e30, 0.5])
+    np.testing.assert_array_equal(stage._dragged[0], [9.0, -9.0, 0.5])
+    with pytest.raises(ValueError, match="finite"):
+        stage.drag(0, [np.nan, 0.0, 0.0])
+
+
+def test_nothing_is_done_for_a_visitor_who_has_left():
+    left = threading.Event()
+    visitor, client = page(left.is_set)
+    visitor.tick()
+    steps, frames = visitor.stage.steps, len(visitor.stage.recording.frames)
+    for _ in range(MOST_ORDERS + 5):  # those beyond are dropped
+        visitor.order("press", "step")
+    assert visitor._orders.qsize() == MOST_ORDERS
+    left.set()
+    visitor.tick()
+    assert (visitor.stage.steps, len(visitor.stage.recording.frames)) == (steps, frames)
+
+
+def test_orders_that_take_long_leave_the_frame_its_time(monkeypatch):
+    visitor, _ = page()
+    visitor.tick()
+    clock = iter(np.arange(0, 1e6, FRAME_BUDGET * 0.6))
+    monkeypatch.setattr("clothgym.playground.page.time.monotonic", lambda: float(next(clock)))
+    for _ in range(10):
+        visitor.order("look")
+    visitor.tick()
+    assert visitor._orders.qsize() == 9
+
+
+def test_a_frame_is_cut_short_where_it_takes_too_long_and_only_on_a_page(monkeypatch):
+    visitor, _ = page()
     clock = iter(np.arange(0, 1e3, FRAME_BUDGET * 0.9))
     monkeypatch.setattr("clothgym.playground.stage.time.perf_counter", lambda: float(next(clock)))
-    stage.advance()
-    assert stage.steps == 1
+    alone = SceneStage("patch")
+    visitor.stage.advance()
+    alone.advance()
+    # a film that is exported does not depend on how fast the machine is
+    assert (visitor.stage.steps, alone.steps) == (1, 2)
 
 
 def test_a_film_ends_with_its_visitor():
-    left = threading.Event()
-    visitor, client = page(left.is_set)
+    visitor, client = page()
     for _ in range(3):
         visitor.tick()
-    left.set()
-    client.gui.handles["as"].value = "film (GIF)"
-    client.gui.handles["Save"].turn(True)
-    visitor.tick()
-    assert not client.files and "the visitor has left" in client.notifications[-1]
+    asked = iter([False, True])
+    with pytest.raises(InterruptedError, match="the visitor has left"):
+        made("gif", visitor.stage, 2, client.camera, left=lambda: next(asked))

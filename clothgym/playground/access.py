@@ -20,6 +20,7 @@ from urllib.parse import parse_qs, urlsplit
 
 MOST_VISITS = 16
 NOWHERE = "clothgym.invalid"  # a name that no server has
+MALFORMED = http.HTTPStatus.BAD_REQUEST, "This request is malformed."
 FRAMES = "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks on this machine may embed the page
 
 
@@ -29,13 +30,13 @@ class Access:
     Args:
         host: address that the server listens at.
         port: its port.
-        full: whether there is no room for one more visitor.
+        full: whether there is no room for one more visitor, beside so many open websockets.
 
     Attributes:
         token: that a request must bring; "" on loopback, where only this machine's programs can send one.
     """
 
-    def __init__(self, host: str, port: int, full: Callable[[], bool] = lambda: False) -> None:
+    def __init__(self, host: str, port: int, full: Callable[[int], bool] = lambda connections: False) -> None:
         self.host, self.port, self._full = host, port, full
         self.token = "" if is_loopback(host) else secrets.token_urlsafe(24)
 
@@ -44,18 +45,26 @@ class Access:
         """Where the page is: the address to open."""
         return f"http://{_named(reachable(self.host))}:{self.port}" + (f"/?token={self.token}" if self.token else "")
 
-    def refusal(self, path: str, headers: Any) -> tuple[http.HTTPStatus, str] | None:
-        """Why a request is refused, None if it may pass; path: with its query; headers: of websockets."""
+    def refusal(self, path: str, headers: Any, connections: int = 0) -> tuple[http.HTTPStatus, str] | None:
+        """Why a request is refused, None if it may pass; path: with its query; headers: of websockets; connections: open now.
+
+        No answer holds the token.
+
+        Raises:
+            ValueError, LookupError: a malformed address, or a header twice.
+        """
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         # rebound names; beyond loopback a server has names that it does not know, and the token guards it
-        if len(hosts) != 1 or (not self.token and hosts[0].lower() not in self._own_names()):
-            return http.HTTPStatus.FORBIDDEN, f"This server is not {', '.join(hosts) or 'without a name'}: open {self.url}"
+        if len(hosts) != 1:
+            return MALFORMED
+        if not self.token and hosts[0].lower() not in self._own_names():
+            return http.HTTPStatus.FORBIDDEN, f"This server is not {hosts[0]}: open {self.url}"
         if origins and (len(origins) > 1 or not _is_page_of(origins[0], hosts[0])):
             return http.HTTPStatus.FORBIDDEN, f"A page of {', '.join(origins)} may not visit this server."
         if self.token and not self._has_token(path, headers):
             return http.HTTPStatus.FORBIDDEN, "Open the whole address that the server has printed, with its token."
         entering = headers.get("Upgrade") is not None or urlsplit(path).path in ("/", "/index.html")
-        if entering and self._full():
+        if entering and self._full(connections):
             return http.HTTPStatus.SERVICE_UNAVAILABLE, f"The playground is full, with {MOST_VISITS} visitors. Try again later."
         return None
 
@@ -63,7 +72,10 @@ class Access:
         """A websocket server's ``process_request`` that refuses first, and then does as before."""
 
         def process_request(connection: Any, request: Any) -> Any:
-            refused = self.refusal(request.path, request.headers)
+            try:
+                refused = self.refusal(request.path, request.headers, len(connection.server.connections))
+            except (ValueError, LookupError):
+                refused = MALFORMED
             if refused is not None:
                 return connection.respond(refused[0], refused[1] + "\n")
             response = process(connection, request) if process is not None else None

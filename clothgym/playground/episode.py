@@ -15,7 +15,7 @@ from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.envs.episode import FAILURES, within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
-from clothgym.playground.stage import Attachment, Stability, Stage, set_in_place, stability, visible
+from clothgym.playground.stage import Attachment, Stability, Stage, set_in_place, stability, visible, within_view
 from clothgym.playground.world import SLIDERS, Settings
 from clothgym.registration import checked_id
 from clothgym.render.solids import drawn
@@ -222,7 +222,7 @@ class EpisodeStage(Stage):
         if place is None:
             self._dragged.pop(attachment, None)
         else:
-            self._dragged[attachment] = vector("place", place)
+            self._dragged[attachment] = within_view(vector("place", place))
 
     def hold(self, attachment: int, holds: bool) -> None:
         indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from queue import Empty, SimpleQueue
+from queue import Empty, Full, Queue
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from clothgym.bending import BENDING
 from clothgym.integrators import INTEGRATORS
@@ -20,6 +20,7 @@ from clothgym.playground.plots import Plots
 from clothgym.playground.readings import legend, readings_table
 from clothgym.playground.show import MODES, Show
 from clothgym.playground.stage import REBUILDS, SceneStage, Stage
+from clothgym.playground.world import number_within
 from clothgym.simulation import GRAVITY
 
 NONE = "none"
@@ -28,6 +29,8 @@ NARROWER = 0.35  # and for each further sheet whose readings make the view narro
 ROOM = 1.25  # distance of the page's eye relative to that of a picture, since panels make the view narrower
 ATTACHMENTS = 4  # anchors and grippers that a visitor can close and open
 MOST_SUBSTEPS, LARGEST_SEED = 400, 2**31 - 1
+FRAME_BUDGET = 0.5  # of orders, and of computing, for one frame [s]
+MOST_ORDERS = 10_000  # that wait; a drag gives sixty a second, and compiling takes a minute
 LEFT, COLUMN = 290, 75  # width of the left panel, and added to it for the readings of a third and a fourth sheet [pixels]
 READ_EVERY = 0.2  # between two updates of numbers and plots [s]
 # sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
@@ -45,15 +48,6 @@ CLOTH = (
     ("air_drag", "drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
     ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
 )
-
-
-def number_within(value: Any, low: float, high: float) -> float:
-    """A number that a browser has sent, clipped to its control's range; the lowest for what is no finite number."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, OverflowError):
-        return low
-    return min(max(number, low), high) if np.isfinite(number) else low
 
 
 class Page:
@@ -80,7 +74,7 @@ class Page:
     ) -> None:
         self._left = left
         self.client, self._open_stage, self.choices = client, open_stage, dict(choices)
-        self._orders: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self._orders: Queue[tuple[str, Any]] = Queue(MOST_ORDERS)
         self.playing, self.moment = True, 0
         self._stale = True  # whether the view must be drawn again
         self._waiting: Any = None  # notification that the next frame takes a while
@@ -93,26 +87,28 @@ class Page:
     # --- what a visitor does --------------------------------------------------------------------------------------------
 
     def order(self, what: str, value: Any = None) -> None:
-        """Queue what a visitor wants, for the next tick."""
-        self._orders.put((what, value))
+        """Queue what a visitor wants, for the next tick; too many orders are dropped."""
+        with contextlib.suppress(Full):
+            self._orders.put_nowait((what, value))
 
     def tick(self) -> None:
-        """Carry out the orders, advance if playing, and show what has changed."""
+        """Carry out the orders, advance if playing, and show what has changed; nothing more once the visitor has left."""
         changes: dict[str, Any] = {}
-        drags: dict[int, NDArray | None] = {}
-        while True:
+        until = time.monotonic() + FRAME_BUDGET
+        # orders that take longer wait for the next tick
+        while not self._left() and time.monotonic() < until:
             try:
                 what, value = self._orders.get_nowait()
             except Empty:
                 break
             if what == "drag":
-                # of several positions only the last counts, but the end of a drag must not be lost
-                drags[value[0]] = value[1]
                 self._do(self.stage.drag, *value)
             elif what == "change":
                 changes |= value
             else:
                 self._do(getattr(self, f"_{what}"), value)
+        if self._left():
+            return
         self._change(changes)
         if self.playing and not self._at_the_end:
             self.playing = self._do(self._advance)
@@ -176,7 +172,7 @@ class Page:
     def open(self, name: str) -> None:
         """Show another scene, environment or recording."""
         self.stage = self._open_stage(name)
-        self.stage.left = self._left
+        self.stage.left, self.stage.budget = self._left, FRAME_BUDGET
         self.playing, self.moment = True, 0
         if not self.controls:
             self._build()
@@ -191,7 +187,7 @@ class Page:
 
     def _press(self, button: str) -> None:
         if button == "reset":
-            self.stage.reset(int(number_within(self.controls["seed"].value, 0, LARGEST_SEED)))
+            self.stage.reset(int(number_within("seed", self.controls["seed"].value, 0, LARGEST_SEED)))
             self.moment, self.playing = 0, True
         elif button == "step":
             self.playing = False
@@ -202,7 +198,7 @@ class Page:
     def _scrub(self, moment: float) -> None:
         """Show an earlier frame."""
         last = len(self.stage.recording.frames) - 1
-        self.playing, self.moment = False, int(number_within(moment, 0, last))
+        self.playing, self.moment = False, int(number_within("moment", moment, 0, last))
 
     def _compare(self, _: Any = None) -> None:
         assert isinstance(self.stage, SceneStage)
@@ -231,6 +227,11 @@ class Page:
         attachment, holds = value
         if self.stage.attachments()[attachment].holds != holds:
             self.stage.hold(attachment, holds)
+
+    def _refuse(self, why: str) -> None:
+        """Set the controls back to what holds, and say why."""
+        self._fill()
+        raise ValueError(why)
 
     def _look(self, _: Any = None) -> None:
         """Draw again: only the view has changed."""
@@ -329,7 +330,10 @@ class Page:
 
         def turned(event: Any) -> None:
             if event.client_id is not None:
-                self.order(what, meant(event.target.value))
+                try:
+                    self.order(what, meant(event.target.value))
+                except ValueError as error:
+                    self.order("refuse", str(error))
 
         (control.on_click if hasattr(control, "on_click") else control.on_update)(turned)
 
@@ -347,10 +351,12 @@ class Page:
         for name, label, largest, step, unit, hint in sliders:
             slider = self._add(name, gui.add_slider(label, 0.0, largest, step, 0.0, hint=hint))
 
-            def meant(value: Any, name: str = name, largest: float = largest, unit: float = unit) -> dict[str, float | None]:
+            def meant(
+                value: Any, name: str = name, label: str = label, largest: float = largest, unit: float = unit
+            ) -> dict[str, float | None]:
                 # a preset may lie beyond the slider
                 present = (getattr(self.stage.settings, name) or 0.0) / unit
-                given = round(number_within(value, 0.0, max(largest, present)) * unit, 12)
+                given = round(number_within(label, value, 0.0, max(largest, present)) * unit, 12)
                 return {name: None if name == "strain_limit" and not given else given}
 
             self._ordered(slider, "change", meant)
@@ -373,7 +379,7 @@ class Page:
         """What the controls say, within their range."""
         if self.controls["auto"].value:
             return "auto"
-        return int(number_within(self.controls["substeps"].value, 1, max(MOST_SUBSTEPS, self._now)))
+        return int(number_within("substeps", self.controls["substeps"].value, 1, max(MOST_SUBSTEPS, self._now)))
 
     def _add_comparison(self, gui: Any) -> None:
         on = self._add(

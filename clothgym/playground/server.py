@@ -128,7 +128,8 @@ class Playground:
         self.visits: dict[int, Visit] = {}
         # viser may still write to a page that has just been closed
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-        self.access = Access(host, free, lambda: len(self.visits) >= MOST_VISITS)
+        self._leaving: list[Visit] = []  # whose visitor has left, and whose thread may still be at its last step
+        self.access = Access(host, free, lambda connections: max(connections, self._busy()) >= MOST_VISITS)
         with contextlib.redirect_stdout(io.StringIO()), self.access.guarding():  # no banner: our own line gives the address
             self.server = viser.ViserServer(host=host, port=free, label="clothgym", verbose=False)
         self.access.port = self.server.get_port()
@@ -146,8 +147,13 @@ class Playground:
         self.server.on_client_connect(self._come)
         self.server.on_client_disconnect(self._go)
 
+    def _busy(self) -> int:
+        """The number of visits, and of threads whose visitor has left."""
+        self._leaving = [visit for visit in self._leaving if visit.thread.is_alive()]
+        return len(self.visits) + len(self._leaving)
+
     async def _come(self, client: Any) -> None:
-        if len(self.visits) >= MOST_VISITS:  # several came at once
+        if self._busy() >= MOST_VISITS:  # several came at once
             client.add_notification("The playground is full", f"It has {MOST_VISITS} visitors. Try again later.", color="orange")
             return
         self.visits[client.client_id] = Visit(client, self.gallery, self.start)
@@ -156,10 +162,11 @@ class Playground:
         visit = self.visits.pop(client.client_id, None)
         if visit is not None:
             visit.closed.set()
+            self._leaving.append(visit)
 
     def stop(self) -> None:
         """End all visits, and close the server."""
-        for visit in list(self.visits.values()):
+        for visit in [*self.visits.values(), *self._leaving]:
             visit.closed.set()
             visit.thread.join(10)
         self.server.stop()
@@ -267,7 +274,7 @@ def serve(
     if not is_loopback(host):
         tell(
             f"--host {host}: other machines can reach this page. Whoever has its address can use this machine's processors. The "
-            "token in it changes with each start."
+            "token in it changes with each start; what is sent is not encrypted."
         )
     tell(f"ready after {time.perf_counter() - begun:.1f} s: open {playground.url} in a browser; Ctrl+C ends it")
     return playground

@@ -22,9 +22,9 @@ from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
-FRAME_BUDGET = 0.5  # of computing, for one frame [s]
 GUSTS = 3600  # control steps after which the gusts repeat
 LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
+EDGE_OF_VIEW = 9.0  # of each coordinate [m]
 KEPT = 1800  # most recent frames that are kept
 MOST_COMPARED = 4
 REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
@@ -100,6 +100,7 @@ class Stage:
     def __init__(self) -> None:
         self.notes: dict[str, str] = {}
         self.left: Callable[[], bool] = lambda: False  # whether the visitor has left, who need not be waited for
+        self.budget = np.inf  # of computing, for one frame [s]
 
     @property
     def frame(self) -> Frame:
@@ -239,11 +240,11 @@ class SceneStage(Stage):
         begun = time.perf_counter()
         for _ in range(STEPS):
             # a frame that takes too long is cut short: then the cloth moves slowly, but the page answers
-            if self.left() or time.perf_counter() - begun > FRAME_BUDGET:
+            if self.left() or time.perf_counter() - begun > self.budget:
                 break
             wind = np.array([self.settings.wind, 0, 0]) + self.settings.gust * self._gusts[self.steps % len(self._gusts)]
             for sheet in self.sheets:
-                if not sheet.burst:
+                if not sheet.burst and not self.left():
                     drive(sheet.simulation, self.scene, self.time, self._targets())
                     sheet.simulation.set_wind(wind)
                     sheet.step(1)
@@ -359,7 +360,7 @@ class SceneStage(Stage):
         if place is None:
             self._dragged.pop(attachment, None)
             return
-        self._dragged[attachment] = vector("place", place) - self.offsets[0]
+        self._dragged[attachment] = within_view(vector("place", place)) - self.offsets[0]
         self.hold(attachment, True)
 
     def hold(self, attachment: int, holds: bool) -> None:
@@ -433,4 +434,9 @@ def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Si
 
 def visible(x: NDArray) -> NDArray[np.float32]:
     """Positions that can be drawn [m]: values that are not finite or far away are clipped to the edge of the view."""
-    return np.clip(np.nan_to_num(x, nan=0.0, posinf=9.0, neginf=-9.0), -9.0, 9.0).astype(np.float32)
+    return within_view(np.nan_to_num(x, nan=0.0)).astype(np.float32)
+
+
+def within_view(x: NDArray) -> NDArray:
+    """Positions [m] clipped to the edge of the view."""
+    return np.clip(x, -EDGE_OF_VIEW, EDGE_OF_VIEW)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -89,6 +90,21 @@ class Settings:
         if "fabric" in changes and changes["fabric"] != self.fabric:
             changes = {name: None for name in SLIDERS if name != "air_drag"} | changes
         return replace(self, **changes)
+
+
+def number_within(label: str, value: Any, low: float, high: float) -> float:
+    """A number that a browser has sent, clipped to its control's range.
+
+    Raises:
+        ValueError: it is not finite, or no number.
+    """
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{label}={str(value)[:20]}: must be a number from {low:g} to {high:g}")
+    return min(max(number, low), high)
 
 
 Targets = Mapping[int, NDArray]
