@@ -1,14 +1,12 @@
 """Floor 6: crumpled, folded and rumpled initial sheets, and the maneuvers that make them.
 
-Tests and benchmarks use the maneuvers, too.
-
 A maneuver is a batch of sheets above a floor, with a script for their anchors or grippers.  Each environment has a seed:
 
     heap = MANEUVERS["heap"](grid(25, 25, 1.0, 1.0), seeds=range(5), self_collision="strict")
     while not heap.over:
         heap.step()
 
-Lengths scale with the sheet's side, which is its larger extent at rest.  Durations suit a sheet of about one meter.
+Lengths scale with the sheet's side, its larger extent at rest.  Durations suit a sheet of about one meter.
 """
 
 from __future__ import annotations
@@ -22,7 +20,6 @@ from numpy.typing import NDArray
 
 from clothgym import checks
 from clothgym.attachments import Gripper
-from clothgym.checks import one_of, positive
 from clothgym.collisions import Plane
 from clothgym.geometry.intersections import find_intersections
 from clothgym.material import Material
@@ -69,7 +66,7 @@ class Maneuver:
         # the sheet, centered at the origin, and a random generator for each environment
         self.mesh = mesh
         self.random = [np.random.default_rng(seed) for seed in checks.indices("seeds", seeds, 2**63 - 1, "seeds")]
-        self.thickness = positive("thickness", thickness)
+        self.thickness = checks.positive("thickness", thickness)
         self.rest = mesh.rest_positions - (mesh.rest_positions.max(axis=0) + mesh.rest_positions.min(axis=0)) / 2
         self.side = float(np.ptp(self.rest, axis=0).max())
         self.frames = 0
@@ -264,7 +261,7 @@ class Wring(Maneuver):
     def __init__(
         self, *args: Any, turns: float = 3.0, turning: float = 9.0, share: float = 0.25, approach: float = 0.15, **options: Any
     ) -> None:
-        self.turns, self.turning, self.share, self.approach = turns, positive("turning", turning), share, approach
+        self.turns, self.turning, self.share, self.approach = turns, checks.positive("turning", turning), share, approach
         self.seconds = turning + self.holding
         super().__init__(*args, **options)
 
@@ -295,7 +292,7 @@ class Drag(Maneuver):
     """A sheet above the floor is dragged by a corner at ``speed`` [m/s], from one random point to the next."""
 
     def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
-        self.speed, self.seconds = positive("speed", speed), positive("seconds", seconds)
+        self.speed, self.seconds = checks.positive("speed", speed), positive("seconds", seconds)
         super().__init__(*args, **options)
         self.target, self.goal = self.held[:, 0].copy(), self.held[:, 0].copy()
 
@@ -401,7 +398,7 @@ def make(
         ValueError: an unknown kind, or options that ``Simulation`` refuses.
         RuntimeError: a sheet that still moves faster than ``TREMBLING`` after ``LONG_SETTLING``, or that intersects itself.
     """
-    one_of("kind", kind, *STARTS)
+    checks.one_of("kind", kind, *STARTS)
     checks.count("count", count)
     checks.count("seed", seed, least=0)
     options = {"self_collision": {"mode": "strict", "thickness": thickness}} | options

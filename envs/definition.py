@@ -196,3 +196,12 @@ class TaskDefinition:
         low, high = self.arena()
         far = float(max(high - low))
         return Camera(eye=(0.7 * far, -0.6 * far, 0.45 * far), target=(0.0, 0.0, 0.15 * far), vertical_fov=40.0)
+
+
+def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:
+    """What is observed of so many points of the sheet: where they are, and their velocities."""
+    what = "3 x 3 points of the sheet (corners, edge middles, center)" if obs_mode == "keypoints" else "all particles, row by row"
+    return [
+        Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
+        Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),
+    ]

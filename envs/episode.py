@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import checks, files
+from clothgym.checks import LARGEST, fits, shown
+from clothgym.parameters import check_properties
 from clothgym.state import State
 
 SHARED = ("sheet", "self_contact")  # fields of a simulation's state that are not one array with the environment first
@@ -94,8 +96,7 @@ def generator_of(text: Any) -> np.random.Generator:
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
         described_whole = False
     if not described_whole:
-        shown = repr(text) if len(repr(text)) < 100 else f"{repr(text)[:100]}..."
-        raise ValueError(f"the state's generators hold {shown}, which is no PCG64 generator: give what get_state() gave")
+        raise ValueError(f"the state's generators hold {shown(text)}, which is no PCG64 generator: give what get_state() gave")
     return generator
 
     def branch(self, count: int, env: int = 0) -> TaskState:
@@ -173,3 +174,31 @@ def within_ball(vectors: NDArray) -> NDArray:
     """Vectors in the cube [-1, 1]^3 shortened to length 1 where they are longer."""
     squares = vectors[..., 0] ** 2 + vectors[..., 1] ** 2 + vectors[..., 2] ** 2
     return vectors / np.sqrt(np.maximum(squares, 1.0))[..., None]
+
+
+def check_state(task: Any, state: TaskState) -> None:
+    """Refuse a state's episodes, and what it belongs to; ``Simulation.set_state`` sees to the physics."""
+    advice = "give what get_state() gave, or TaskState.load(path)"
+    if not isinstance(state, TaskState) or not all(isinstance(part, dict) for part in (state.episode, state.task)):
+        raise ValueError(f"state={shown(state)}: {advice}")
+    # of another task
+    for name, here in task._belongs.items():
+        if (there := state.task.get(name)) != here:
+            raise ValueError(f"the state is of another {name} than this environment's: {there!r} instead of {here!r}")
+    memory = task._memory()
+    if set(state.episode) != set(memory):
+        raise ValueError(f"the state's episodes differ in {', '.join(sorted(set(state.episode) ^ set(memory)))}: {advice}")
+    if not isinstance(state.generators, list) or len(state.generators) != task.num_envs:
+        raise ValueError(f"the state has not one generator for each of {task.num_envs} environments: {advice}")
+    # of episodes that there cannot be
+    for name in ("over", "step", *memory):
+        low, high = task._ranges.get(name, (-LARGEST, LARGEST))
+        fits(name, state.episode[name], memory[name], low, high, advice=advice)
+        if name == "step" and np.any(state.episode["over"] & (state.episode["step"] == 0)):
+            raise ValueError("the state is from before the first reset: there is no episode to continue")
+    check_properties(task.physics.material, state.episode["material"])
+    episodes = task.episode.copy()
+    for name in names_of(episodes):
+        episodes[name] = state.episode[name]
+    for env in range(task.num_envs):
+        task.check_episode(env, episodes[env])

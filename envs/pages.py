@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from clothgym.envs.definition import Observation
+from clothgym.envs.definition import Observation, points_observed
 from clothgym.envs.measures import key_particles
-from clothgym.envs.task import Task, points_observed
+from clothgym.envs.task import Task
 
 if TYPE_CHECKING:
     from clothgym.envs.single import ClothEnv

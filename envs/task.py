@@ -19,14 +19,14 @@ from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.checks import LARGEST, fits, not_negative, numbers, one_of, shown
-from clothgym.envs.definition import VELOCITY_BOUND, Observation, TaskDefinition
-from clothgym.envs.episode import TaskState, checked_seeds, generator_of, names_of, record_of, records
+from clothgym.checks import not_negative, numbers, one_of, shown
+from clothgym.envs.definition import TaskDefinition, points_observed
+from clothgym.envs.episode import TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
 from clothgym.exclusive import Turn, exclusive
 from clothgym.material import Material
-from clothgym.parameters import AIR_DENSITY, PROPERTIES, check_properties, of_material
+from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
 from clothgym.simulation import Simulation
 
 REWARD_MODES = ("delta", "sparse")
@@ -425,7 +425,7 @@ class Task(TaskDefinition):
         Raises:
             ValueError: the state is another task's or of another size, or holds what no episode can have; nothing is changed then.
         """
-        self._check_state(state)
+        check_state(self, state)
         generators = list(map(generator_of, state.generators))
         self.simulation.set_state(state.simulation)
         self.turn.begin(range(self.num_envs))
@@ -434,39 +434,3 @@ class Task(TaskDefinition):
         self.generators[:] = generators
         self._seeded[:] = True
         self.turn.unfinished = ()
-
-    def _check_state(self, state: TaskState) -> None:
-        """Refuse a state's episodes, and what it belongs to; ``Simulation.set_state`` sees to the physics."""
-        advice = "give what get_state() gave, or TaskState.load(path)"
-        if not isinstance(state, TaskState) or not all(isinstance(part, dict) for part in (state.episode, state.task)):
-            raise ValueError(f"state={shown(state)}: {advice}")
-        # of another task
-        for name, here in self._belongs.items():
-            if (there := state.task.get(name)) != here:
-                raise ValueError(f"the state is of another {name} than this environment's: {there!r} instead of {here!r}")
-        memory = self._memory()
-        if set(state.episode) != set(memory):
-            raise ValueError(f"the state's episodes differ in {', '.join(sorted(set(state.episode) ^ set(memory)))}: {advice}")
-        if not isinstance(state.generators, list) or len(state.generators) != self.num_envs:
-            raise ValueError(f"the state has not one generator for each of {self.num_envs} environments: {advice}")
-        # of episodes that there cannot be
-        for name in ("over", "step", *memory):
-            low, high = self._ranges.get(name, (-LARGEST, LARGEST))
-            fits(name, state.episode[name], memory[name], low, high, advice=advice)
-            if name == "step" and np.any(state.episode["over"] & (state.episode["step"] == 0)):
-                raise ValueError("the state is from before the first reset: there is no episode to continue")
-        check_properties(self.physics.material, state.episode["material"])
-        episodes = self.episode.copy()
-        for name in names_of(episodes):
-            episodes[name] = state.episode[name]
-        for env in range(self.num_envs):
-            self.check_episode(env, episodes[env])
-
-
-def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:
-    """What is observed of so many points of the sheet: where they are, and their velocities."""
-    what = "3 x 3 points of the sheet (corners, edge middles, center)" if obs_mode == "keypoints" else "all particles, row by row"
-    return [
-        Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
-        Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),
-    ]

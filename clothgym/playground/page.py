@@ -20,8 +20,7 @@ from clothgym.playground.plots import Plots
 from clothgym.playground.readings import legend, readings_table
 from clothgym.playground.show import MODES, Show
 from clothgym.playground.stage import REBUILDS, SceneStage, Stage
-from clothgym.playground.world import number_within
-from clothgym.simulation import GRAVITY
+from clothgym.playground.world import CLOTH, WORLD, number_within
 
 NONE = "none"
 SIDE_BY_SIDE = 0.55  # share of its distance by which the eye moves back for each further sheet
@@ -33,21 +32,6 @@ FRAME_BUDGET = 0.5  # of orders, and of computing, for one frame [s]
 MOST_ORDERS = 10_000  # that wait; a drag gives sixty a second, and compiling takes a minute
 LEFT, COLUMN = 290, 75  # width of the left panel, and added to it for the readings of a third and a fourth sheet [pixels]
 READ_EVERY = 0.2  # between two updates of numbers and plots [s]
-# sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
-WORLD = (
-    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from zero to that of the Earth"),
-    ("wind", "wind m/s", 12.0, 0.1, 1.0, "steady part, to the right"),
-    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "root mean square of each component"),
-    ("friction", "friction", 1.0, 0.01, 1.0, "Coulomb's coefficient of the solids"),
-)
-CLOTH = (
-    ("stretch_stiffness", "yarns N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
-    ("shear_stiffness", "diagonals N/m", 1000.0, 1.0, 1.0, "shear stiffness: shear modulus times thickness"),
-    ("bend_rigidity", "bending µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
-    ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
-    ("air_drag", "drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
-    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
-)
 
 
 class Page:

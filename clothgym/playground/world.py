@@ -25,6 +25,21 @@ from clothgym.simulation import GRAVITY, Simulation
 FRAME = 1 / 60  # control step [s]
 Vector = tuple[float, float, float]
 SLIDERS = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
+# sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
+WORLD = (
+    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from zero to that of the Earth"),
+    ("wind", "wind m/s", 12.0, 0.1, 1.0, "steady part, to the right"),
+    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "root mean square of each component"),
+    ("friction", "friction", 1.0, 0.01, 1.0, "Coulomb's coefficient of the solids"),
+)
+CLOTH = (
+    ("stretch_stiffness", "yarns N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
+    ("shear_stiffness", "diagonals N/m", 1000.0, 1.0, 1.0, "shear stiffness: shear modulus times thickness"),
+    ("bend_rigidity", "bending µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
+    ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
+    ("air_drag", "drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
+    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
