@@ -292,7 +292,7 @@ class Drag(Maneuver):
     """A sheet above the floor is dragged by a corner at ``speed`` [m/s], from one random point to the next."""
 
     def __init__(self, *args: Any, speed: float = 1.0, seconds: float = 30.0, **options: Any) -> None:
-        self.speed, self.seconds = checks.positive("speed", speed), positive("seconds", seconds)
+        self.speed, self.seconds = checks.positive("speed", speed), checks.positive("seconds", seconds)
         super().__init__(*args, **options)
         self.target, self.goal = self.held[:, 0].copy(), self.held[:, 0].copy()
 
