@@ -1,12 +1,14 @@
 """The page in a real browser: a headless Chromium, which draws with SwiftShader; what is waited for has a deadline."""
 
 import contextlib
+import http.server
 import os
 import shutil
 import signal
 import socket
 import subprocess
 import tempfile
+import threading
 import time
 
 import imageio.v3 as iio
@@ -23,7 +25,8 @@ from clothgym.playground.recording import yarns  # noqa: E402
 from clothgym.playground.server import LOOPBACK, serve  # noqa: E402
 
 DEADLINE = 90.0  # seconds for what is waited for: kernels may have to be compiled, beside other tests
-FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
+REBOUND = "--host-resolver-rules=MAP evil.example 127.0.0.1"
+FLAGS = [REBOUND, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
 # another library's word on its own dependency
 KNOWN = ("THREE.Clock",)
 
@@ -210,6 +213,47 @@ def test_two_visitors_have_a_cloth_each_and_a_killed_browser_leaves_the_server_w
         until(lambda: not thread.is_alive())
     visitor.until(lambda: len(visitor.stage.recording.frames) > frames + 5)
     assert visitor.visit.thread.is_alive() and playground.visits
+
+
+def test_pages_of_other_origins_and_of_a_rebound_name_do_not_come_in(playground, chromium):
+    enter = """([address, protocol]) => new Promise((done) => {
+        const socket = new WebSocket(address, protocol);
+        socket.onopen = () => done(true);
+        socket.onclose = () => done(false);
+    })"""
+    port, protocol = playground.access.port, f"viser-v{viser.__version__}"
+    near, rebound = f"ws://{LOOPBACK}:{port}/", f"ws://evil.example:{port}/"
+    with other_site() as site, contextlib.closing(chromium.new_page()) as tab:
+        for name in ("evil.example", LOOPBACK):
+            tab.goto(f"http://{name}:{site}/")
+            assert not tab.evaluate(enter, [near, protocol])
+        # a name that now means this machine: neither the page nor, from the refusal, the websocket
+        assert tab.goto(f"http://evil.example:{port}/").status == 403
+        assert not tab.evaluate(enter, [near, protocol]) and not tab.evaluate(enter, [rebound, protocol])
+        # the same from the server's own address
+        assert tab.goto(playground.url).status == 200
+        assert tab.evaluate(enter, [near, protocol])
+
+
+@contextlib.contextmanager
+def other_site():
+    """The port of a server with an empty page."""
+    with http.server.ThreadingHTTPServer((LOOPBACK, 0), EmptyPage) as running:
+        threading.Thread(target=running.serve_forever).start()
+        try:
+            yield running.server_port
+        finally:
+            running.shutdown()
+
+
+class EmptyPage(http.server.BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.send_response(200)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def log_message(self, *_):
+        """Say nothing."""
 
 
 def test_nothing_listens_beyond_loopback(playground):
