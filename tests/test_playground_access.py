@@ -306,5 +306,5 @@ def test_a_film_ends_with_its_visitor():
     for _ in range(3):
         visitor.tick()
     asked = iter([False, True])
-    with pytest.raises(InterruptedError, match="the visitor has left"):
+    with pytest.raises(ValueError, match="the visitor has left"):
         made("gif", visitor.stage, 2, client.camera, left=lambda: next(asked))

@@ -36,9 +36,8 @@ def made(
     pictures and films, "fabric" or "strain"; left: whether the visitor has left, who then needs no file.
 
     Raises:
-        ValueError: no such kind.
+        ValueError: no such kind, or the visitor has left.
         ImportError: a library that this kind needs is missing; the message says how to get it.
-        InterruptedError: the visitor has left.
     """
     if kind not in KINDS:
         raise ValueError(f"file kind={kind!r}: must be one of {', '.join(KINDS)}")
@@ -64,7 +63,7 @@ def _wanted(frames: Sequence[Frame], left: Callable[[], bool]) -> Iterator[Frame
     """The frames, as long as somebody waits for them."""
     for frame in frames:
         if left():
-            raise InterruptedError("the visitor has left")
+            raise ValueError("the visitor has left")
         yield frame
 
 
