@@ -176,7 +176,7 @@ def test_the_most_strained_thread_that_the_page_names_is_the_cores(visitor):
     visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{i} to {j}", exact=True).count() == 1)
     visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{100 * strain.max():.2f} %", exact=True).count() == 1)
     # what was sent to the browser is red where the core is most strained
-    node = visitor.page.show._threads[0]
+    node = visitor.page.show._yarns[0]
     springs = yarns(mesh)
     loud = np.argsort(strain)[-6:]
     assert np.array_equal(node.points[loud], s.positions[0][mesh.springs.particles[springs[loud]]])
