@@ -81,24 +81,6 @@ class TaskState:
             task = {name: str(text) for name, text in parts["task"].items()}
             return TaskState(State.of(parts["simulation"]), parts["episode"], generators, task)
 
-
-def generator_of(text: Any) -> np.random.Generator:
-    """The random generator that ``get_state`` has described in JSON.
-
-    Raises:
-        ValueError: the text describes none.
-    """
-    generator = np.random.default_rng(0)
-    try:
-        described = json.loads(text)
-        generator.bit_generator.state = described
-        described_whole = generator.bit_generator.state == described and described["state"]["inc"] % 2 == 1
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        described_whole = False
-    if not described_whole:
-        raise ValueError(f"the state's generators hold {shown(text)}, which is no PCG64 generator: give what get_state() gave")
-    return generator
-
     def branch(self, count: int, env: int = 0) -> TaskState:
         """One environment's state, ``count`` times: ``vector_env.unwrapped.set_state(env.unwrapped.get_state().branch(8))``.
 
@@ -117,6 +99,24 @@ def generator_of(text: Any) -> np.random.Generator:
             generators=[self.generators[one] for one in chosen],
             task=self.task,
         )
+
+
+def generator_of(text: Any) -> np.random.Generator:
+    """The random generator that ``get_state`` has described in JSON.
+
+    Raises:
+        ValueError: the text describes none.
+    """
+    generator = np.random.default_rng(0)
+    try:
+        described = json.loads(text)
+        generator.bit_generator.state = described
+        described_whole = generator.bit_generator.state == described and described["state"]["inc"] % 2 == 1
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
+        described_whole = False
+    if not described_whole:
+        raise ValueError(f"the state's generators hold {shown(text)}, which is no PCG64 generator: give what get_state() gave")
+    return generator
 
 
 def checked_seeds(seeds: Sequence[Any]) -> list[int | None]:
