@@ -153,9 +153,33 @@ def test_a_malformed_request_is_refused_and_leaves_no_traceback(running, lines, 
     assert not any(record.exc_info for record in caplog.records)
 
 
-def test_a_viser_that_cannot_be_guarded_is_not_opened(monkeypatch):
+@pytest.mark.parametrize("lines", [[b"Host: \xff"], [b"Host: HOST", b"Origin: http://\xff"]])
+def test_a_name_of_bytes_that_are_no_text_is_refused_and_leaves_no_traceback(running, lines, caplog):
+    port = running.access.port
+    lines = [line.replace(b"HOST", b"127.0.0.1:%d" % port) for line in lines]
+    assert answered(port, b"GET / HTTP/1.1", *lines).startswith(b"HTTP/1.1 403")
+    assert not any(record.exc_info for record in caplog.records)
+
+
+def test_a_server_that_does_not_answer_is_not_guarded():
+    assert not access.Access("127.0.0.1", server.free_port("127.0.0.1", 0)).stands()
+
+
+@pytest.mark.parametrize("open_to", ["everything", "websockets", "pages"])
+def test_a_viser_that_cannot_be_guarded_is_not_opened(monkeypatch, open_to):
     pytest.importorskip("viser")
-    monkeypatch.setattr(access.Access, "guarded", lambda self, process: process)
+    guarded = access.Access.guarded
+
+    def half(self, process):
+        strict = guarded(self, process)
+
+        def process_request(connection, request):
+            kind = "websockets" if "Upgrade" in request.headers else "pages"
+            return (process if open_to in ("everything", kind) else strict)(connection, request)
+
+        return process_request
+
+    monkeypatch.setattr(access.Access, "guarded", half)
     with pytest.raises(RuntimeError, match="cannot be guarded"):
         server.Playground(server.Gallery(), "patch", port=0)
 

@@ -18,8 +18,15 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from clothgym.checks import shown
+
 MOST_VISITS = 16
 NOWHERE = "clothgym.invalid"  # a name that no server has
+# the rest of a request for a page, and of one for a websocket
+PAGE = "Connection: close\r\n"
+WEBSOCKET = (
+    "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n"
+)
 MALFORMED = http.HTTPStatus.BAD_REQUEST, "This request is malformed."
 FRAMES = "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks on this machine may embed the page
 
@@ -58,9 +65,9 @@ class Access:
         if len(hosts) != 1:
             return MALFORMED
         if not self.token and hosts[0].lower() not in self._own_names():
-            return http.HTTPStatus.FORBIDDEN, f"This server is not {hosts[0]}: open {self.url}"
+            return http.HTTPStatus.FORBIDDEN, f"This server is not {shown(hosts[0])}: open {self.url}"
         if origins and (len(origins) > 1 or not _is_page_of(origins[0], hosts[0])):
-            return http.HTTPStatus.FORBIDDEN, f"A page of {', '.join(origins)} may not visit this server."
+            return http.HTTPStatus.FORBIDDEN, f"A page of {shown(origins)} may not visit this server."
         if self.token and not self._has_token(path, headers):
             return http.HTTPStatus.FORBIDDEN, "Open the whole address that the server has printed, with its token."
         entering = headers.get("Upgrade") is not None or urlsplit(path).path in ("/", "/index.html")
@@ -105,10 +112,16 @@ class Access:
             server.serve = plain  # type: ignore[misc]
 
     def stands(self) -> bool:
-        """Whether the server refuses a request that it must refuse; asked of the server itself."""
-        with socket.create_connection((_near(self.host), self.port), timeout=10) as probe:
-            probe.sendall(f"GET / HTTP/1.1\r\nHost: {NOWHERE}\r\nConnection: close\r\n\r\n".encode())
-            return probe.recv(64).startswith(b"HTTP/1.1 403")
+        """Whether the server refuses a page and a websocket that it must refuse; asked of the server itself."""
+        return self._refuses(PAGE) and self._refuses(WEBSOCKET)
+
+    def _refuses(self, lines: str) -> bool:
+        try:
+            with socket.create_connection((_near(self.host), self.port), timeout=10) as probe:
+                probe.sendall(f"GET / HTTP/1.1\r\nHost: {NOWHERE}\r\n{lines}\r\n".encode())
+                return probe.recv(64).startswith(b"HTTP/1.1 403")
+        except OSError:  # no answer is no refusal
+            return False
 
     @property
     def _cookie(self) -> str:
