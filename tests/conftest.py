@@ -1,7 +1,8 @@
-"""What several tests share: chains of particles whose behavior is known in closed form."""
+"""What several tests share: chains of particles whose behavior is known in closed form, and the way to the training scripts."""
 
 import numpy as np
 import pytest
+from training_runs import ROOT
 
 from clothgym import Material, Simulation
 from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
@@ -57,3 +58,9 @@ def chain():
         return simulation
 
     return make
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    """The scripts' folder, to import from."""
+    monkeypatch.syspath_prepend(str(ROOT / "training"))

@@ -220,18 +220,24 @@ def test_a_sheet_too_far_from_the_origin_is_reported():
     clothgym.Simulation(sheet(), self_collision="strict", dtype="float64").reset(positions=far)
 
 
-def test_a_lane_under_an_absurd_pull_neither_hangs_nor_touches_its_neighbors():
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e25])
+def test_a_diverged_lane_neither_hangs_nor_touches_its_neighbors(value):
     mesh = sheet(9)
     x = np.stack([three_layers(mesh, 0.03)] * 3)
     runs = []
-    for pull in (9.81, 1e28):
-        simulation = clothgym.Simulation(mesh, num_envs=3, self_collision="strict", on_divergence="ignore", air_density=0)
-        simulation.set_parameters([1], warn=False, gravity=(0, 0, -pull))
+    for gone in (False, True):
+        simulation = clothgym.Simulation(mesh, num_envs=3, self_collision="strict", on_divergence="ignore")
         simulation.reset(positions=x)
+        simulation.step(2)
+        if gone:
+            state = simulation.get_state()
+            state.diverged[1], state.positions[1, 40], state.velocities[1, 40] = True, value, value
+            simulation.set_state(state)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a sheet that is far away
             simulation.step(5)
         runs.append(simulation)
+    np.testing.assert_array_equal(runs[1].diverged, [False, True, False])
     np.testing.assert_array_equal(runs[0].positions[[0, 2]], runs[1].positions[[0, 2]])
 
 

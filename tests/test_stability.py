@@ -274,7 +274,7 @@ def test_frequencies_against_a_dense_eigenvalue(mesh, bending, rigidity):
 # --- violence ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("side", "limit"), [(9, 0.1), (15, None)])
+@pytest.mark.parametrize(("side", "limit"), [(9, None), (15, None), (9, 0.1)])
 @pytest.mark.parametrize("name", [name for name in INTEGRATORS if name != "explicit_euler"])
 def test_a_corner_that_is_torn_three_meters_away_comes_back(side, name, limit):
     """At 180 m/s, with the automatic substeps: half a second there, and three seconds after that the sheet hangs as before."""

@@ -7,13 +7,12 @@ import sys
 from pathlib import Path
 
 import gymnasium as gym
-import numpy as np
 import pytest
+from training_runs import ROOT, run
 
 import clothgym
 from clothgym import files
 
-ROOT = Path(__file__).parent.parent
 SHORT = """
 ClothDrape-v0:
   n_envs: 16
@@ -25,47 +24,10 @@ ClothDrape-v0:
   learning_rate: lin_0.001
   policy_kwargs: {net_arch: [8], log_std_init: -1.0}
 """
-CONSTRAINED = """
-ClothStrain-v0:
-  n_envs: 16
-  n_timesteps: !!float 1600
-  policy: MlpPolicy
-  n_steps: 50
-  batch_size: 400
-  n_epochs: 1
-  learning_rate: lin_0.0001
-  policy_kwargs: {net_arch: [8], log_std_init: 0.0}
-  lagrange: {cost_limit: 0.5, rate: 0.01}
-"""
-CLONED = """
-ClothReach-v0:
-  n_envs: 64
-  n_timesteps: !!float 2560
-  policy: MlpPolicy
-  n_steps: 40
-  batch_size: 2560
-  n_epochs: 1
-  learning_rate: lin_0.0000001
-  policy_kwargs: {net_arch: [64, 64], log_std_init: -2.0}
-  clone: {episodes: 4, noise: 0.3, epochs: 40, batch_size: 1024, learning_rate: 0.003}
-"""
-
-
 CONFIG = {
     "env": "ClothDrape-v0", "algo": "ppo", "lagrange": {}, "clone": {}, "env_kwargs": {}, "hyperparameters": {}, "num_envs": 4,
     "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
 }  # fmt: skip
-
-
-def run(script, *arguments, cwd):
-    command = [sys.executable, str(ROOT / "training" / script), *map(str, arguments)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
-
-
-@pytest.fixture
-def scripts(monkeypatch):
-    """The scripts' folder, to import from."""
-    monkeypatch.syspath_prepend(str(ROOT / "training"))
 
 
 @pytest.fixture(scope="module")
@@ -328,157 +290,3 @@ def test_a_full_disk_ends_a_script_with_one_sentence(scripts, tmp_path, capsys):
     said = capsys.readouterr().err
     assert caught.value.code == 1 and len(said.splitlines()) == 1
     assert said.startswith("error: ") and "is whole" in said and said.endswith(": go on with  --resume run\n")
-
-
-# --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
-
-
-class Learner:
-    """What the callback needs of one."""
-
-    def __init__(self, env):
-        from stable_baselines3.common.logger import Logger
-
-        self.env, self.logger = env, Logger(None, [])
-
-    def get_env(self):
-        return self.env
-
-
-def multiplier_of(folder, env, **kwargs):
-    from lagrange import LagrangeMultiplier
-
-    callback = LagrangeMultiplier(folder, **kwargs)
-    callback.model = Learner(env)
-    callback._on_training_start()
-    return callback
-
-
-def rollout(callback, costs):
-    """One in which episodes with these costs ended, two a step, beside one that goes on."""
-    for pair in costs:
-        callback.locals = {
-            "dones": np.array([True, False, True]),
-            "infos": [{"episode_cost": pair[0]}, {}, {"episode_cost": pair[1]}],
-        }
-        assert callback._on_step()
-    callback._on_rollout_end()
-
-
-def test_the_multiplier_follows_the_excess_of_the_cost_and_is_never_below_zero(scripts, tmp_path):
-    from clothgym.adapters.sb3 import make_sb3_vec_env
-
-    env = make_sb3_vec_env("ClothStrain-v0", 3)
-    callback = multiplier_of(tmp_path, env, cost_limit=2.0, rate=0.1, most=1.5)
-    seen = []
-    # mean costs 4, none, 1, 1.5, 0, 100, 12 and 3: by 0.1 times the excess over 2, counted up to 10, from 0 to 1.5
-    for costs in ([(3, 5), (4, 4)], [], [(0, 2)], [(1, 2)], [(0, 0)], [(80, 120)], [(12, 12)], [(3, 3)], [(0, 0)] * 3):
-        rollout(callback, costs)
-        seen.append(callback.multiplier)
-        assert env.env.cost_penalty == seen[-1] == callback.multiplier
-        assert files.read_json(tmp_path / "multiplier.json", "multiplier", "") == {"multiplier": seen[-1]}
-    assert seen == pytest.approx([0.2, 0.2, 0.1, 0.05, 0.0, 1.0, 1.5, 1.5, 1.3])
-    # another one in the same folder goes on with it, and so do its environments from the first step on
-    other = make_sb3_vec_env("ClothStrain-v0", 3)
-    assert other.env.cost_penalty == 0
-    again = multiplier_of(tmp_path, other, cost_limit=2.0, rate=0.1, start=0.4)
-    assert other.env.cost_penalty == again.multiplier == pytest.approx(1.3)
-    new = multiplier_of(tmp_path / "elsewhere", other, cost_limit=2.0, rate=0.1, start=0.4)
-    assert other.env.cost_penalty == new.multiplier == 0.4
-
-
-def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
-    (tmp_path / "short.yml").write_text(CONSTRAINED)
-    options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 2, "--final-episodes", 3, "--threads", 1)
-    common = ("--env", "ClothStrain-v0", "--algo", "ppo_lagrange")
-    done = run("train.py", *common, "--run", tmp_path / "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    # a policy of pure noise costs far more than the excess of 10 that counts: 0.01 times that for each of two rollouts
-    path = tmp_path / "run" / "multiplier.json"
-    assert json.loads(path.read_text())["multiplier"] == pytest.approx(2 * 0.01 * 10)
-    assert "cost" in done.stdout and "careless" in done.stdout
-    scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
-    assert scores["references"]["careless"]["cost"] > 3 > scores["references"]["expert"]["cost"]
-    assert json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[-1])["cost"] >= 0
-    files.write_json(path, {"multiplier": 3.0})
-    resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 2400, *options[2:6], cwd=tmp_path)
-    assert resumed.returncode == 0, resumed.stderr
-    assert json.loads(path.read_text())["multiplier"] == pytest.approx(3.0 + 0.01 * 10)
-
-
-def test_costs_are_evaluated(tmp_path):
-    out = tmp_path / "scores.json"
-    command = ("--env", "ClothStrain-v0", "--policy", "noop", "careless", "--episodes", 5, "--seed", 50, "--json", out)
-    done = run("evaluate.py", *command, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    header, noop, careless = done.stdout.splitlines()[1:4]
-    assert header.split()[-2:] == ["cost", "safe"] and noop.startswith("noop") and careless.startswith("careless")
-    scores = json.loads(out.read_text())
-    costs, safe = [], []
-    for seed in range(50, 55):
-        env = gym.make("clothgym:ClothStrain-v0").unwrapped
-        env.reset(seed=seed)
-        terminated, cost = False, 0
-        while not terminated:
-            *_, terminated, _, info = env.step(env.task.careless_actions()[0].astype(np.float32))
-            cost += info["cost"]
-        costs.append(cost)
-        safe.append(info["is_success"] and cost == 0)
-    assert scores["careless"]["cost"] == pytest.approx(np.mean(costs)) and np.mean(costs) > 3
-    half = 1.96 * np.std(costs, ddof=1) / np.sqrt(5)
-    assert scores["careless"]["cost_ci95"] == pytest.approx([np.mean(costs) - half, np.mean(costs) + half])
-    assert scores["careless"]["safe_success_rate"] == np.mean(safe) and scores["careless"]["success_rate"] == 1
-    assert scores["noop"]["cost"] == 0 and scores["noop"]["safe_success_rate"] == 0
-    assert float(careless.split()[-4]) == pytest.approx(np.mean(costs), abs=0.006)
-
-
-# --- cloning the expert ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_demonstrations_are_what_the_expert_would_do_undisturbed(scripts, noise):
-    """The reach's expert goes to its place at four times the distance a second: what it does can be read off what is seen."""
-    from clone import demonstrations
-    from stable_baselines3.common.vec_env import VecMonitor
-
-    from clothgym.adapters.sb3 import make_sb3_vec_env
-
-    env = VecMonitor(make_sb3_vec_env("ClothReach-v0", 4, seed=0))
-    observations, actions = demonstrations(env, 2, noise, seed=0)
-    assert observations.shape == (2 * 40 * 4, 58) and actions.shape == (2 * 40 * 4, 3)
-    way = observations[:, 54:57] * 0.6 / 10
-    assert actions == pytest.approx(np.clip(4 * way / 0.5, -1, 1), abs=1e-4)
-    # the batch is seen step by step: where an action was followed, the way grows shorter by it
-    steps = way.reshape(80, 4, 3)[:39], way.reshape(80, 4, 3)[1:40]
-    wanted = actions.reshape(80, 4, 3)[:39]
-    wanted = wanted / np.maximum(1, np.linalg.norm(wanted, axis=2, keepdims=True)) * 0.5 / 15
-    strayed = np.abs(steps[0] - steps[1] - wanted).mean(axis=(0, 2)) / (0.5 / 15)
-    # where it is disturbed, each environment is so by a noise of its own strength
-    assert strayed.max() < 1e-3 if noise == 0 else 0.1 < strayed.max() < 0.6 and strayed.max() > 2 * strayed.min()
-
-
-def test_what_is_done_while_the_sheet_settles_is_not_demonstrated(scripts):
-    from clone import demonstrations
-
-    from clothgym.adapters.sb3 import make_sb3_vec_env
-
-    observations, actions = demonstrations(make_sb3_vec_env("ClothDrapeGripper-v0", 2, seed=0), 1, 0.3, seed=0)
-    assert observations.shape == (200, 82) and actions.shape == (200, 8)
-    assert not observations[:, 65].any() and np.abs(actions).max() <= 1
-
-
-def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(tmp_path):
-    (tmp_path / "short.yml").write_text(CLONED)
-    options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 40, "--final-episodes", 10, "--threads", 1)
-    done = run("train.py", "--env", "ClothReach-v0", "--algo", "bc_ppo", "--run", tmp_path / "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "cloned the expert from 10,240 samples" in done.stdout
-    lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
-    assert [line["timesteps"] for line in lines] == [0, 2560]
-    assert lines[0]["success_rate"] > 0.5 and lines[0]["training_seconds"] > 0
-    assert lines[1]["success_rate"] > 0.5  # one small step of PPO unlearns nothing
-    resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 5120, *options[2:6], cwd=tmp_path)
-    assert resumed.returncode == 0, resumed.stderr
-    assert "cloned the expert" not in resumed.stdout
-    scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
-    assert scores["timesteps"] == 5120 and scores["success_rate"] > 0.5 > scores["references"]["random"]["success_rate"]
