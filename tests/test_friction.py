@@ -111,7 +111,7 @@ def test_moves_are_checked():
     simulation = Simulation(grid(2, 2, 0.1, 0.1), num_envs=3, colliders=[Sphere(), Plane()])
     before = simulation.get_state()
     for arguments, message in (
-        ({"index": 2, "targets": (0, 0, 0)}, "2 colliders"),
+        ({"index": 2, "targets": (0, 0, 0)}, "index=2: must be the place of a collider, an integer of at most 1"),
         ({"index": 0}, "targets, velocities, or both"),
         ({"index": 0, "targets": (0, np.nan, 0)}, "not finite"),
         ({"index": 0, "targets": np.zeros((2, 3))}, r"shape \(2, 3\)"),

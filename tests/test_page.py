@@ -172,8 +172,10 @@ def test_the_most_strained_thread_that_the_page_names_is_the_cores(visitor):
     visitor.until(lambda: not visitor.page.playing)
     s, mesh = visitor.stage.sheets[0].simulation, visitor.stage.scene.mesh
     strain = s.strain()[0]
-    i, j = mesh.springs.particles[mesh.springs.kind < 3][np.argmax(strain)]
-    visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{i} to {j}", exact=True).count() == 1)
+    # the sheet is symmetric: several are the most strained, but for rounding
+    most = mesh.springs.particles[mesh.springs.kind < 3][strain > strain.max() - 2e-5]
+    named = [visitor.tab.get_by_role("cell", name=f"{i} to {j}", exact=True) for i, j in most]
+    visitor.until(lambda: sum(cell.count() for cell in named) == 1)
     visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{100 * strain.max():.2f} %", exact=True).count() == 1)
     # what was sent to the browser is red where the core is most strained
     node = visitor.page.show._yarns[0]
