@@ -87,11 +87,11 @@ def second_browser():
 class Visitor:
     """A tab, the server's side of it, and what the console said."""
 
-    def __init__(self, playground, browser):
+    def __init__(self, playground, browser, width=1000, height=620):
         known = set(playground.visits)
         self.said, self.asked = [], []
         self.tab = browser.new_page()
-        self.tab.set_viewport_size({"width": 1000, "height": 620})
+        self.tab.set_viewport_size({"width": width, "height": height})
         self.tab.on("console", lambda message: self.said.append((message.type, message.text)))
         self.tab.on("pageerror", lambda error: self.said.append(("error", str(error))))
         self.tab.on("request", lambda request: self.asked.append(request.url))
@@ -203,7 +203,7 @@ def test_menus_switch_the_integrator_and_the_colors(visitor):
 def test_two_visitors_have_a_cloth_each_and_a_killed_browser_leaves_the_server_well(playground, visitor):
     with second_browser() as (process, port):
         browser = visitor.tab.context.browser.browser_type.connect_over_cdp(f"http://{LOOPBACK}:{port}", timeout=1e3 * DEADLINE)
-        other = Visitor(playground, browser.contexts[0])
+        other = Visitor(playground, browser.contexts[0], 320, 240)  # a browser without a graphics card is slow
         frames = len(visitor.stage.recording.frames)
         assert other.stage is not visitor.stage
         other.until(lambda: len(other.stage.recording.frames) > 5)

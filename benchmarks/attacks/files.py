@@ -200,8 +200,10 @@ def _scripts() -> None:
 
 @cache
 def _policy() -> Any:
+    import torch
     from stable_baselines3.common.policies import ActorCriticPolicy
 
+    torch.set_num_threads(1)  # the threads of OpenMP are lost in a fork, and waited for
     env: Any = gym.make("ClothReach-v0")
     return ActorCriticPolicy(env.observation_space, env.action_space, lambda _: 1e-3, net_arch=[8])
 

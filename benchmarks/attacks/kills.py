@@ -12,10 +12,12 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -56,43 +58,70 @@ def killed_while_writing(seed: int) -> None:
 def _kill_and_resume(seconds: float | None = None, step: int | None = None) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "short.yml").write_text(SHORT)
-        child = _child(folder, step, "--run", str(folder / "run"), "--env", "ClothReach-v0")
-        if seconds is not None:
+        config = folder / "run" / "config.json"
+
+        def watch(child: int) -> None:
             # from its configuration on there is something to go on with
-            while not (folder / "run" / "config.json").exists() and not os.waitid(
-                os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT
-            ):
+            while not config.exists() and not os.waitid(os.P_PID, child, os.WEXITED | os.WNOHANG | os.WNOWAIT):
                 time.sleep(0.002)
-            time.sleep(seconds)
+            time.sleep(seconds or 0.0)
             os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        if not (folder / "run" / "config.json").exists():
+
+        trained(
+            folder, "--run", str(folder / "run"), "--env", "ClothReach-v0",
+            prepare=None if step is None else lambda: _die_at(step), watch=None if seconds is None else watch,
+        )  # fmt: skip
+        if not config.exists():
             return  # nothing had begun
-        _, status = os.waitpid(_child(folder, None, "--resume", str(folder / "run")), 0)
-        said = (folder / "said").read_text()
+        status, said = trained(folder, "--resume", str(folder / "run"))
         assert status == 0 and (folder / "run" / "evaluation.json").exists(), f"status {status}: {said[-500:]}"
         assert "Traceback" not in said, said[-500:]
 
 
-def _child(folder: Path, step: int | None, *arguments: str) -> int:
-    """Train in another process; its number."""
+def trained(
+    folder: Path, *arguments: str, prepare: Callable[[], None] | None = None, watch: Callable[[int], None] | None = None
+) -> tuple[int, str]:
+    """``training/train.py`` in another process, within a folder; see ``forked``.  prepare: what the process does first."""
     _preloaded()
-    child = os.fork()
-    if child:
-        return child
-    try:
-        file = os.open(folder / "said", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-        os.dup2(file, 1)
-        os.dup2(file, 2)
+    (folder / "short.yml").write_text(SHORT)
+
+    def train() -> None:
         os.chdir(folder)
-        if step is not None:
-            _die_at(step)
+        if prepare is not None:
+            prepare()
         _train(arguments)
-        status = 0
-    except BaseException as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
-        status = 1
+
+    return forked(train, watch)
+
+
+def forked(work: Callable[[], None], watch: Callable[[int], None] | None = None) -> tuple[int, str]:
+    """Exit status and output of some work in another process.  watch: what is done meanwhile, with the number of that process."""
+    read, write = os.pipe()
+    child = os.fork()
+    if not child:
+        os.dup2(write, 1)
+        os.dup2(write, 2)
+        _work(work)
+    os.close(write)
+    with open(read, "rb") as pipe, ThreadPoolExecutor(1) as reader:
+        said = reader.submit(pipe.read)
+        if watch is not None:
+            watch(child)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        return status, said.result().decode(errors="replace")
+
+
+def _work(work: Callable[[], None]) -> NoReturn:
+    """Work, and end this process with the status of a script."""
+    status = 0
+    try:
+        work()
+    except SystemExit as ended:
+        status = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+        print(ended.code if isinstance(ended.code, str) else "", file=sys.stderr, flush=True)
+    except BaseException:
+        traceback.print_exc()
+        status = 70
     os._exit(status)
 
 
@@ -112,6 +141,7 @@ def _preloaded() -> Any:
 def _train(arguments: tuple[str, ...]) -> None:
     """``training/train.py``, with an evaluation after each rollout and without pictures."""
     learning = _preloaded()
+    import endings
     import train
     import tyro
 
@@ -123,7 +153,8 @@ def _train(arguments: tuple[str, ...]) -> None:
     learning.HeldOutEvaluation.__init__ = often
     learning.film = learning.draw_learning_curve = lambda *ignored: None
     common = ("--hyperparams", "short.yml", "--eval-episodes", "1", "--final-episodes", "1")
-    train.main(tyro.cli(train.Args, args=(*arguments, *common)))
+    with endings.stopped():
+        train.main(tyro.cli(train.Args, args=(*arguments, *common)))
 
 
 def _die_at(step: int) -> None:

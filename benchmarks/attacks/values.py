@@ -89,7 +89,7 @@ def run(text: str) -> Any:
     if "torch" in text:
         names["torch"] = importlib.import_module("torch")
     names["attacks"] = importlib.import_module("attacks")
-    for module in ("values", "constructors", "resets", "actions", "states", "files", "kills"):
+    for module in ("values", "constructors", "resets", "actions", "states", "files", "kills", "disk", "protocol"):
         if f"attacks.{module}." in text:
             with contextlib.suppress(AttributeError):
                 setattr(names["attacks"], module, importlib.import_module(f"attacks.{module}"))

@@ -208,9 +208,12 @@ class Page:
             self._see()
 
     def _hold(self, value: tuple[int, bool]) -> None:
-        attachment, holds = value
-        if self.stage.attachments()[attachment].holds != holds:
-            self.stage.hold(attachment, holds)
+        number, holds = value
+        attachments = self.stage.attachments()[:ATTACHMENTS]
+        if number >= len(attachments):  # only a browser of a stranger sends this
+            raise ValueError(f"attachment={number}: this sheet has {len(attachments)}")
+        if attachments[number].holds != holds:
+            self.stage.hold(number, holds)
 
     def _refuse(self, why: str) -> None:
         """Set the controls back to what holds, and say why."""
