@@ -1,13 +1,15 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
+# make clients: tests with other libraries      make oldest: tests with the oldest dependencies; each in an environment of its own
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 ENV ?= ClothDrape-v0
 SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
+OLDEST = closest intersections mesh integrators collisions self_contact simulation envs reach files
 
-.PHONY: train check lint test bench clean
+.PHONY: train check lint test clients oldest bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -24,6 +26,16 @@ check: lint
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --durations=10
 
+clients:
+	$(PYTHON) -m venv $(VENV)-clients
+	$(VENV)-clients/bin/pip install --quiet "torch==2.13.0" "pytest>=8" ".[clients]"
+	cd tests && ../$(VENV)-clients/bin/python -m pytest -q clients
+
+oldest:
+	$(PYTHON) -m venv $(VENV)-oldest
+	$(VENV)-oldest/bin/pip install --quiet --constraint .ci/oldest.txt "pytest>=8" .
+	cd tests && ../$(VENV)-oldest/bin/python -m pytest -q $(OLDEST:%=test_%.py)
+
 bench: $(VENV)/ready
 	$(BIN)/python -m clothgym bench
 
@@ -37,4 +49,4 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info clothgym/envs
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-oldest build dist *.egg-info clothgym/envs
