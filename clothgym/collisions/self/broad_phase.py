@@ -26,6 +26,7 @@ class Reach(NamedTuple):
     them.
     margin: beyond the thickness within which a pair becomes a contact.  stop: that gap constraints keep.  standoff: that they keep
     where a vertex is attached.
+    at_rest: shortest distance at rest of primitives that share no vertex.
     """
 
     near: float
@@ -35,6 +36,7 @@ class Reach(NamedTuple):
     margin: float
     stop: float
     standoff: float
+    at_rest: float
 
 
 @inlined

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import disjoint, inlined, kernel
 from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
-from clothgym.collisions.self.narrow_phase import SHARE, query
+from clothgym.collisions.self.narrow_phase import MARGIN, SHARE, query
+from clothgym.collisions.self.spread import least_stretch
 from clothgym.contact_memory import REPORT_CLAMPED, REPORT_CONTACTS, REPORT_QUERIES, REPORT_UNCERTAIN
 
 INSIDE = 0.999  # share of each bound that is used; the rest allows for rounding
@@ -65,7 +66,14 @@ def confine(x, v, w, sheet, block, h):
         if due:
             _query_again(x, v, w, sheet, block, l, h, own_outside)
     # these positions are certified now
-    old[:] = x
+    _copy(x.reshape(x.size), old.reshape(x.size))
+
+
+@disjoint
+def _copy(row, out):
+    """A loop of its own, so that it is vectorized: lanes of one environment are the shortest of rows."""
+    for e in range(row.shape[0]):
+        out[e] = row[e]
 
 
 @kernel
@@ -232,27 +240,34 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
     particles = x.shape[1]
-    # copies of what the query reads, and how far ahead it looks
-    new_bounds, new_limits, extra = np.empty(particles), np.empty(particles), np.empty(particles)
-    _look_ahead(v, sheet, l, h, extra)
+    # copies of what the query reads
+    new_bounds, new_limits, extra = np.empty(particles), np.empty(particles), np.zeros(particles)
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
             start[c, k, l] = x[c, k, l]
             p[k, c] = x[c, k, l]
-    # find contacts and gap constraints, and bounds
     report = memory.report[block, l]
     report[REPORT_QUERIES] += 1
     before = memory.contacts[block, l]
     known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
-    count, constraints = query(
-        p, sheet.pairs, sheet.reach, extra, held, new_bounds, new_limits, memory.particles[block, l], memory.coefficients[block, l],
-        memory.members[block, l], memory.planes[block, l], report,
-    )  # fmt: skip
+    # of a sheet that is spread out nothing is within reach, and until the next query nothing comes within the thickness
+    count, constraints, reach = 0, 0, sheet.reach
+    clear = least_stretch(p, sheet.pairs.triangles, sheet.pairs.to_rest) * reach.at_rest
+    if clear >= max(reach.near, reach.far):
+        new_bounds[:] = SHARE * (max(clear - reach.far_thickness, min(reach.near, reach.far)) - MARGIN)
+        new_limits[:] = new_bounds
+    # else find contacts and gap constraints, and bounds
+    else:
+        _look_ahead(v, sheet, l, h, extra)
+        count, constraints = query(
+            p, sheet.pairs, reach, extra, held, new_bounds, new_limits, memory.particles[block, l], memory.coefficients[block, l],
+            memory.members[block, l], memory.planes[block, l], report,
+        )  # fmt: skip
     memory.constraints[block, l] = constraints
     # fast mode takes no notice of distances: it queries when something may have come within reach
     if not setting.strict:
-        new_bounds[:] = SHARE * min(sheet.reach.near, sheet.reach.far)
+        new_bounds[:] = SHARE * min(reach.near, reach.far)
         new_limits[:] = new_bounds + 2.0 * SHARE * extra
     # bounds are compared with squared displacements
     for k in range(particles):

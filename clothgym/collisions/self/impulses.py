@@ -35,28 +35,21 @@ FASTEST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness up to which a contact may act soon
 
 
-@apart
-def press_again(x, v, w, sheet, block, carried):
+@kernel
+def press_again(x, v, w, pressed, carried):
     """Apply the impulses of the last sweep to one block's sheets, v_i += w_i sum_k c_i j_k, before the solids, which so carry what
     lies on them.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  carried: time for which a new velocity
-    has already moved the positions [s].  Where no impulse acts, no bit changes.
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  pressed: the changes of velocities
+    [m/s], (3, particles, lanes).  carried: time for which a new velocity has already moved the positions [s].  Where no impulse
+    acts, no bit changes.
     """
-    memory = sheet.memory
-    zero, any_contact = x.dtype.type(0), False
-    # a block without contacts has nothing to apply
-    for l in range(memory.used[block]):
-        any_contact |= memory.contacts[block, l] > 0
-    if not any_contact:
-        return
     # adding -0 changes no bit; selecting x and v instead would keep the loop from being vectorized
-    negative_zero = -zero
+    negative_zero = -x.dtype.type(0)
     for c in range(3):
         _apply_impulses(
-            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), memory.pressed[block, c].reshape(w.size), carried,
-            negative_zero
-        )  # fmt: skip
+            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), pressed[c].reshape(w.size), carried, negative_zero
+        )
 
 
 @disjoint

@@ -286,4 +286,4 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
             f"at most {FAR_MOST * apart:.2g} fits, {usual:.2g} is usual"
         )
     thin = min(own, NEAR_MOST * near)
-    return Reach(REACH * thin, REACH * own, thin, own, CONTACT * thin, STOP * thin, STANDOFF * thin)
+    return Reach(REACH * thin, REACH * own, thin, own, CONTACT * thin, STOP * thin, STANDOFF * thin, min(near, apart))

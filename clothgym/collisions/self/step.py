@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.self.broad_phase import Reach
 from clothgym.collisions.self.displacement_bounds import confine, note_uncertain
 from clothgym.collisions.self.impulses import press_again, repel
@@ -122,14 +122,25 @@ def press(x, v, w, sheet, block, step, h, carried):
         # float32 certifies distances only near the origin
         if sheet.setting.single:
             note_uncertain(x, memory.report[block], memory.used[block])
-    press_again(x, v, w, sheet, block, carried)
+    if _any_contact(memory, block):
+        press_again(x, v, w, memory.pressed[block], carried)
 
 
 @apart
 def keep_apart(x, v, w, sheet, block, h, carried):
     """Stages 2 and 3, after the solids: impulses, then bounds.  Arguments as in ``press``."""
-    repel(x, v, w, sheet, block, h, carried)
+    if _any_contact(sheet.memory, block):
+        repel(x, v, w, sheet, block, h, carried)
     confine(x, v, w, sheet, block, h)
+
+
+@inlined
+def _any_contact(memory, block):
+    """Whether a block has contacts."""
+    for l in range(memory.used[block]):
+        if memory.contacts[block, l] > 0:
+            return True
+    return False
 
 
 @kernel

@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.collisions.self.spread import to_rest
 from clothgym.mesh import ClothMesh
 
 NODE_LEAVES = 8  # leaves in a node that is not split further, except the last: a vector of float64
@@ -56,6 +57,7 @@ class Pairs(NamedTuple):
     near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
     two edges.
     samples: vertices that stand for the whole sheet, (SAMPLES,).
+    to_rest: see ``spread``.
     """
 
     triangles: Int
@@ -84,6 +86,7 @@ class Pairs(NamedTuple):
     near_pairs: Int
     vertex_triangles: int
     samples: Int
+    to_rest: Real
 
 
 def pairs_of(mesh: ClothMesh) -> Pairs:
@@ -147,6 +150,7 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         near_pairs=_int(np.concatenate([vertex_triangle, edge_edge])),
         vertex_triangles=len(vertex_triangle),
         samples=_int(np.linspace(0, len(x) - 1, SAMPLES).round()),
+        to_rest=to_rest(mesh),
     )
 
 
