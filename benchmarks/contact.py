@@ -67,7 +67,7 @@ CASES: tuple[Case, ...] = (
 def depths(rows: int, case: Case) -> dict[str, Any]:
     name, solid, distance, top, size = case
     mesh = grid(rows, rows, 0.6, 0.6)
-    simulation = Simulation(mesh, Material.preset("cotton", air_drag=0.2), colliders=[solid], threads=1)
+    simulation = Simulation(mesh, Material.preset("penava_cotton", air_drag=0.2), colliders=[solid], threads=1)
     pieces = 2 if rows > 20 else 4
 
     def depth() -> float:

@@ -34,7 +34,7 @@ def targets(shape: str) -> tuple[list[float], list[float], list[Target]]:
 def coverage(solids: list[Target]) -> list[float]:
     """Coverage [share of the upper surface] of each target after settling."""
     mesh = grid(ROWS, ROWS, SIDE, SIDE)
-    material = replace(Material.preset("cotton"), air_drag=1.0)
+    material = replace(Material.preset("penava_cotton"), air_drag=1.0)
     colliders = [Plane(friction=FRICTION, thickness=THICKNESS), solids[0].collider(FRICTION, THICKNESS)]
     simulation = Simulation(mesh, material, num_envs=len(solids), time_step=1 / 60, air_density=0, colliders=colliders)
     simulation.set_collider(1, [solid.collider(FRICTION, THICKNESS) for solid in solids])

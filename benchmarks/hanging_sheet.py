@@ -49,7 +49,7 @@ SECTIONS = ("ours", "mujoco", "static", "drape")
 ROWS, SIDE, FRAME, FRAMES = 25, 1.0, 1 / 60, 30  # [m], [s]
 ENOUGH = 1.5  # seconds of frames whose median counts
 SHEET = grid(ROWS, ROWS, SIDE, SIDE)
-COTTON = Material.preset("cotton")
+COTTON = Material.preset("penava_cotton")
 # where the preset comes from: Young's modulus [Pa], Poisson's ratio, thickness [m]
 YOUNG, POISSON, THICKNESS = 0.821e6, 0.243, 0.318e-3
 

@@ -53,7 +53,7 @@ CASES: tuple[tuple[str, dict[str, float], dict[str, float] | int, float, str], .
 
 def simulation(name: str, options: dict[str, float], damping_time: float, lanes: int) -> Simulation:
     sheet = grid(ROWS, ROWS, 1.0, 1.0)
-    fabric = Material.preset("cotton", damping_time=damping_time)
+    fabric = Material.preset("penava_cotton", damping_time=damping_time)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is timed need not be accurate
         return Simulation(

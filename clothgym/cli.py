@@ -177,7 +177,7 @@ def _writable(text: str) -> Path:
 
 def _list(options: argparse.Namespace) -> None:
     from clothgym.integrators import INTEGRATORS
-    from clothgym.material import PRESETS
+    from clothgym.material import PRESETS, rigidity_percentile
     from clothgym.playground.scenes import TITLES
 
     orders = {name: f"order {method.order}" if method.order else "no order" for name, method in INTEGRATORS.items()}
@@ -186,7 +186,8 @@ def _list(options: argparse.Namespace) -> None:
         "scenes": TITLES,
         "integrators": {name: f"{orders[name]}; a substep costs {method.cost}" for name, method in INTEGRATORS.items()},
         "fabrics": {
-            name: f"{material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m"
+            name: f"{material.density * 1000:.0f} g/m^2, E t = {material.stretch_stiffness:.0f} N/m, "
+            f"B = {material.bend_rigidity * 1e6:.3g} uN m (percentile {rigidity_percentile(material.bend_rigidity):.0f})"
             for name, material in PRESETS.items()
         },
     }

@@ -103,7 +103,7 @@ class Simulation(Observed):
         self.on_divergence = on_divergence
         self.bending = model_of(bending, mesh)
         self.mesh = mesh
-        self.material = material if material is not None else Material.preset("cotton")
+        self.material = material if material is not None else Material.preset("penava_cotton")
         self.integrator = integrators.get(integrator)
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)

@@ -27,7 +27,7 @@ SHEET = grid(ROWS, ROWS, SIDE, SIDE)
 # what the ids of both tasks fix, but for what holds the sheet
 PHYSICS = Physics(
     mesh=SHEET,
-    material=Material.preset("cotton", air_drag=0.72),
+    material=Material.preset("penava_cotton", air_drag=0.72),
     time_step=1 / 30,
     integrator="semi_implicit_euler",
     substeps=50,

@@ -85,7 +85,7 @@ class ReachTask(Task):
 
     physics = Physics(
         mesh=SHEET,
-        material=Material.preset("cotton", air_drag=0.72),
+        material=Material.preset("penava_cotton", air_drag=0.72),
         time_step=1 / 15,
         integrator="semi_implicit_euler",
         substeps=50,

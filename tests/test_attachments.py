@@ -12,7 +12,7 @@ STEP = 1 / 30
 REST = MESH.rest_positions
 G = 9.81
 # damps a hanging sheet in a second or two
-DAMPED = Material.preset("cotton", air_drag=1.5)
+DAMPED = Material.preset("penava_cotton", air_drag=1.5)
 
 
 def simulation(**kwargs):

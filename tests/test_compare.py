@@ -17,7 +17,7 @@ TINY = Scene(
     name="tiny",
     breaks="a small sheet swings: for tests",
     size=(5, 5, 0.4, 0.4),
-    material=Material.preset("cotton"),
+    material=Material.preset("penava_cotton"),
     held=(20, 24),
     seconds=0.2,
     substeps=(8, 32),
@@ -61,7 +61,7 @@ def test_an_explosion_is_a_row(tiny):
     _, results = tiny
     row = row_of(results, "explicit_euler", 8)
     assert not row["stable"] and "error_mm" not in row and "ms_batch" not in row
-    assert row["auto_substeps"] >= FRAME / Material.preset("cotton").damping_time
+    assert row["auto_substeps"] >= FRAME / Material.preset("penava_cotton").damping_time
     assert all(row_of(results, name, n)["stable"] for name in ("verlet", "xpbd") for n in TINY.substeps)
 
 

@@ -147,7 +147,13 @@ def test_a_sheet_by_kinds_swings_as_one_whose_springs_are_taken_one_by_one(bendi
     lengths = mesh.springs.rest_length * np.where(np.arange(len(mesh.springs.kind)) == 3, 1 + 1e-5, 1)
     for sheet in (mesh, replace(mesh, springs=mesh.springs._replace(rest_length=lengths))):
         cloth = Simulation(
-            sheet, Material.preset("cotton"), anchors=mesh.corners[:2], wind=(1, 2, 0), bending=bending, dtype="float64", threads=1
+            sheet,
+            Material.preset("penava_cotton"),
+            anchors=mesh.corners[:2],
+            wind=(1, 2, 0),
+            bending=bending,
+            dtype="float64",
+            threads=1,
         )
         cloth.step(20)
         found.append(cloth.positions[0])

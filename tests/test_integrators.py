@@ -81,7 +81,7 @@ def test_projective_dynamics_refuses_properties_that_differ(changed_property):
     simulation.reset()
     simulation.step()
     fresh = Simulation(
-        SHEET, Material.preset("cotton", **changed), integrator="projective_dynamics", anchors=[0], dtype="float64",
+        SHEET, Material.preset("penava_cotton", **changed), integrator="projective_dynamics", anchors=[0], dtype="float64",
         substeps=40,
     )  # fmt: skip
     fresh.step()
@@ -114,7 +114,7 @@ def test_all_others_take_figures_by_environment(name):
     simulation = Simulation(SHEET, num_envs=2, integrator=name, anchors=[0], substeps=300, dtype="float64")
     simulation.set_parameters(stretch_stiffness=[100.0, 261.1], shear_stiffness=[40.0, 105.0], density=[0.1503, 0.2])
     simulation.step(5)
-    cotton = Material.preset("cotton", density=0.2)
+    cotton = Material.preset("penava_cotton", density=0.2)
     alone = Simulation(SHEET, cotton, integrator=name, anchors=[0], substeps=300, dtype="float64")
     alone.step(5)
     assert np.array_equal(simulation.positions[1], alone.positions[0])

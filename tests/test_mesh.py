@@ -126,7 +126,7 @@ def test_unknown_preset_lists_the_known():
 
 
 def test_cotton_has_the_mass_and_stiffness_of_its_source():
-    cotton = Material.preset("cotton")
+    cotton = Material.preset("penava_cotton")
     thickness, modulus, poisson = 0.318e-3, 0.821e6, 0.243
     assert cotton.density == pytest.approx(472.64 * thickness, rel=1e-3)
     assert cotton.stretch_stiffness == pytest.approx(modulus * thickness, rel=1e-3)

@@ -118,7 +118,7 @@ def test_parameters_differ_by_lane():
     s = simulation(num_envs=4)
     s.set_parameters([1, 3], density=[0.15, 0.30], gravity=[[0, 0, -9.81], [0, 0, 0.0]])
     s.step(10)
-    alone = simulation(material=Material.preset("cotton", density=0.15))
+    alone = simulation(material=Material.preset("penava_cotton", density=0.15))
     alone.step(10)
     assert s.positions[1] == pytest.approx(alone.positions[0], abs=1e-5)
     assert s.positions[3] == pytest.approx(MESH.rest_positions, abs=1e-6)

@@ -6,7 +6,7 @@ from solids import ON_ITS_CORNER, bowl, box_distance, capsule_distance, chair, d
 
 from clothgym import Box, Capsule, Gripper, Material, MeshCollider, Plane, Simulation, Sphere, grid
 
-COTTON = Material.preset("cotton", air_drag=0.2)
+COTTON = Material.preset("penava_cotton", air_drag=0.2)
 AXIS = (1, 0.3, 0)
 CHAIR, BOWL = chair(), bowl()
 # a solid, its distance, the height of its top above its center, and its size [m]

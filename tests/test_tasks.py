@@ -160,7 +160,7 @@ def test_a_task_that_cannot_be_evaluated_is_refused(missing):
 class Counting(Task):
     """A sheet on the floor, of which the hooks are counted."""
 
-    physics = Physics(grid(5, 5, 0.2, 0.2), Material.preset("cotton"), 1 / 30, "semi_implicit_euler", 40, 0.5, anchors=(24,))
+    physics = Physics(grid(5, 5, 0.2, 0.2), Material.preset("penava_cotton"), 1 / 30, "semi_implicit_euler", 40, 0.5, anchors=(24,))
     acting_steps = 6
     accounts = (("calls", int),)
 
@@ -189,7 +189,7 @@ class Picking(GripperTask):
     """One gripper above the corner of a sheet that lies on the floor."""
 
     physics = Physics(
-        grid(5, 5, 0.2, 0.2), Material.preset("cotton"), 1 / 30, "semi_implicit_euler", 40, 0.6,
+        grid(5, 5, 0.2, 0.2), Material.preset("penava_cotton"), 1 / 30, "semi_implicit_euler", 40, 0.6,
         grippers=(Gripper(position=(0.1, 0.1, 0.03), reach=0.03),),
     )  # fmt: skip
     acting_steps, settling_steps = 30, 5
@@ -285,7 +285,7 @@ def test_another_fabric_has_automatic_substeps_and_its_own_name_the_task_s():
     double = Material(**{name: 2 * value for name, value in denim.items()})
     tuned, cotton, auto, named, given = (
         gym.make("clothgym:ClothDrape-v0", **kwargs).unwrapped.task.simulation
-        for kwargs in ({}, {"fabric": "cotton"}, {"substeps": "auto"}, {"fabric": "denim"}, {"fabric": double})
+        for kwargs in ({}, {"fabric": "penava_cotton"}, {"substeps": "auto"}, {"fabric": "denim"}, {"fabric": double})
     )
     assert tuned.substeps == cotton.substeps == 50 and tuned.material == cotton.material
     assert named.substeps == given.substeps > 1.3 * auto.substeps
@@ -304,7 +304,7 @@ def test_a_fabric_by_name_for_one_episode(env_id):
 
 @pytest.mark.parametrize("fabric", ["velvet", 3, {"density": 1}])
 def test_a_fabric_that_there_is_not_gets_the_list_of_those_that_there_are(fabric):
-    known = "cotton, knit, polyester, silk, wool, denim"
+    known = "median, cotton_broad.*penava_cotton, knit, polyester, silk, wool, denim"
     with pytest.raises(ValueError, match=known):
         gym.make("clothgym:ClothReach-v0", fabric=fabric)
     env = gym.make("clothgym:ClothReach-v0").unwrapped

@@ -37,7 +37,7 @@ NUMBERS = 13  # float32 values of a particle that a substep reads and writes: x,
 def hanging(mesh: ClothMesh, num_envs: int = 1, damping_time: float = 1e-4, **world: Any) -> Simulation:
     """Slightly uneven sheets that hang upright by their upper corners.  A disc hangs by particles of its rim."""
     held = mesh.corners[2:] if mesh.shape is not None else (mesh.num_particles - 4, mesh.num_particles - 1)
-    fabric = Material.preset("cotton", damping_time=damping_time, air_drag=0.72)
+    fabric = Material.preset("penava_cotton", damping_time=damping_time, air_drag=0.72)
     world = {"anchors": held, "air_density": 0.0, "threads": 1, "on_divergence": "ignore", **world}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # timings need no accuracy

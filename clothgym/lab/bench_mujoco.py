@@ -14,7 +14,7 @@ from clothgym.mesh import grid
 from clothgym.starts import EdgeDrop
 
 FRAME, ROWS, SIDE, SECONDS, DROP, THIN = 1 / 60, 25, 0.5, 2.0, 0.05, 0.004
-COTTON = Material.preset("cotton")
+COTTON = Material.preset("penava_cotton")
 YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # from the source of the preset: [Pa], [m]
 
 

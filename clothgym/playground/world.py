@@ -62,7 +62,7 @@ class Settings:
     gravity: float = GRAVITY
     wind: float = 0.0
     gust: float = 0.0
-    fabric: str = "cotton"
+    fabric: str = "penava_cotton"
     stretch_stiffness: float | None = None
     shear_stiffness: float | None = None
     bend_rigidity: float | None = None
