@@ -25,6 +25,7 @@ REST_SPEED = 1e-3  # a sheet is at rest when no particle is faster [m/s]
 LOADING = 1.0  # time in which gravity grows from zero, as the specimen is lowered onto the instrument's disc [s]
 ASYMMETRY, MOST_WAVES = 1e-4, 12  # initial waves, without which a specimen would not fold: height [m], largest number around it
 LINES = 4000  # scan lines across a shadow
+FOLD_DEPTH = 0.05  # a fold of the skirt stands out of both valleys beside it by this share of the overhang
 COLUMNS, ROWS = 20, 3  # free particles along a strip, and particles across it
 
 Option = str | Mapping[str, Any] | Integrator
@@ -33,11 +34,13 @@ Option = str | Mapping[str, Any] | Integrator
 class Drape(NamedTuple):
     """Results of a drape test, one for each environment.
 
-    coefficient: drape coefficient, from 0 (limp) to 1 (flat), (num_envs,).  speed: of the fastest particle at the end [m/s],
-    (num_envs,).  seconds: simulated time [s].  positions: [m], (num_envs, particles, 3).  mesh: the specimen.
+    coefficient: drape coefficient, from 0 (limp) to 1 (flat), (num_envs,).  folds: their number, see ``fold_count``, (num_envs,).
+    speed: of the fastest particle at the end [m/s], (num_envs,).  seconds: simulated time [s].  positions: [m], (num_envs,
+    particles, 3).  mesh: the specimen.
     """
 
     coefficient: NDArray[np.float64]
+    folds: NDArray[np.int64]
     speed: NDArray[np.float64]
     seconds: float
     positions: NDArray
@@ -113,7 +116,30 @@ def cusick_drape(
     support = projected_area(mesh.rest_positions, mesh.triangles[inside])
     shadows = np.array([projected_area(one, mesh.triangles) for one in simulation.positions])
     coefficient = (shadows - support) / (float(mesh.area.sum()) - support)
-    return Drape(coefficient, _fastest(simulation), passed, simulation.positions, mesh)
+    rim = simulation.positions[:, -6 * rings :].astype(np.float64)  # particles of the last ring come last, in their order
+    folds = np.array([fold_count(one, FOLD_DEPTH * (SPECIMEN_RADIUS - SUPPORT_RADIUS)) for one in rim])
+    return Drape(coefficient, folds, _fastest(simulation), passed, simulation.positions, mesh)
+
+
+def fold_count(rim: ArrayLike, depth: float) -> int:
+    """Number of folds, or nodes, of a skirt around the z axis: places of its rim that are farther from the axis than the valleys.
+
+    Args:
+        rim: points along the closed rim, in order [m], (points, 3).
+        depth: a fold is at least so much farther from the axis than the deeper valleys on either side [m].
+
+    Raises:
+        ValueError: fewer than three points, or values that are not finite.
+    """
+    from scipy.signal import find_peaks  # imported here because it would slow down a warm start
+
+    x = finite("rim", rim)
+    if x.ndim != 2 or x.shape[1] != 3 or len(x) < 3:
+        raise ValueError(f"rim has shape {x.shape}: must be (points, 3), of three points or more")
+    # once around, from the deepest valley back to it
+    radius = np.hypot(x[:, 0], x[:, 1])
+    around = np.roll(radius, -int(np.argmin(radius)))
+    return len(find_peaks(np.append(around, around[0]), prominence=positive("depth", depth))[0])
 
 
 def projected_area(positions: ArrayLike, triangles: ArrayLike) -> float:
