@@ -148,7 +148,9 @@ def batch_seeds(seed: Any, num_envs: int) -> list[int | None]:
 
 def records(count: int, fields: Fields) -> NDArray:
     """Records with these fields, all zero, (count,): kernels read ``record.name``, Python ``records["name"]``."""
-    return np.zeros(count, np.dtype(list(fields), align=True))
+    # a shape of 1 is a row: older versions of numpy take it for a number
+    whole = [(name, kind, *((size,) if isinstance(size, int) else size for size in shape)) for name, kind, *shape in fields]
+    return np.zeros(count, np.dtype(whole, align=True))
 
 
 def names_of(records: NDArray) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import clothgym.envs
 from clothgym import Simulation, Sphere, State, files, grid
 from clothgym.envs.episode import TaskState
 from clothgym.playground.recording import Recording
@@ -159,8 +160,8 @@ def test_attacks_end_in_a_sentence_or_do_no_harm(family, count, monkeypatch):
             attack()
             outcomes["fine"] += 1
         except ValueError as error:
-            raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename)
-            ours = raised_in.is_relative_to(ROOT / "clothgym") or raised_in.is_relative_to(ROOT / "envs")
+            raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename).resolve()
+            ours = any(raised_in.is_relative_to(Path(package.__file__).resolve().parent) for package in (clothgym, clothgym.envs))
             assert "/tmp" in str(error) if family == "files" else ours, text
             outcomes["refused"] += 1
     assert outcomes["refused"] > count / 2 and outcomes["fine"] > 0
