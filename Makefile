@@ -7,7 +7,7 @@ BIN = $(VENV)/bin
 ENV ?= ClothDrape-v0
 SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
-OLDEST = closest intersections mesh integrators collisions self_contact simulation envs reach files
+OLDEST = closest intersections mesh integrators simulation envs reach
 
 .PHONY: train check lint test clients oldest bench clean
 
@@ -28,7 +28,7 @@ test: lint
 
 clients:
 	$(PYTHON) -m venv $(VENV)-clients
-	$(VENV)-clients/bin/pip install --quiet "torch==2.13.0" "pytest>=8" ".[clients]"
+	$(VENV)-clients/bin/pip install --quiet --constraint .ci/clients.txt "torch==2.13.0" "pytest>=8" ".[clients]"
 	cd tests && ../$(VENV)-clients/bin/python -m pytest -q clients
 
 oldest:

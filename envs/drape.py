@@ -57,7 +57,7 @@ class DrapeTask(Task):
     physics = replace(draping.PHYSICS, anchors=(SHEET.corners[2], SHEET.corners[3]))
     kernels = Kernels(
         draping.covering, draping.evaluate_cover, draping.observe_target, act=_let_go, done=_holds_nothing,
-        account=draping.account_reference,
+        account=draping.account_reference, stop=draping.stop_at_target,
     )  # fmt: skip
     acting_steps = 60
     settling_steps = 40

@@ -94,7 +94,13 @@ class DrapeGripperTask(GripperTask):
     physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.attachment_speed, reach=REACH),) * 2)
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _potential, draping.evaluate_cover, _observe, act=_take, account=draping.account_reference, fingers=close_or_open
+        _potential,
+        draping.evaluate_cover,
+        _observe,
+        act=_take,
+        account=draping.account_reference,
+        fingers=close_or_open,
+        stop=draping.stop_at_target,
     )
     acting_steps = 100
     settling_steps = 40

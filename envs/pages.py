@@ -30,14 +30,22 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "integrator": ("``$integrator``", "or another, by name or ``{\"name\": ..., option: ...}``, with automatic substeps"),
     "substeps": ("$substeps", 'substeps of a control step, or ``"auto"``'),
-    "bending": ('``"springs"``', 'or ``"hinge"`` or ``"quadratic"``, see ``clothgym.bending``'),
+    "physics": (
+        '``"fast"``',
+        'contact with particles alone, none of the sheet with itself, skip springs, hands that go through solids; or ``"true"``: '
+        "whole-sheet and strict contact, rigidity, solids that stop hands, a measured fabric in quadratic air",
+    ),
+    "bending": ("``None``", 'that of ``physics``; or ``"springs"``, ``"hinge"``, ``"quadratic"``, see ``clothgym.bending``'),
     "strain_limit": (
         "``None``", 'largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met',
     ),
     "self_collision": (
-        "``False``", 'or ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``attachment_lag`` and more',
+        "``None``",
+        'that of ``physics``; or ``False``, ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``attachment_lag`` and more',
     ),
-    "contact": ('``"particles"``', 'what touches solids: particles only, or ``"sheet"``, the whole sheet, which solids also stop'),
+    "contact": (
+        "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet, which solids stop',
+    ),
     "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
     "obs_mode": ('``"keypoints"``', 'or ``"particles"``'),
     "reward_mode": ('``"delta"``', 'or ``"sparse"``'),

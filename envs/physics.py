@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.attachments import Gripper
-from clothgym.checks import finite, number, shown
+from clothgym.checks import finite, number, one_of, shown
 from clothgym.guards import refusal
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
@@ -20,6 +20,9 @@ from clothgym.parameters import AIR_DENSITY, PROPERTIES
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
+PHYSICS = ("true", "fast")
+MEDIAN = Material.preset("median")
+MEDIAN = replace(MEDIAN, air_drag=2 * MEDIAN.density)  # 2 per second, the middle of what was found for filmed cloth
 MEASURED = ("density", "stretch_stiffness", "shear_stiffness", "bend_rigidity")  # what presets take from measurements
 
 
@@ -33,8 +36,10 @@ class Physics:
         integrator, substeps: how it is advanced.
         attachment_speed: speed limit of anchors and grippers [m/s].
         anchors, grippers: see ``Simulation``.
-        air_density: [kg/m^3]; 0 where the linear drag alone stands for the air.
+        air_density: [kg/m^3].
         wind: what the air does, unless the environment's keyword says otherwise.
+        contact, self_collision, bending: as ``Simulation`` takes them.
+        solid_hands: whether solids stop what holds the sheet, in tasks whose kernels see to it.
     """
 
     mesh: ClothMesh
@@ -47,6 +52,27 @@ class Physics:
     grippers: tuple[Gripper, ...] = ()
     air_density: float = AIR_DENSITY
     wind: Wind | None = None
+    contact: str = "particles"
+    self_collision: Any = False
+    bending: str = "springs"
+    solid_hands: bool = False
+
+    def chosen(self, name: str) -> Physics:
+        """This, with the short cuts that most benchmarks take: "fast"; or "true", without them.
+
+        Fast: solids touch particles alone, the sheet passes through itself and hands through solids, and skip springs, which have
+        no rigidity in the flat state, stand for bending.  True: the whole sheet is in contact, with itself, too, solids stop hands,
+        and it bends with its rigidity.  Where an id has a linear drag in place of the air, the fabric is then the median of 618
+        that were measured, in quadratic air, with a drag as of filmed cloth; see docs/physics.md, "What brings a sheet to rest".
+
+        Raises:
+            ValueError: another name.
+        """
+        one_of("physics", name, *PHYSICS)
+        if name == "fast":
+            return self
+        true = replace(self, contact="sheet", self_collision="strict", bending="quadratic", solid_hands=True)
+        return true if self.air_density > 0 else replace(true, material=MEDIAN, air_density=AIR_DENSITY)
 
 
 def chosen_fabric(fabric: Any, own: Material) -> Material:

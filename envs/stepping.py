@@ -40,6 +40,7 @@ account = placeholder(
     "of (own, rules, sheet, info, terms, running, failure), at an episode's start, not running, and after each step: the rest of "
     "info, and the sum of the task's own reward terms",
 )
+stop = placeholder("stop", "of (own, rules, k): moves the place where attachment k is to go, own.targets[k], out of solids")
 fingers = placeholder("fingers", "of (move, wanted, acting): how far a gripper's fingers are to open, from 0 to 1")
 
 
@@ -98,6 +99,11 @@ def _no_fingers(move, wanted, acting):
     return wanted
 
 
+@inlined
+def _nothing_stops(own, rules, k):
+    """Hands go where they like."""
+
+
 class Kernels(NamedTuple):
     """A task's own part of a step, see the module."""
 
@@ -109,6 +115,7 @@ class Kernels(NamedTuple):
     done: Any = _never
     account: Any = _no_more
     fingers: Any = _no_fingers
+    stop: Any = _nothing_stops
 
 
 IN_NUMPY = Kernels(_performance_written, _evaluation_written, _observed_already, done=_done_written)
@@ -206,6 +213,9 @@ def apply_actions(actions, block, lane, rules, episode, air, outcome, targets, w
                 if acting:
                     there = own.targets[k, c] + rule.reach * (move[c] / slow)
                     own.targets[k, c] = min(max(there, rule.low[c]), rule.high[c])
+            if acting:
+                stop(own, rule, k)
+            for c in range(3):
                 targets[b, k, c, l] = own.targets[k, c]
             wanted[b, k, l] = fingers(move, wanted[b, k, l], acting)
         # the wind that the episode has drawn for this step; its last one holds on

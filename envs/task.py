@@ -42,7 +42,8 @@ class Task(TaskDefinition):
         fabric: another fabric than the task's own, a ``Material`` or a preset's name; substeps are then chosen automatically.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
-        bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them.
+        physics: "fast", the task's own with its short cuts, or "true", without them, see ``Physics.chosen``.
+        bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them, in place of what that fixes.
         obs_mode: one of ``obs_modes``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
         randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
@@ -69,10 +70,11 @@ class Task(TaskDefinition):
         fabric: str | Material | None = None,
         integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
-        bending: str = "springs",
+        physics: str = "fast",
+        bending: str | None = None,
         strain_limit: float | None = None,
-        self_collision: bool | str | Mapping[str, Any] = False,
-        contact: str = "particles",  # what the tasks were made and scored with
+        self_collision: bool | str | Mapping[str, Any] | None = None,
+        contact: str | None = None,
         air_density: float | None = None,
         obs_mode: str = "keypoints",
         reward_mode: str = "delta",
@@ -86,40 +88,40 @@ class Task(TaskDefinition):
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
         self._check_definition()
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
-        own_fabric = self.physics.material
-        physics = self.physics = replace(self.physics, material=chosen_fabric(fabric, own_fabric))  # type: ignore[misc]
+        own = self.physics.chosen(physics)
+        fixed = self.physics = replace(own, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
         self.randomize = checked_ranges({} if randomize is None else randomize)
-        self.wind = physics.wind if wind is None else checked_wind(wind)
+        self.wind = fixed.wind if wind is None else checked_wind(wind)
         if air_density is None:
-            air_density = physics.air_density if wind is None else AIR_DENSITY
-        method = integrators.get(integrator if integrator is not None else physics.integrator)
-        check_ranges(physics, self.randomize, method)
+            air_density = fixed.air_density if wind is None else AIR_DENSITY
+        method = integrators.get(integrator if integrator is not None else fixed.integrator)
+        check_ranges(fixed, self.randomize, method)
         if substeps is None:
-            as_tuned = method.name == physics.integrator and not self.randomize and physics.material == own_fabric
-            substeps = physics.substeps if as_tuned else "auto"
+            as_tuned = physics == "fast" and method.name == fixed.integrator and fixed.material == own.material
+            substeps = fixed.substeps if as_tuned and not self.randomize else "auto"
         self.simulation = Simulation(
-            physics.mesh,
+            fixed.mesh,
             # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
-            material=most_demanding(physics.material, self.randomize),
+            material=most_demanding(fixed.material, self.randomize),
             num_envs=num_envs,
             integrator=method,
-            time_step=physics.time_step,
+            time_step=fixed.time_step,
             substeps=substeps,  # type: ignore[arg-type]
             colliders=self.colliders(),
-            contact=contact,
+            contact=fixed.contact if contact is None else contact,
             air_density=not_negative("air_density", air_density),
-            anchors=physics.anchors,  # type: ignore[arg-type]
-            anchor_speed=2 * physics.attachment_speed,
-            grippers=physics.grippers,
-            bending=bending,
+            anchors=fixed.anchors,  # type: ignore[arg-type]
+            anchor_speed=2 * fixed.attachment_speed,
+            grippers=fixed.grippers,
+            bending=fixed.bending if bending is None else bending,
             strain_limit=strain_limit,
-            self_collision=self_collision,
+            self_collision=fixed.self_collision if self_collision is None else self_collision,
             threads=threads,
             on_divergence="ignore",  # a step's outcome says so
         )
         self.num_envs = num_envs
         self.threads = self.simulation.threads
-        self.num_attachments = len(physics.anchors) + len(physics.grippers)
+        self.num_attachments = len(fixed.anchors) + len(fixed.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)
         self._prepare_observation()
         self._prepare_records()
@@ -180,7 +182,7 @@ class Task(TaskDefinition):
         self.rules = record_of(
             low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
-            side=max(physics.mesh.size), **self.constants(),
+            side=max(physics.mesh.size), solid_hands=physics.solid_hands, **self.constants(),
         )  # fmt: skip
         numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]

@@ -13,7 +13,7 @@ VALUES = [
     {"strain_limit": 0.1},
     *({"self_collision": mode} for mode in ("fast", "strict", {"mode": "strict", "thickness": 0.004})),
     {"contact": "sheet"},
-    {"contact": "sheet", "self_collision": "strict", "bending": "quadratic", "air_density": 1.2},
+    {"physics": "true"},
     {"air_density": 1.2},
     {"obs_mode": "particles"},
     {"reward_mode": "sparse"},
@@ -21,7 +21,7 @@ VALUES = [
     {"wind": {"speed": [0, 2], "gust": 0.5}},
     {"render_color": "strain"},
 ]
-CONTACT = [kwargs for kwargs in VALUES if {"self_collision", "contact"} & set(kwargs)]
+CONTACT = [kwargs for kwargs in VALUES if {"self_collision", "contact", "physics"} & set(kwargs)]
 CASES = [("ClothReach-v0", kwargs) for kwargs in VALUES]
 CASES += [(env_id, kwargs) for env_id in ("ClothDrape-v0", GRIPPER, "ClothStrain-v0") for kwargs in CONTACT]
 CASES += [(GRIPPER, kwargs) for kwargs in ({"grippers": 1}, {"slip_force": 0.5}, {"grippers": 1, "self_collision": "strict"})]
@@ -42,5 +42,5 @@ def test_every_argument_plays_episodes_through_autoreset(env_id, kwargs):
         assert np.isfinite(rewards).all() and env.observation_space.contains(observations)
         assert "diverged" not in info["failure"]
     assert ended >= 4
-    if "strict" in str(kwargs.get("self_collision")):
+    if "strict" in str(kwargs.get("self_collision")) or "physics" in kwargs:
         assert not task.simulation.intersections().any()

@@ -73,6 +73,40 @@ def test_no_anchor_moves_faster_than_the_limit_in_any_direction():
     assert again[1] == pytest.approx(moved[1], rel=1e-3)
 
 
+def outside(target, p):
+    """Distance of points from a target [m], negative within it."""
+    away = p[:, :2] - target.center
+    if target.shape == "box":
+        c, s = np.cos(target.yaw), np.sin(target.yaw)
+        x, y = np.abs(away @ [[c, -s], [s, c]]).T
+        beyond = np.stack([x - target.radius, y - target.radius, p[:, 2] - target.height], axis=1)
+        return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(axis=1), 0)
+    middle = target.height - target.radius
+    up = p[:, 2] - (np.minimum(p[:, 2], middle) if target.shape == "post" else middle)
+    return np.linalg.norm(np.column_stack([away, up]), axis=1) - target.radius
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box", "post"])
+@pytest.mark.parametrize("physics", ["true", "fast"])
+def test_solids_stop_hands_under_the_true_physics(shape, physics):
+    env, _ = start(physics=physics)
+    env.reset(seed=4, options={"target": {"shape": shape, "center": (0.0, 0.0)}})
+    task, nearest = env.task, []
+    target = task.targets[0]
+    for _ in range(60):
+        # both corners are pulled to the middle of the solid, from above and from the side
+        goal = np.array([(0.0, 0.02, target.height / 2), (0.02, 0.0, 0.7 * target.height)])
+        way = goal - task.episode["targets"][0]
+        action = np.concatenate([way / np.linalg.norm(way, axis=1)[:, None], [[-1], [-1]]], axis=1)
+        if env.step(action.ravel().astype(np.float32))[2]:
+            break
+        nearest.append(outside(target, task.episode["targets"][0]).min())
+    if physics == "true":
+        assert min(nearest) == pytest.approx(0.005, abs=1e-6)
+    else:
+        assert min(nearest) < -0.05
+
+
 @pytest.mark.parametrize(("grip", "held"), [(0.79, True), (0.81, False)])
 def test_an_anchor_lets_go_above_four_fifths(grip, held):
     env, _ = start()
