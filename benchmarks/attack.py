@@ -54,7 +54,8 @@ LISTED = 20  # lines of a family's report
 OURS = tuple(str(Path(module.__file__ or "").resolve().parent) for module in (clothgym, clothgym.envs))
 OURS = (*OURS, str(Path(__file__).resolve().parents[1] / "training"))
 REMEDY = re.compile(
-    r"\b(must|there (are|is|may)|give|takes?|need|needs|holds?|names?|check|reset|call|lower|use|set|write|choose|make|remove)\b"
+    r"\b(must|there (are|is|may)|give|takes?|need|needs|holds?|names?|check|reset|call|lower|use|set|write|choose|make|remove|"
+    r"train|install)\b"
 )
 
 Finding = tuple[str, str, str]  # what to paste, the outcome, and what was said

@@ -113,7 +113,7 @@ class Simulation(Observed):
         by_particle = is_regular(mesh) and self.integrator.any_order
         self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
         # what holds the sheet
-        if not isinstance(anchors, Sequence | np.ndarray):
+        if not isinstance(anchors, Sequence | np.ndarray) or (isinstance(anchors, np.ndarray) and not anchors.ndim):
             raise ValueError(f"anchors={shown(anchors)}: must be a sequence of particles, or of patches of them; () for none")
         patches = [indices("anchors", patch, mesh.num_particles, "particles of this mesh") for patch in anchors]
         self._attachments = Attachments(

@@ -60,7 +60,7 @@ class Maneuver:
         **options: Any,
     ) -> None:
         if not isinstance(mesh, ClothMesh):
-            raise ValueError(f"mesh={mesh!r}: must be a ClothMesh, as grid() and disc() make")
+            raise ValueError(f"mesh={checks.shown(mesh)}: must be a ClothMesh, as grid() and disc() make")
         if own := {"num_envs", "colliders", "anchors", "grippers"} & set(options):
             raise ValueError(f"{', '.join(sorted(own))}: set by the maneuver itself, leave them out")
         # the sheet, centered at the origin, and a random generator for each environment
@@ -198,7 +198,7 @@ class Fold(Maneuver):
     def __init__(self, *args: Any, times: int = 1, **options: Any) -> None:
         self.times = checks.count("times", times)
         if times > len(self.FOLDS):
-            raise ValueError(f"times={times!r}: a sheet can be folded {len(self.FOLDS)} times at most")
+            raise ValueError(f"times={checks.shown(times)}: a sheet can be folded {len(self.FOLDS)} times at most")
         self.seconds = (self.carrying + self.holding + self.resting) * times + 1.5
         self.directions = sorted({d for _, held in self.FOLDS[:times] for d in held})
         super().__init__(*args, **options)

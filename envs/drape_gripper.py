@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
+from clothgym.checks import shown
 from clothgym.collisions import Collider
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
@@ -146,7 +147,7 @@ class DrapeGripperTask(GripperTask):
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
-            raise ValueError(f"reset option rumpled={options['rumpled']!r}: must be True or False")
+            raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         target = draping.draw_target(rng, options.get("target", {}))

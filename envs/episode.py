@@ -186,7 +186,10 @@ def check_state(task: Any, state: TaskState) -> None:
     # of another task
     for name, here in task._belongs.items():
         if (there := state.task.get(name)) != here:
-            raise ValueError(f"the state is of another {name} than this environment's: {there!r} instead of {here!r}")
+            raise ValueError(
+                f"the state's {name} is {shown(there)}, this environment's {here!r}: give a state of the same task, made with the "
+                "same arguments"
+            )
     memory = task._memory()
     if set(state.episode) != set(memory):
         raise ValueError(f"the state's episodes differ in {', '.join(sorted(set(state.episode) ^ set(memory)))}: {advice}")

@@ -41,7 +41,7 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "self_collision": (
         "``None``",
-        'that of ``physics``; or ``False``, ``"fast"``, ``"strict"``; then ``info`` has ``self_contacts``, ``attachment_lag`` and more',
+        'that of ``physics``; or ``False``, ``"fast"``, ``"strict"``, with ``self_contacts`` and ``attachment_lag`` in ``info``',
     ),
     "contact": (
         "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet, which solids stop',

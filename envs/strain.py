@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym import integrators
 from clothgym._jit import inlined
-from clothgym.checks import LARGEST, not_negative, positive
+from clothgym.checks import LARGEST, not_negative, positive, shown
 from clothgym.collisions import Capsule, Collider, Sphere
 from clothgym.envs import carriers
 from clothgym.envs.definition import Observation
@@ -208,7 +208,7 @@ class StrainTask(Task):
         **kwargs: Any,
     ) -> None:
         if strain_limit is not None or integrators.get(self.physics.integrator if integrator is None else integrator).limits_strain:
-            what = f"strain_limit={strain_limit!r}" if strain_limit is not None else f"integrator={integrator!r}"
+            what = f"strain_limit={shown(strain_limit)}" if strain_limit is not None else f"integrator={shown(integrator)}"
             raise ValueError(
                 f"{what}: a limiter would keep the strain below the threshold whatever the agent does, and the task would be "
                 "empty; take an integrator without one"

@@ -58,7 +58,7 @@ class Target:
         if abs(self.yaw) > math.pi / 4 + 1e-9:
             raise ValueError(f"target yaw={self.yaw!r}: must be within 45 degrees (pi/4); a box looks the same every 90")
         if self.shape in ("sphere", "box") and not math.isclose(self.height, 2 * self.radius, rel_tol=1e-6):
-            raise ValueError(f"target height={self.height!r}: that of a {self.shape} is twice its radius {self.radius!r}")
+            raise ValueError(f"target height={self.height!r}: must be twice the radius {self.radius!r} of a {self.shape}")
         if self.shape == "post" and self.height < self.radius:
             raise ValueError(f"target height={self.height!r}: that of a post is at least its radius {self.radius!r}")
 

@@ -186,7 +186,7 @@ class Task(TaskDefinition):
         )  # fmt: skip
         numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]
-        self._belongs = {"task": type(self).__name__, "observation mode": self.obs_mode, "arguments": digest}
+        self._belongs = {"task": type(self).__name__, "observation mode": self.obs_mode, "digest of the arguments": digest}
         # what a step brings
         brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_attachments, self.actions_per_attachment)), ("free", np.uint8, self.num_attachments)]

@@ -47,7 +47,7 @@ class ClothVectorEnv(VectorEnv):
         self.num_envs = count("num_envs", num_envs)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
+        except (ValueError, TypeError):  # TypeError: what cannot even be compared
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode={shown(autoreset_mode)}: must be one of {known}") from None
         self.max_episode_steps = None if max_episode_steps is None else count("max_episode_steps", max_episode_steps, "None, or ")

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, finite, not_negative, positive, vector
+from clothgym.checks import as_array, count, finite, not_negative, positive, shown, vector
 from clothgym.collisions.solids.distance_grid import DistanceGrid, distance_grid
 from clothgym.collisions.solids.shapes import KIND_MESH, R_AXES, R_HALF, R_POINT, UNTURNED, Collider, Quaternion, Vector, turned
 from clothgym.geometry.closed_mesh import checked_solid
@@ -80,7 +80,10 @@ class MeshCollider(Collider):
             with self._named():
                 return _solid(*_frozen(x * self.scale, triangles))
         assert self.vertices is not None and self.triangles is not None
-        return _solid(*_frozen(finite("vertices", self.vertices) * self.scale, np.asarray(self.triangles)))
+        corners = as_array(self.triangles)
+        if corners is None:
+            raise ValueError(f"triangles={shown(self.triangles)}: must be an array of vertices' numbers, (triangles, 3)")
+        return _solid(*_frozen(finite("vertices", self.vertices) * self.scale, corners))
 
     @cached_property
     def grid(self) -> DistanceGrid:
