@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ SETTLING_DRAG = 20.0  # rate of the linear drag [1/s]: about critical for a skir
 REST_SPEED = 1e-3  # a sheet is at rest when no particle is faster [m/s]
 LOADING = 1.0  # time in which gravity grows from zero, as the specimen is lowered onto the instrument's disc [s]
 ASYMMETRY, MOST_WAVES = 1e-4, 12  # initial waves, without which a specimen would not fold: height [m], largest number around it
+MOST_RINGS = 100  # the support's edge is on one of so many rings, or next to it
 LINES = 4000  # scan lines across a shadow
 FOLD_DEPTH = 0.05  # a fold of the skirt stands out of both valleys beside it by this share of the overhang
 COLUMNS, ROWS = 20, 3  # free particles along a strip, and particles across it
@@ -76,24 +78,30 @@ def cusick_drape(
     integrator: Option = "semi_implicit_euler",
     dtype: str = "float32",
     seconds: float = 6.0,
+    specimen: float = SPECIMEN_RADIUS,
+    support: float = SUPPORT_RADIUS,
 ) -> Drape:
-    """Hang a round specimen of 15 cm radius over a disc of 9 cm, and measure its shadow.
+    """Hang a round specimen over a disc, of 15 cm and 9 cm radius unless others are given, and measure its shadow.
 
     The instrument clamps the specimen between two discs; here the particles above the disc are anchored.  Each environment
     starts from its own heights, drawn with ``seed``, ``seed + 1``, ..., and may settle into different folds.
 
     Args:
         material: the fabric; its own ``air_drag`` is replaced.
-        rings: of the specimen's mesh; a multiple of 5 puts a ring on the edge of the support.
+        rings: of the specimen's mesh, so many that a ring lies on the edge of the support: a multiple of 5 for the usual radii.
         seconds: longest simulated time [s]; ``Drape.speed`` shows whether the sheet was at rest.
+        specimen, support: their radii [m].
 
     Raises:
-        ValueError: rings that are not a multiple of 5, or a material that ``Simulation`` refuses.
+        ValueError: no ring on the edge of the support, a support as large as the specimen, or what ``Simulation`` refuses.
     """
-    if count("rings", rings) % 5:
-        raise ValueError(f"rings={rings!r}: must be a multiple of 5, so that a ring lies on the support's edge")
-    mesh = disc(SPECIMEN_RADIUS, rings)
-    edge = rings * 3 // 5
+    if positive("support", support) >= positive("specimen", specimen):
+        raise ValueError(f"support={support!r}: must be smaller than the specimen's radius, {specimen!r} m")
+    share = Fraction(support / specimen).limit_denominator(MOST_RINGS)
+    if count("rings", rings) % share.denominator:
+        raise ValueError(f"rings={rings!r}: must be a multiple of {share.denominator}, so that a ring lies on the support's edge")
+    mesh = disc(specimen, rings)
+    edge = rings * share.numerator // share.denominator
     held = 1 + 3 * edge * (edge + 1)  # particles of the rings up to the edge come first
     simulation = Simulation(
         mesh,
@@ -105,7 +113,7 @@ def cusick_drape(
         bending=bending,
         dtype=dtype,
     )
-    simulation.reset(positions=np.stack([_uneven(mesh.rest_positions, seed + env) for env in range(num_envs)]))
+    simulation.reset(positions=np.stack([_uneven(mesh.rest_positions, seed + env, specimen, support) for env in range(num_envs)]))
     loading = round(LOADING / simulation.time_step)
     for step in range(loading):
         simulation.set_parameters(gravity=(0.0, 0.0, -GRAVITY * (step + 1) / loading))
@@ -113,11 +121,11 @@ def cusick_drape(
     passed = LOADING + _settle(simulation, seconds)
     # all areas are those of the mesh, whose rings are polygons, so a flat sheet has exactly 1
     inside = np.all(mesh.triangles < held, axis=1)
-    support = projected_area(mesh.rest_positions, mesh.triangles[inside])
+    supported = projected_area(mesh.rest_positions, mesh.triangles[inside])
     shadows = np.array([projected_area(one, mesh.triangles) for one in simulation.positions])
-    coefficient = (shadows - support) / (float(mesh.area.sum()) - support)
+    coefficient = (shadows - supported) / (float(mesh.area.sum()) - supported)
     rim = simulation.positions[:, -6 * rings :].astype(np.float64)  # particles of the last ring come last, in their order
-    folds = np.array([fold_count(one, FOLD_DEPTH * (SPECIMEN_RADIUS - SUPPORT_RADIUS)) for one in rim])
+    folds = np.array([fold_count(one, FOLD_DEPTH * (specimen - support)) for one in rim])
     return Drape(coefficient, folds, _fastest(simulation), passed, simulation.positions, mesh)
 
 
@@ -240,13 +248,13 @@ def elastica_droop(weight: float) -> float:
     return float(np.degrees(np.arctan2(solution.y[3, -1], solution.y[2, -1])))
 
 
-def _uneven(x: NDArray, seed: int) -> NDArray[np.float64]:
+def _uneven(x: NDArray, seed: int, specimen: float, support: float) -> NDArray[np.float64]:
     """A flat specimen with slight waves in its overhanging rim [m], (particles, 3).  The waves do not depend on the mesh."""
     random = np.random.default_rng(seed)
     waves = np.arange(2, MOST_WAVES + 1)
     height, phase = random.normal(scale=ASYMMETRY, size=len(waves)), random.uniform(0, 2 * np.pi, len(waves))
     radius, angle = np.hypot(x[:, 0], x[:, 1]), np.arctan2(x[:, 1], x[:, 0])
-    out = np.maximum(radius - SUPPORT_RADIUS, 0) / (SPECIMEN_RADIUS - SUPPORT_RADIUS)
+    out = np.maximum(radius - support, 0) / (specimen - support)
     raised = x.copy()
     raised[:, 2] += out * (height * np.cos(waves * angle[:, None] + phase)).sum(axis=1)
     return raised
