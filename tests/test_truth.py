@@ -85,7 +85,7 @@ def test_the_fling_s_hands_go_where_the_benchmark_has_them():
 
 
 def test_a_flung_cloth_meets_the_table_no_earlier_than_a_straight_one_and_lands_ahead_of_the_hands():
-    """A cloth that hung straight down would touch at 3.09 s, when its hands are at 0.90 m; the last of nine filmed ones did at 3.63.
+    """A cloth that hung straight down would touch at 3.09 s, with its hands at 0.90 m; the last of nine filmed ones did at 3.63 s.
     In the benchmark's film the lower edge is ahead of the hands, and stays there on the table."""
     thrown = fling(Material.preset("median"), rows=8, seconds=DURATION)
     assert 3.05 <= thrown.contact <= 3.63
