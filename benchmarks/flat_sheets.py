@@ -16,14 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from clothgym.envs.draping import (
-    ENOUGH_CENTERING,
-    ENOUGH_COVERAGE,
-    ENOUGH_REST,
-    ENOUGH_SPREAD,
-    SHEET,
-    SIDE,
-)
+from clothgym.envs.draping import ENOUGH_CENTERING, ENOUGH_COVERAGE, ENOUGH_REST, ENOUGH_SPREAD, SHEET, SIDE
 from clothgym.envs.targets import SHAPES, THICKNESS
 from clothgym.parameters import AIR_DENSITY
 
@@ -52,10 +45,11 @@ def evaluated(shape: str, physics: str) -> dict[str, NDArray]:
     sheet = doubled_over() if physics == "doubled" else SHEET.rest_positions
     task = env.unwrapped.task
     task.simulation.reset(positions=np.array([sheet + target.top + (0, 0, 2 * THICKNESS) for target in task.targets]))
-    # both corners are let go at once; no episode fails, so all end together
+    task.simulation.release()
+    # no episode fails, so all end together
     terminated = np.zeros(TARGETS, bool)
     while not terminated.any():
-        *_, terminated, _, info = env.step(np.tile((0.0, 0.0, 0.0, 1.0), (TARGETS, 2)))
+        *_, terminated, _, info = env.step(np.zeros((TARGETS, 8)))
     return info
 
 

@@ -27,7 +27,7 @@ GUIDE_REACH = 0.15 * SIDE
 LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
-EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.25, 0.55, 0.25
+EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.3, 0.55, 0.25
 EXPERT_SPEED = 0.8  # share of the anchors' speed limit
 
 
@@ -103,7 +103,7 @@ class DrapeTask(Task):
         return np.stack([x, y, z], axis=1)
 
     def expert_actions(self) -> NDArray:
-        """Over the target in one straight line, beyond it by a quarter of a side, down, and let go.
+        """Over the target in one straight line, beyond it by three tenths of a side, down, and let go.
 
         Without memory: where the anchors are says which of the two ways they are on.
         """

@@ -352,9 +352,10 @@ def laid(env, offset, sheet=flat):
     env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.unwrapped.task
     task.simulation.reset(positions=sheet(0.244) + (offset * SIDE, 0, 0))
+    task.simulation.release()
     terminated = False
     while not terminated:
-        *_, terminated, _, info = env.step(np.array([0, 0, 0, 1, 0, 0, 0, 1]))
+        *_, terminated, _, info = env.step(np.zeros(8))
     return info
 
 
