@@ -395,9 +395,10 @@ def test_cheats_do_not_pay(policy):
 
 
 def test_the_expert_succeeds():
-    env = gym.make_vec(DRAPE, num_envs=60, autoreset_mode="Disabled")
+    """In contact with the whole sheet: between particles that lie on a box its edges stick out, which covers nothing."""
+    env = gym.make_vec(DRAPE, num_envs=40, autoreset_mode="Disabled", contact="sheet", self_collision="strict", bending="quadratic")
     env.reset(seed=500)
-    success = np.zeros(60, bool)
+    success = np.zeros(40, bool)
     for _ in range(100):
         *_, terminated, _, info = env.step(env.unwrapped.expert_actions())
         success |= terminated & info["is_success"]

@@ -244,7 +244,7 @@ def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():
         assert last["rms_speed"][i] == pytest.approx(speed, rel=1e-4)
         assert last["normalized_performance"][i] == pytest.approx(performance, abs=1e-5)
         assert last["is_success"][i] == success
-    assert np.ptp(last["normalized_performance"]) > 0.3 and 0 < last["is_success"].mean() < 1
+    assert np.ptp(last["normalized_performance"]) > 0.2 and 0 < last["is_success"].mean() < 1
 
 
 @pytest.mark.parametrize(
