@@ -1,7 +1,7 @@
 """How sheets that lie on targets are judged, and the coverage that a sheet let down flat and centered reaches.
 
 That reference is simulated with the whole sheet in contact, strict self-collision, rigidity and quadratic air, whatever physics a
-task has.  The tasks' own cloth has a committed table (``benchmarks/drape_reference.py``).  That of another size or fabric is
+task has.  The tasks' own cloths have committed tables (``benchmarks/drape_reference.py``).  That of another size or fabric is
 simulated on first use, with fewer particles and targets, and kept beside the compiled kernels.
 """
 
@@ -120,13 +120,14 @@ def simulated(cloth: Mapping[str, float], rows: int, counts: Sequence[int]) -> d
 def _table(cloth: str) -> dict[str, Any]:
     """The table of a cloth, described in JSON: the committed one; or what this user has simulated before; or simulated now."""
     committed = json.loads(resources.files("clothgym.envs").joinpath("drape_reference.json").read_text())
-    if json.dumps(committed["cloth"], sort_keys=True) == cloth:
-        return committed["shapes"]
+    for known in committed["cloths"]:
+        if json.dumps(known["cloth"], sort_keys=True) == cloth:
+            return known["shapes"]
     folder, name = cache_folder(), hashlib.sha256(cloth.encode()).hexdigest()[:16]
     path = folder.path / f"{name}.reference"
     with contextlib.suppress(OSError):
-        if (known := folder.read(path)) is not None:
-            return json.loads(bytes(known))
+        if (kept := folder.read(path)) is not None:
+            return json.loads(bytes(kept))
     where = f", kept in {folder.path}" if folder.writable else ""
     print(f"clothgym: simulating what this cloth can cover (once, some ten seconds){where}", file=sys.stderr, flush=True)
     table = simulated(json.loads(cloth), ROWS, COUNTS)
