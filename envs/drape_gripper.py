@@ -17,13 +17,13 @@ from clothgym.checks import shown
 from clothgym.collisions import Collider
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import PHYSICS, SHEET, SIDE, THICKNESS, covering, observe_target
+from clothgym.envs.draping import PHYSICS, SHEET, SIDE, covering, observe_target
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import Target
+from clothgym.envs.targets import THICKNESS, Target
 from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class DrapeGripperTask(GripperTask):
         return [*draping.REMEMBERS, ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
 
     def check_episode(self, env: int, own: Any) -> None:
-        draping.check_target(own)
+        draping.check_target(own, self.physics)
 
     def constants(self) -> dict[str, Any]:
         return draping.constants(GUIDE_REACH) | {"places": self.places}
@@ -151,7 +151,7 @@ class DrapeGripperTask(GripperTask):
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         target = draping.draw_target(rng, options.get("target", {}))
-        draping.remember(self.episode[env], target)
+        draping.remember(self.episode[env], target, self.physics)
         gap, sideways, yaw = SIDE * rng.uniform(0.05, 0.15), SIDE * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
         rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(_rumpled())))
         x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, THICKNESS)

@@ -15,9 +15,10 @@ from clothgym.checks import shown
 from clothgym.collisions import Collider, Plane
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
-from clothgym.envs.measures import CENTROID, SPEED2, covered_share, soft_coverage
+from clothgym.envs.measures import CENTROID, SPEED2, count_layers, soft_coverage
 from clothgym.envs.physics import Physics
-from clothgym.envs.targets import SHAPES, Target, placed, reference_coverage, unit_surface
+from clothgym.envs.reference import EVALUATED_POINTS, limits, reference_coverage
+from clothgym.envs.targets import FRICTION, SHAPES, THICKNESS, Target, placed, unit_normals, unit_surface
 from clothgym.material import Material
 from clothgym.mesh import grid
 
@@ -35,14 +36,11 @@ PHYSICS = Physics(
     air_density=0.0,
 )
 
-FRICTION = 0.5
-THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its flat triangles stay outside of a round one
-EVALUATED_POINTS = 256
 GUIDE_POINTS = 32
-COVERED_WITHIN = 0.02  # in sides
 CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
 SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
-ENOUGH_COVERAGE, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.1, 0.05
+# of the reference's coverage; of the covered points under one layer; in sides; [m/s]
+ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.05
 
 BOX, POST = SHAPES.index("box"), SHAPES.index("post")
 HAND = 0.005  # distance from the target at which it stops a hand [m]
@@ -53,7 +51,9 @@ REMEMBERS: Fields = [
     *[("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2), ("reference", float)],
 ]
 RANGES = {"solid": (0, len(SHAPES) - 1)}
-EVALUATION: Fields = (("coverage", float), ("coverage_reference", float), ("off_center", float), ("rms_speed", float))
+EVALUATION: Fields = (
+    *[("coverage", float), ("coverage_reference", float), ("spread", float), ("off_center", float), ("rms_speed", float)],
+)
 RELATIVE_TO = "the target's top"
 
 
@@ -96,12 +96,12 @@ def draw_target(rng: np.random.Generator, wanted: Any) -> Target:
     return Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape")).changed(wanted)
 
 
-def remember(own: Any, target: Target) -> None:
-    """Write a target into the record of the episode that it is for."""
+def remember(own: Any, target: Target, physics: Physics) -> None:
+    """Write a target into the record of the episode that it is for; physics: the task's."""
     own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
     own["top"] = own["origin"] = target.top
     own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
-    own["reference"] = reference_coverage(target, SIDE)
+    own["reference"] = reference_coverage(target, physics)
 
 
 def recalled(own: Any) -> Target:
@@ -110,15 +110,15 @@ def recalled(own: Any) -> Target:
     return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
 
 
-def check_target(own: Any) -> None:
-    """Refuse a record whose target cannot be one.
+def check_target(own: Any, physics: Physics) -> None:
+    """Refuse a record whose target cannot be one; physics: the task's.
 
     Raises:
         ValueError: what is wrong with it.
     """
     target = recalled(own)
     turn = np.array([np.cos(target.yaw), np.sin(target.yaw)])
-    if np.abs(own["turn"] - turn).max() > 1e-9 or own["reference"] != reference_coverage(target, SIDE):
+    if np.abs(own["turn"] - turn).max() > 1e-9 or own["reference"] != reference_coverage(target, physics):
         raise ValueError("the state's target has another turn or reference than its size and yaw give: give what get_state() gave")
 
 
@@ -129,11 +129,12 @@ def episode_colliders(own: Any) -> dict[int, Collider]:
 
 def constants(guide_reach: float) -> dict[str, Any]:
     """Numbers that the kernels below read from ``rules``; guide_reach: distance at which a guide point counts half [m]."""
-    guides, evaluated = (
-        np.stack([np.resize(unit_surface(shape, count), (count, 3)) for shape in ("sphere", "box")])
-        for count in (GUIDE_POINTS, EVALUATED_POINTS)
+    guides, evaluated, normals = (
+        np.stack([np.resize(unit(shape, count), (count, 3)) for shape in ("sphere", "box")])
+        for unit, count in ((unit_surface, GUIDE_POINTS), (unit_surface, EVALUATED_POINTS), (unit_normals, EVALUATED_POINTS))
     )
-    return {"guide_reach": np.float32(guide_reach), "guides": guides, "evaluated": evaluated}
+    surface = {"guides": guides, "evaluated": evaluated, "normals": normals}
+    return {"guide_reach": np.float32(guide_reach), "judged_within": limits(SIDE), **surface}
 
 
 # --- kernels about one environment, see ``stepping`` --------------------------------------------------------------------------
@@ -153,10 +154,20 @@ def _nearness(x, surface, reach):
 
 
 @kernel
-def _coverage(x, triangles, surface, tolerance):
-    """Share of the points of the target's upper surface that are covered."""
-    points = placed(*surface)
-    return covered_share(x, triangles, points, tolerance)
+def _coverage(x, triangles, surface, normals, within):
+    """Share of the points of the target's upper surface that are covered, and of these the share under one layer of the sheet.
+
+    normals: those of a unit surface.  within: see ``reference.limits``.
+    """
+    _, _, _, turn = surface
+    layers = np.empty(normals.shape[0], np.int64)
+    count_layers(x, triangles, placed(*surface), placed(normals, np.zeros(3), 1.0, turn), within, layers)
+    # both shares
+    covered, once = 0, 0
+    for k in range(layers.shape[0]):
+        covered += layers[k] > 0
+        once += layers[k] == 1
+    return covered / layers.shape[0], once / max(covered, 1)
 
 
 @inlined
@@ -181,17 +192,18 @@ def covering(own, rules, sheet):
 
 @inlined
 def evaluate_cover(own, rules, sheet, info):
-    """Write what covers the target, how central and how much at rest it is; returns the normalized performance."""
+    """Write what covers the target, how flat, central and much at rest it is; returns the normalized performance."""
     # what the evaluation measures
-    surface = _surface_of(own, rules.evaluated)
-    info.coverage = _coverage(sheet.x, sheet.mesh.triangles, surface, COVERED_WITHIN * rules.side)
+    surface, normals = _surface_of(own, rules.evaluated), rules.normals[1 if own.solid == BOX else 0]
+    info.coverage, info.spread = _coverage(sheet.x, sheet.mesh.triangles, surface, normals, rules.judged_within)
     info.off_center = _off_center(own, rules, sheet)
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
-    # success by thresholds; the performance is a smooth product of the same three
+    # success by thresholds; the performance is a smooth product of the same four
     share = info.coverage / own.reference
-    central, at_rest = info.off_center <= ENOUGH_CENTERING, info.rms_speed < ENOUGH_REST
-    info.is_success = share >= ENOUGH_COVERAGE and central and at_rest
-    return min(share, 1.0) * _centering(info.off_center) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+    covered, flat = share >= ENOUGH_COVERAGE, info.spread >= ENOUGH_SPREAD
+    info.is_success = covered and flat and info.off_center <= ENOUGH_CENTERING and info.rms_speed < ENOUGH_REST
+    performance = min(share, 1.0) * info.spread * _centering(info.off_center)
+    return performance / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
 
 
 @inlined

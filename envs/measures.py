@@ -19,7 +19,7 @@ FAR2 = 1e6  # a kilometer or a kilometer a second is no cloth [m^2, m^2/s^2]
 MOST_STRAIN = 1e3  # stands for the strain of a sheet that has diverged
 LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
 
-GROUP = 4  # triangles that share a box in ``covered_share``
+GROUP = 4  # triangles that share a box in ``count_layers``
 
 
 @inlined
@@ -153,50 +153,20 @@ def key_particles(mesh: ClothMesh) -> NDArray:
     return (rows[:, None] * mesh.grid_shape[1] + columns[None, :]).ravel()
 
 
-@kernel
-def _distance2_to_triangle(p, a, b, c):
-    """Squared distance [m^2] from point p to triangle abc (Ericson, Real-Time Collision Detection, 2005, section 5.1.5)."""
-    # edges from a, the point from each corner, and its projections on these edges
-    abx, aby, abz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    acx, acy, acz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-    apx, apy, apz = p[0] - a[0], p[1] - a[1], p[2] - a[2]
-    d1 = abx * apx + aby * apy + abz * apz
-    d2 = acx * apx + acy * apy + acz * apz
-    bpx, bpy, bpz = p[0] - b[0], p[1] - b[1], p[2] - b[2]
-    d3 = abx * bpx + aby * bpy + abz * bpz
-    d4 = acx * bpx + acy * bpy + acz * bpz
-    cpx, cpy, cpz = p[0] - c[0], p[1] - c[1], p[2] - c[2]
-    d5 = abx * cpx + aby * cpy + abz * cpz
-    d6 = acx * cpx + acy * cpy + acz * cpz
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    # the nearest point is a + s ab + t ac, with s and t by the region in which p lies
-    if d1 <= 0 and d2 <= 0:  # the region of vertex a
-        s, t = 0.0, 0.0
-    elif d3 >= 0 and d4 <= d3:  # b
-        s, t = 1.0, 0.0
-    elif d6 >= 0 and d5 <= d6:  # c
-        s, t = 0.0, 1.0
-    elif vc <= 0 and d1 >= 0 and d3 <= 0:  # edge ab
-        s, t = d1 / (d1 - d3), 0.0
-    elif vb <= 0 and d2 >= 0 and d6 <= 0:  # edge ac
-        s, t = 0.0, d2 / (d2 - d6)
-    elif va <= 0 and d4 - d3 >= 0 and d5 - d6 >= 0:  # edge bc
-        t = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        s = 1.0 - t
-    else:  # inside
-        s, t = vb / (va + vb + vc), vc / (va + vb + vc)
-    rx, ry, rz = apx - s * abx - t * acx, apy - s * aby - t * acy, apz - s * abz - t * acz
-    return rx * rx + ry * ry + rz * rz
-
-
 @apart
-def covered_share(x, triangles, points, tolerance):
-    """Share of points [m], (points, 3), that lie within ``tolerance`` [m] of a triangle of a sheet.
+def count_layers(x, triangles, points, normals, limits, layers):
+    """Layers of a sheet over points of a solid's surface, (points,): 0 for a point that is not covered.
 
+    The line through a point along its outward normal meets the sheet at heights t [m].  A point is covered if one of them lies in
+    [-poking, near] and none in [-near, -poking): there it would stick out of the sheet.  Its layers are the heights in
+    [-poking, far].
+
+    points [m], normals: (points, 3), the normals of length 1.  limits: poking, near and far [m], far being the largest.
     float64 throughout: this is part of the evaluation, once an episode.
     """
+    poking, near, far = limits
     count = triangles.shape[0]
-    # a box about triangles that lie together, within which a point is near enough
+    # a box about triangles that lie together
     corners, low, high = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3))
     for first in range(0, count, GROUP):
         g = first // GROUP
@@ -206,23 +176,77 @@ def covered_share(x, triangles, points, tolerance):
                 for m in range(3):
                     corners[t, m, c] = x[c, triangles[t, m]]
                     least, most = min(least, corners[t, m, c]), max(most, corners[t, m, c])
-            low[g, c], high[g, c] = least - tolerance, most + tolerance
-    # count the points that have a triangle near enough
-    covered = 0
+            low[g, c], high[g, c] = least, most
+    # each point's segment, against the triangles in the boxes that it may meet
+    ends, axes = np.empty((2, 3)), np.empty((3, 3))
     for k in range(points.shape[0]):
-        covered += _near_any(points[k], corners, low, high, tolerance * tolerance)
-    return covered / points.shape[0]
+        for c in range(3):
+            a, b = points[k, c] - near * normals[k, c], points[k, c] + far * normals[k, c]
+            ends[0, c], ends[1, c] = min(a, b), max(a, b)
+        _write_axes(normals[k], axes)
+        over, within, pokes = 0, 0, 0
+        for g in range((count + GROUP - 1) // GROUP):
+            if (
+                ends[1, 0] < low[g, 0] or ends[0, 0] > high[g, 0] or ends[1, 1] < low[g, 1] or ends[0, 1] > high[g, 1]
+                or ends[1, 2] < low[g, 2] or ends[0, 2] > high[g, 2]
+            ):  # fmt: skip
+                continue
+            for t in range(GROUP * g, min(GROUP * (g + 1), count)):
+                height = _height_over(points[k], axes, corners[t])
+                over += -poking <= height <= far
+                within += -poking <= height <= near
+                pokes += -near <= height < -poking
+        layers[k] = over if within > 0 and pokes == 0 else 0
 
 
 @kernel
-def _near_any(p, corners, low, high, tolerance2):
-    """Whether a triangle is within the root of ``tolerance2`` [m^2] of point p; low, high: boxes of GROUP triangles each."""
-    # triangles of a box that holds the point, until one is near enough
-    x, y, z = p[0], p[1], p[2]
-    for g in range((corners.shape[0] + GROUP - 1) // GROUP):
-        if x < low[g, 0] or x > high[g, 0] or y < low[g, 1] or y > high[g, 1] or z < low[g, 2] or z > high[g, 2]:
-            continue
-        for t in range(GROUP * g, min(GROUP * (g + 1), corners.shape[0])):
-            if _distance2_to_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2]) <= tolerance2:
-                return True
-    return False
+def _write_axes(n, axes):
+    """Two vectors at right angles to the unit vector n and to each other, and n, (3, 3), as rows.
+
+    Duff and others, Building an Orthonormal Basis, Revisited, JCGT 6(1), 2017.
+    """
+    sign = 1.0 if n[2] >= 0 else -1.0
+    a = -1.0 / (sign + n[2])
+    b = n[0] * n[1] * a
+    axes[0, 0], axes[0, 1], axes[0, 2] = 1.0 + sign * n[0] * n[0] * a, sign * b, -sign * n[0]
+    axes[1, 0], axes[1, 1], axes[1, 2] = b, sign + n[1] * n[1] * a, -n[1]
+    for c in range(3):
+        axes[2, c] = n[c]
+
+
+@kernel
+def _height_over(p, axes, corners):
+    """Where the line through p along the third axis meets a triangle, (3, 3): its height over p [m], or NaN if it misses.
+
+    Of the triangles that share an edge or a corner, and do not fold over there, a line through it meets exactly one: the corners
+    are projected along the line, which gives neighbors the same numbers, and an edge that it meets belongs to the triangle on one
+    side of it (Woop, Benthin and Wald, Watertight Ray/Triangle Intersection, JCGT 2(1), 2013; the rule is the rasterizers').
+    """
+    ax, ay, az = _along(axes, p, corners[0])
+    bx, by, bz = _along(axes, p, corners[1])
+    cx, cy, cz = _along(axes, p, corners[2])
+    # twice the areas that the line cuts the projected triangle into; a neighbor has the same with the other sign
+    u, v, w = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+    whole = u + v + w
+    if whole < 0:
+        inside = _on_side(-u, cx - bx, cy - by) and _on_side(-v, ax - cx, ay - cy) and _on_side(-w, bx - ax, by - ay)
+    else:
+        inside = _on_side(u, bx - cx, by - cy) and _on_side(v, cx - ax, cy - ay) and _on_side(w, ax - bx, ay - by)
+    return (u * az + v * bz + w * cz) / whole if inside and whole != 0 else np.nan
+
+
+@kernel
+def _along(axes, p, q):
+    """Components along three axes of the way from p to q."""
+    x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    return (
+        axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z,
+        axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z,
+        axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z,
+    )
+
+
+@inlined
+def _on_side(area, x, y):
+    """Whether an area is positive; or, of an edge that goes against (x, y), none, and the edge is the triangle's own."""
+    return area > 0 or (area == 0 and (y > 0 or (y == 0 and x > 0)))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,8 @@ LARGEST = 0.6  # [m]: sizes and distances beyond this leave no room to drape in
 SHAPES = ("sphere", "box", "post")
 # ranges of (width, height) by shape, in sides of the sheet: sphere radius, box half side, post radius; post height
 SIZES = {"sphere": ((0.2, 0.3), None), "box": ((0.15, 0.25), None), "post": ((0.1, 0.15), (0.4, 0.6))}
+FRICTION = 0.5
+THICKNESS = 0.002  # [m]: the cloth rests this far above the solid, so that its flat triangles stay outside of a round one
 # a surface is "upper" where it slopes by at most this: below, cloth hangs free of it in folds
 UPPER_SLOPE = math.radians(60)
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -99,6 +99,11 @@ class Target:
         turn = np.array([math.cos(self.yaw), math.sin(self.yaw)])
         return placed(unit_surface(self.shape, count), np.array(self.top), self.radius, turn)
 
+    def upper_normals(self, count: int) -> NDArray[np.float64]:
+        """The surface's outward normals at these points, (points, 3)."""
+        turn = np.array([math.cos(self.yaw), math.sin(self.yaw)])
+        return placed(unit_normals(self.shape, count), np.zeros(3), 1.0, turn)
+
     def changed(self, properties: Mapping[str, Any]) -> Target:
         """The same but for some properties; its height follows from its radius unless it is among them, or a post's."""
         if "radius" in properties and "height" not in properties and self.shape != "post":
@@ -121,9 +126,16 @@ def unit_surface(shape: str, count: int) -> NDArray[np.float64]:
     return np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE), -below], axis=1)
 
 
+@lru_cache
+def unit_normals(shape: str, count: int) -> NDArray[np.float64]:
+    """The outward normals at the points of ``unit_surface``, (points, 3)."""
+    points = unit_surface(shape, count)
+    return np.tile((0.0, 0.0, 1.0), (len(points), 1)) if shape == "box" else points + (0, 0, 1)
+
+
 @kernel
 def placed(units, top, radius, turn):
-    """Points of a unit surface, (points, 3), in their places on a target [m].
+    """Points of a unit surface, (points, 3), in their places on a target [m]; or its normals, about no top, with radius 1.
 
     top: see ``Target.top``.  turn: cosine and sine of the target's yaw, (2,).
     """
@@ -134,23 +146,3 @@ def placed(units, top, radius, turn):
         points[k, 1] = top[1] + turn[1] * x + turn[0] * y
         points[k, 2] = top[2] + units[k, 2] * radius
     return points
-
-
-@lru_cache
-def _reference_table() -> dict[str, tuple[NDArray, NDArray, NDArray]]:
-    """The committed coverages: widths and heights, in sheet sides, and the coverage at each pair, by shape."""
-    text = resources.files("clothgym.envs").joinpath("drape_reference.json").read_text()
-    return {
-        shape: tuple(np.array(rows[name], dtype=float) for name in ("widths", "heights", "coverage"))  # type: ignore[misc]
-        for shape, rows in json.loads(text)["shapes"].items()
-    }
-
-
-def reference_coverage(target: Target, side: float) -> float:
-    """Coverage that a fine sheet, laid flat and centered, reaches on this target: the ideal of the task.
-
-    Bilinear in the committed table over width and height (in sheet sides); beyond the table its edge holds.
-    """
-    widths, heights, coverage = _reference_table()[target.shape]
-    by_width = [float(np.interp(target.radius / side, widths, column)) for column in coverage.T]
-    return by_width[0] if len(heights) == 1 else float(np.interp(target.height / side, heights, by_width))

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from clothgym.envs.drape import SHEET
-from clothgym.envs.measures import covered_share
-from clothgym.envs.targets import reference_coverage
+from clothgym.envs.draping import PHYSICS
+from clothgym.envs.reference import layers_over, reference_coverage
 
 GRIPPER = "clothgym:ClothDrapeGripper-v0"
 SIDE, ROWS = 0.6, 17
@@ -70,12 +70,13 @@ def evaluation(env, index=0):
     task = env.unwrapped.task
     target, x = task.targets[index], positions(env)[index]
     v = task.simulation.velocities[index].astype(float)
-    coverage = covered_share(x.T.copy(), SHEET.triangles, target.upper_surface(256), 0.02 * SIDE)
-    share = coverage / reference_coverage(target, SIDE)
+    layers = layers_over(target, x, SHEET.triangles, SIDE)
+    coverage, spread = np.mean(layers > 0), np.sum(layers == 1) / max(np.sum(layers > 0), 1)
+    share = coverage / reference_coverage(target, PHYSICS)
     off = np.linalg.norm(SHARE @ x[:, :2] - target.center) / SIDE
     speed = np.sqrt(SHARE @ np.sum(v**2, axis=1))
-    performance = min(share, 1) / (1 + (off / 0.2) ** 2) / (1 + (speed / 0.1) ** 2)
-    return performance, share >= 0.9 and off <= 0.1 and speed < 0.05, coverage, off, speed
+    performance = min(share, 1) * spread / (1 + (off / 0.2) ** 2) / (1 + (speed / 0.1) ** 2)
+    return performance, share >= 0.9 and spread >= 0.9 and off <= 0.1 and speed < 0.05, coverage, off, speed
 
 
 def play(env, policy):
@@ -238,12 +239,12 @@ def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():
     for i in range(12):
         performance, success, coverage, off, speed = evaluation(env, i)
         assert last["coverage"][i] == coverage
-        assert last["coverage_reference"][i] == reference_coverage(env.unwrapped.task.targets[i], SIDE)
+        assert last["coverage_reference"][i] == reference_coverage(env.unwrapped.task.targets[i], PHYSICS)
         assert last["off_center"][i] == pytest.approx(off, abs=1e-5)
         assert last["rms_speed"][i] == pytest.approx(speed, rel=1e-4)
         assert last["normalized_performance"][i] == pytest.approx(performance, abs=1e-5)
         assert last["is_success"][i] == success
-    assert np.ptp(last["normalized_performance"]) > 0.3 and 0 < last["is_success"].mean() < 1
+    assert np.ptp(last["normalized_performance"]) > 0.2 and 0 < last["is_success"].mean() < 1
 
 
 @pytest.mark.parametrize(
