@@ -19,7 +19,8 @@ from tqdm import tqdm
 
 from clothgym import starts
 from clothgym.envs.drape_gripper import REACH, UNEVEN
-from clothgym.envs.draping import PHYSICS, SHEET, SIDE, THICKNESS
+from clothgym.envs.draping import PHYSICS, SHEET, SIDE
+from clothgym.envs.targets import ON_FLOOR
 from clothgym.geometry.intersections import find_intersections
 
 KEPT, COUNT, AT_ONCE = 64, 256, 32
@@ -52,12 +53,12 @@ def robust(x: NDArray) -> NDArray:
 def main() -> None:
     options = {"time_step": PHYSICS.time_step, "substeps": PHYSICS.substeps, "air_density": PHYSICS.air_density}
     made = [
-        starts.make(SHEET, PHYSICS.material, "rumpled", AT_ONCE, seed=seed, thickness=3 * THICKNESS, **options)
+        starts.make(SHEET, PHYSICS.material, "rumpled", AT_ONCE, seed=seed, thickness=3 * ON_FLOOR, **options)
         for seed in tqdm(range(0, COUNT, AT_ONCE), unit="batch")
     ]
     x = np.concatenate(made).astype(np.float64)
     x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
-    x[:, :, 2] += THICKNESS - x[:, :, 2].min(axis=1, keepdims=True)
+    x[:, :, 2] += ON_FLOOR - x[:, :, 2].min(axis=1, keepdims=True)
     x = np.round(x / UNIT) * UNIT
     can_be_taken, free = graspable(x), robust(x)
     print(f"of {COUNT} sheets {can_be_taken.sum()} can be taken by their corners, {free.sum()} bear unevenness")

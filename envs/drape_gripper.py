@@ -23,7 +23,7 @@ from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import THICKNESS, Target
+from clothgym.envs.targets import ON_FLOOR, Target
 from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ class DrapeGripperTask(GripperTask):
         draping.remember(self.episode[env], target, self.physics)
         gap, sideways, yaw = SIDE * rng.uniform(0.05, 0.15), SIDE * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
         rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(_rumpled())))
-        x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, THICKNESS)
+        x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, ON_FLOOR)
         c, s = np.cos(yaw), np.sin(yaw)
         x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
         # before the target, whose half width is at most sqrt(2) radii

@@ -16,9 +16,9 @@ from clothgym.collisions import Collider, Plane
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.measures import CENTROID, SPEED2, count_layers, soft_coverage
-from clothgym.envs.physics import Physics
+from clothgym.envs.physics import MEDIAN, Physics
 from clothgym.envs.reference import EVALUATED_POINTS, limits, reference_coverage
-from clothgym.envs.targets import FRICTION, SHAPES, THICKNESS, Target, placed, unit_normals, unit_surface
+from clothgym.envs.targets import FRICTION, ON_FLOOR, SHAPES, THICKNESS, Target, placed, unit_normals, unit_surface
 from clothgym.material import Material
 from clothgym.mesh import grid
 
@@ -28,12 +28,12 @@ SHEET = grid(ROWS, ROWS, SIDE, SIDE)
 # what the ids of both tasks fix, but for what holds the sheet
 PHYSICS = Physics(
     mesh=SHEET,
-    material=Material.preset("penava_cotton", air_drag=0.72),
+    material=MEDIAN,
     time_step=1 / 30,
     integrator="semi_implicit_euler",
     substeps=50,
     attachment_speed=1.0,
-    air_density=0.0,
+    fast={"material": Material.preset("penava_cotton", air_drag=0.72), "air_density": 0.0, "substeps": 50},
 )
 
 GUIDE_POINTS = 32
@@ -77,7 +77,7 @@ def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
 
 def colliders() -> list[Collider]:
     """The floor, and a target in whose place each episode has its own."""
-    floor = Plane(friction=FRICTION, thickness=THICKNESS)
+    floor = Plane(friction=FRICTION, thickness=ON_FLOOR)
     return [floor, Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
 
 

@@ -31,9 +31,10 @@ COMMON: dict[str, tuple[str, str]] = {
     "integrator": ("``$integrator``", "or another, by name or ``{\"name\": ..., option: ...}``, with automatic substeps"),
     "substeps": ("$substeps", 'substeps of a control step, or ``"auto"``'),
     "physics": (
-        '``"fast"``',
-        'contact with particles alone, none of the sheet with itself, skip springs, hands that go through solids; or ``"true"``: '
-        "whole-sheet and strict contact, rigidity, solids that stop hands, a measured fabric in quadratic air",
+        '``"true"``',
+        "whole-sheet contact with solids, strict contact with itself, rigidity, solids that stop hands; "
+        'or ``"fast"``: contact with particles alone, none of the sheet with itself, skip springs in the place of rigidity, hands '
+        "that go through solids",
     ),
     "bending": ("``None``", 'that of ``physics``; or ``"springs"``, ``"hinge"``, ``"quadratic"``, see ``clothgym.bending``'),
     "strain_limit": (

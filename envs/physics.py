@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import product
 from typing import Any
 
@@ -21,6 +21,8 @@ from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 PHYSICS = ("true", "fast")
+# the short cuts of most benchmarks
+SHORT_CUTS: dict[str, Any] = {"contact": "particles", "self_collision": False, "bending": "springs", "solid_hands": False}
 MEDIAN = Material.preset("median")
 MEDIAN = replace(MEDIAN, air_drag=2 * MEDIAN.density)  # 2 per second, the middle of what was found for filmed cloth
 MEASURED = ("density", "stretch_stiffness", "shear_stiffness", "bend_rigidity")  # what presets take from measurements
@@ -40,6 +42,7 @@ class Physics:
         wind: what the air does, unless the environment's keyword says otherwise.
         contact, self_collision, bending: as ``Simulation`` takes them.
         solid_hands: whether solids stop what holds the sheet, in tasks whose kernels see to it.
+        fast: what physics="fast" changes beside ``SHORT_CUTS``.
     """
 
     mesh: ClothMesh
@@ -52,27 +55,24 @@ class Physics:
     grippers: tuple[Gripper, ...] = ()
     air_density: float = AIR_DENSITY
     wind: Wind | None = None
-    contact: str = "particles"
-    self_collision: Any = False
-    bending: str = "springs"
-    solid_hands: bool = False
+    contact: str = "sheet"
+    self_collision: Any = "strict"
+    bending: str = "quadratic"
+    solid_hands: bool = True
+    fast: Mapping[str, Any] = field(default_factory=dict)
 
     def chosen(self, name: str) -> Physics:
-        """This, with the short cuts that most benchmarks take: "fast"; or "true", without them.
+        """This, "true"; or "fast", with the short cuts that most benchmarks take.
 
-        Fast: solids touch particles alone, the sheet passes through itself and hands through solids, and skip springs, which have
-        no rigidity in the flat state, stand for bending.  True: the whole sheet is in contact, with itself, too, solids stop hands,
-        and it bends with its rigidity.  Where an id has a linear drag in place of the air, the fabric is then the median of 618
-        that were measured, in quadratic air, with a drag as of filmed cloth; see docs/physics.md, "What brings a sheet to rest".
+        True: the whole sheet is in contact with solids and, strictly, with itself, solids stop hands, and the sheet bends with its
+        rigidity.  Fast: solids touch particles alone, the sheet passes through itself and hands through solids, skip springs, which
+        have no rigidity in the flat state, stand for bending, and what the id has in ``fast``.
 
         Raises:
             ValueError: another name.
         """
         one_of("physics", name, *PHYSICS)
-        if name == "fast":
-            return self
-        true = replace(self, contact="sheet", self_collision="strict", bending="quadratic", solid_hands=True)
-        return true if self.air_density > 0 else replace(true, material=MEDIAN, air_density=AIR_DENSITY)
+        return self if name == "true" else replace(self, **SHORT_CUTS, **self.fast)
 
 
 def chosen_fabric(fabric: Any, own: Material) -> Material:
@@ -189,7 +189,7 @@ def settled(physics: Physics, start: NDArray, seconds: float) -> NDArray:
     """The sheet of an id at rest under its anchors [m], (particles, 3): a strongly damped simulation in still air."""
     cloth = Simulation(
         physics.mesh, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
-        anchors=physics.anchors, air_density=0, threads=1,
+        anchors=physics.anchors, air_density=0, bending=physics.bending, threads=1,
     )  # fmt: skip
     cloth.set_parameters(air_drag=1.0)
     cloth.reset(positions=start)

@@ -15,7 +15,7 @@ from clothgym.collisions import Collider, Sphere
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
-from clothgym.envs.physics import Physics, settled
+from clothgym.envs.physics import MEDIAN, Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
@@ -85,13 +85,13 @@ class ReachTask(Task):
 
     physics = Physics(
         mesh=SHEET,
-        material=Material.preset("penava_cotton", air_drag=0.72),
+        material=MEDIAN,
         time_step=1 / 15,
         integrator="semi_implicit_euler",
         substeps=50,
         attachment_speed=0.5,
         anchors=(DRIVEN,),
-        air_density=0.0,
+        fast={"material": Material.preset("penava_cotton", air_drag=0.72), "air_density": 0.0, "substeps": 50},
     )
     kernels = Kernels(_potential, _evaluate, _observe)
     acting_steps = 40
@@ -120,14 +120,19 @@ class ReachTask(Task):
         return [("goal", float, 3), ("distance", float)]
 
     def constants(self) -> dict[str, Any]:
-        return {"free": FREE, "hangs": hanging()[FREE]}
+        return {"free": FREE, "hangs": self._hanging[FREE]}
+
+    @property
+    def _hanging(self) -> NDArray:
+        """See ``hanging``."""
+        return hanging(self.physics_name)
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         if "goal" in options:
             goal = vector("reset option goal", options["goal"])
-            low, high = LOW + hanging()[FREE], HIGH + hanging()[FREE]
+            low, high = LOW + self._hanging[FREE], HIGH + self._hanging[FREE]
             if np.any((goal < low) | (goal > high)):
                 raise ValueError(f"reset option goal={options['goal']!r}: the free corner can rest from {low} to {high} only")
 
@@ -135,8 +140,9 @@ class ReachTask(Task):
         middle = (LOW + HIGH) / 2
         start = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
-        goal = np.asarray(options.get("goal", rest + hanging()[FREE]), np.float64)
-        x = start + hanging() + rng.normal(scale=1e-4, size=hanging().shape)
+        hangs = self._hanging
+        goal = np.asarray(options.get("goal", rest + hangs[FREE]), np.float64)
+        x = start + hangs + rng.normal(scale=1e-4, size=hangs.shape)
         own = self.episode[env]
         own["goal"] = own["origin"] = goal
         own["distance"] = max(length(x[FREE] - goal), NEAREST * SIDE)
@@ -150,7 +156,7 @@ class ReachTask(Task):
 
     def _way(self) -> NDArray:
         """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
-        return self.episode["goal"] - hanging()[FREE] - self.simulation.attachment_positions[:, 0]
+        return self.episode["goal"] - self._hanging[FREE] - self.simulation.attachment_positions[:, 0]
 
     def markers(self, env: int) -> list[Any]:
         goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE)
@@ -163,12 +169,12 @@ class ReachTask(Task):
 
 
 @cache
-def hanging() -> NDArray:
-    """The sheet at rest under its driven corner, relative to it [m], (particles, 3)."""
+def hanging(physics: str) -> NDArray:
+    """The sheet at rest under its driven corner, relative to it [m], (particles, 3); physics: by name."""
     rest = SHEET.rest_positions
     # the driven corner up, both wings turned to one side: so they come to hang, whatever they began with
     along, across = (rest[:, 0] - rest[:, 1]) / np.sqrt(2), (rest[:, 0] + rest[:, 1]) / np.sqrt(2)
-    x = settled(ReachTask.physics, np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
+    x = settled(ReachTask.physics.chosen(physics), np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
     return x - x[DRIVEN]
 
 

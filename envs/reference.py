@@ -24,7 +24,7 @@ from clothgym._jit.cache import cache_folder
 from clothgym.collisions import Plane
 from clothgym.envs.measures import count_layers
 from clothgym.envs.physics import MEASURED, Physics
-from clothgym.envs.targets import FRICTION, SIZES, THICKNESS, Target
+from clothgym.envs.targets import FRICTION, ON_FLOOR, SIZES, THICKNESS, Target
 from clothgym.material import Material
 from clothgym.mesh import grid
 from clothgym.progress import clear, show
@@ -85,7 +85,7 @@ def laid(targets: Sequence[Target], cloth: Mapping[str, float], rows: int) -> tu
     side = cloth["side"]
     mesh, own = grid(rows, rows, side, side), {name: cloth[name] for name in MEASURED}
     fabric = Material(**own, air_drag=AIR_DRAG)  # type: ignore[arg-type]
-    floor, solids = Plane(friction=FRICTION, thickness=THICKNESS), [target.collider(FRICTION, THICKNESS) for target in targets]
+    floor, solids = Plane(friction=FRICTION, thickness=ON_FLOOR), [target.collider(FRICTION, THICKNESS) for target in targets]
     simulation = Simulation(
         mesh, fabric, num_envs=len(targets), time_step=TIME_STEP, colliders=[floor, solids[0]],
         bending="quadratic", self_collision="strict", contact="sheet", threads=1,

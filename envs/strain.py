@@ -164,6 +164,7 @@ class StrainTask(Task):
         attachment_speed=1.0,
         anchors=CLIPS,
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
+        fast={"substeps": 35},
     )
     kernels = Kernels(_potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account)
     acting_steps = 150
@@ -270,7 +271,7 @@ class StrainTask(Task):
         own["after"], own["way"] = legs.sum() - legs.cumsum(), legs.sum()
         ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
         ripple[CLIPPED] = 0
-        x = middles[0] + hanging()
+        x = middles[0] + hanging(self.physics_name)
         x[:, 0] += ripple
         return x
 
@@ -321,10 +322,11 @@ def _post(x: float, y: float) -> Capsule:
 
 
 @cache
-def hanging() -> NDArray:
-    """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3)."""
+def hanging(physics: str) -> NDArray:
+    """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3); physics: by name."""
     rest = SHEET.rest_positions
-    return settled(StrainTask.physics, np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1), seconds=8)
+    start = np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1)
+    return settled(StrainTask.physics.chosen(physics), start, seconds=8)
 
 
 class ClothStrainEnv(ClothEnv):

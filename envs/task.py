@@ -42,7 +42,7 @@ class Task(TaskDefinition):
         fabric: another fabric than the task's own, a ``Material`` or a preset's name; substeps are then chosen automatically.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
-        physics: "fast", the task's own with its short cuts, or "true", without them, see ``Physics.chosen``.
+        physics: "true", or "fast", with short cuts, see ``Physics.chosen``.
         bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them, in place of what that fixes.
         obs_mode: one of ``obs_modes``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
@@ -70,7 +70,7 @@ class Task(TaskDefinition):
         fabric: str | Material | None = None,
         integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
-        physics: str = "fast",
+        physics: str = "true",
         bending: str | None = None,
         strain_limit: float | None = None,
         self_collision: bool | str | Mapping[str, Any] | None = None,
@@ -88,7 +88,7 @@ class Task(TaskDefinition):
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
         self._check_definition()
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
-        own = self.physics.chosen(physics)
+        own, self.physics_name = self.physics.chosen(physics), physics
         fixed = self.physics = replace(own, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
         self.randomize = checked_ranges({} if randomize is None else randomize)
         self.wind = fixed.wind if wind is None else checked_wind(wind)
@@ -97,7 +97,7 @@ class Task(TaskDefinition):
         method = integrators.get(integrator if integrator is not None else fixed.integrator)
         check_ranges(fixed, self.randomize, method)
         if substeps is None:
-            as_tuned = physics == "fast" and method.name == fixed.integrator and fixed.material == own.material
+            as_tuned = method.name == fixed.integrator and fixed.material == own.material
             substeps = fixed.substeps if as_tuned and not self.randomize else "auto"
         self.simulation = Simulation(
             fixed.mesh,
