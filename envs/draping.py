@@ -40,7 +40,7 @@ GUIDE_POINTS = 32
 CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
 SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
 # of the reference's coverage; of the covered points under one layer; in sides; [m/s]
-ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.05
+ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.02
 
 BOX, POST = SHAPES.index("box"), SHAPES.index("post")
 HAND = 0.005  # distance from the target at which it stops a hand [m]

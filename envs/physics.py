@@ -190,6 +190,7 @@ def settled(physics: Physics, start: NDArray, seconds: float) -> NDArray:
     cloth = Simulation(
         physics.mesh, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
         anchors=physics.anchors, air_density=0, bending=physics.bending, threads=1,
+        self_collision=physics.self_collision,
     )  # fmt: skip
     cloth.set_parameters(air_drag=1.0)
     cloth.reset(positions=start)
