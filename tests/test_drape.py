@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from clothgym import Material
-from clothgym._jit.cache import cache_folder
+from clothgym._jit.cache import CacheFolder
 from clothgym.envs import reference
 from clothgym.envs.drape import SHEET, SIDE
 from clothgym.envs.draping import PHYSICS
@@ -44,7 +44,7 @@ def potential(env):
 def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices():
     env, _ = start()
     total, effort, before, terminated = 0.0, 0.0, potential(env), False
-    for step in range(100):
+    for step in range(200):
         action = env.expert_action()
         acting = not env.task.episode["settling_since"][0] >= 0
         effort += 0.001 * np.sum(action.reshape(2, 4)[:, :3].astype(float) ** 2) * acting
@@ -121,11 +121,11 @@ def test_an_anchor_lets_go_above_four_fifths(grip, held):
     assert env.task.simulation.attached[0].tolist() == [held, True]
 
 
-def test_time_is_up_after_60_steps_and_the_evaluation_is_40_later():
+def test_time_is_up_after_60_steps_and_the_evaluation_is_75_later():
     env, _ = start()
-    for step in range(1, 101):
+    for step in range(1, 136):
         *_, terminated, _, info = env.step(np.zeros(8))
-        assert info["settling"] == (step >= 60) and terminated == (step == 100)
+        assert info["settling"] == (step >= 60) and terminated == (step == 135)
 
 
 def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
@@ -144,14 +144,14 @@ def test_a_sheet_that_still_moves_is_no_success():
     env = gym.make(DRAPE).unwrapped
     env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.task
-    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.244))
+    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.246))
     task.simulation.release()
-    task.episode["settling_since"][0], task.episode["step"][0] = 60, 99
-    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.244), velocities=(0.3, 0, 0))
+    task.episode["settling_since"][0], task.episode["step"][0] = 60, 134
+    task.simulation.reset(positions=SHEET.rest_positions + (0, 0, 0.246), velocities=(0.3, 0, 0))
     task.simulation.release()
     *_, terminated, _, info = env.step(np.zeros(8))
     assert terminated and info["coverage"] > 0.9 and info["off_center"] < 0.1
-    assert info["rms_speed"] > 0.05 and not info["is_success"]
+    assert info["rms_speed"] > 0.02 and not info["is_success"]
     still = 1 / (1 + (info["rms_speed"] / 0.1) ** 2)
     share = min(info["coverage"] / info["coverage_reference"], 1)
     flat = share * info["spread"]
@@ -172,7 +172,7 @@ def test_the_observation_is_what_the_manual_page_says():
     assert observation[54:57] == pytest.approx((center - top) / SIDE, abs=1e-5)
     shapes = [float(target.shape == shape) for shape in ("sphere", "box", "post")]
     assert observation[57:].tolist() == pytest.approx(
-        [1, 1, *shapes, target.radius / SIDE, target.height / SIDE, target.yaw * 4 / np.pi, 0, 0.95, 55 / 60], abs=1e-6
+        [1, 1, *shapes, target.radius / SIDE, target.height / SIDE, target.yaw * 4 / np.pi, 0, 130 / 135, 55 / 60], abs=1e-6
     )
 
 
@@ -203,7 +203,7 @@ def test_a_refused_reset_leaves_nothing_behind():
         with pytest.raises(ValueError, match="bend_rigidity"):
             env.reset(seed=0, options={"material": {"bend_rigidity": 0.1}})
     env.reset(seed=0)
-    assert env.task.simulation.parameters[0] == pytest.approx([0.1503, 261.1, 105.0, 2.34e-6, 1e-4, 1.2, 0.02, 0.72])
+    assert env.task.simulation.parameters[0] == pytest.approx([0.197, 300.0, 40.0, 1.39e-5, 1e-4, 1.2, 0.02, 0.394])
 
 
 # --- the evaluation of the drape -------------------------------------------------------------------------------------------
@@ -322,12 +322,13 @@ def test_reference_coverage_interpolates_the_table(monkeypatch):
     assert found == pytest.approx([0.85, 0.9, 0.6, 0.6])
 
 
-def test_another_cloth_s_reference_is_simulated_once_and_kept(monkeypatch, capsys):
+def test_another_cloth_s_reference_is_simulated_once_and_kept(monkeypatch, capsys, tmp_path):
     sphere, silk = Target("sphere", 0.15, 0.3, (0, 0)), replace(PHYSICS, material=Material.preset("silk", density=0.0831))
     simulated, table = [], {"sphere": {"widths": [0.2, 0.3], "none": [0.0], "coverage": [[0.8], [0.9]]}}
     monkeypatch.setattr(reference, "simulated", lambda cloth, rows, counts: simulated.append(cloth) or table)
-    for path in cache_folder().path.glob("*.reference"):
-        path.unlink()
+    monkeypatch.setenv("CLOTHGYM_CACHE_DIR", str(tmp_path))
+    folder = CacheFolder()
+    monkeypatch.setattr(reference, "cache_folder", lambda: folder)
     for _ in range(2):
         reference._table.cache_clear()
         assert reference_coverage(sphere, silk) == pytest.approx(0.85)
@@ -351,7 +352,7 @@ def laid(env, offset, sheet=flat):
     """Put the sheet on the target's top, ``offset`` sides beside it, held by nothing; let it settle and be evaluated."""
     env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
     task = env.unwrapped.task
-    task.simulation.reset(positions=sheet(0.244) + (offset * SIDE, 0, 0))
+    task.simulation.reset(positions=sheet(0.246) + (offset * SIDE, 0, 0))
     task.simulation.release()
     terminated = False
     while not terminated:
@@ -381,7 +382,7 @@ def test_cheats_do_not_pay(policy):
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     success, over = np.zeros(40, bool), np.zeros(40, bool)
-    for _ in range(100):
+    for _ in range(135):
         if policy == "hover":
             action = env.unwrapped.expert_actions()
             action[:, [3, 7]] = -1
@@ -395,14 +396,13 @@ def test_cheats_do_not_pay(policy):
 
 
 def test_the_expert_succeeds():
-    """In contact with the whole sheet: between particles that lie on a box its edges stick out, which covers nothing."""
-    env = gym.make_vec(DRAPE, num_envs=40, autoreset_mode="Disabled", contact="sheet", self_collision="strict", bending="quadratic")
+    env = gym.make_vec(DRAPE, num_envs=40, autoreset_mode="Disabled")
     env.reset(seed=500)
     success = np.zeros(40, bool)
-    for _ in range(100):
+    for _ in range(135):
         *_, terminated, _, info = env.step(env.unwrapped.expert_actions())
         success |= terminated & info["is_success"]
-    assert success.mean() >= 0.85
+    assert success.mean() >= 0.9
 
 
 # --- options and failures -------------------------------------------------------------------------------------------------

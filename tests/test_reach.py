@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym.envs.episode import OUT_OF_BOUNDS
-from clothgym.envs.reach import DRIVEN, FREE, HIGH, LOW, SIDE, hanging
+from clothgym.envs.reach import DRIVEN, FREE, HIGH, LOW, PINCH, SIDE, hanging
 
 REACH = "clothgym:ClothReach-v0"
 STEPS = 40
@@ -123,7 +123,7 @@ def test_a_corner_at_rest_succeeds_within_a_twentieth_of_a_side(distance, succes
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, -0.6, 0.8)])
 def test_a_corner_that_passes_through_the_goal_is_no_success(direction, speed, success):
     """In the goal at the moment of the evaluation, but on its way through; speeds in sides a second."""
-    env, _ = start()
+    env, _ = start(air_density=0.0)
     info = evaluated(env, 0.0, np.array(direction) * speed * SIDE)
     assert info["goal_distance"] < 5e-3 and info["corner_speed"] == pytest.approx(speed, abs=5e-3)
     assert info["is_success"] == success
@@ -166,12 +166,13 @@ def test_the_observation_is_what_the_manual_page_says():
     )
 
 
-def test_the_sheet_hangs_at_rest_by_one_corner():
-    """Its weight pulls straight down through the attachment, the free corner is lowest, and nothing moves but the ripple."""
+def test_the_sheet_hangs_at_rest_by_a_pinch_of_one_corner():
+    """Its weight pulls straight down through the pinch, the free corner is lowest, and nothing moves but the ripple."""
     env, _ = start()
     s = env.task.simulation
     shape, area = HANGS, env.task.physics.mesh.area
-    assert (area @ shape / area.sum())[:2] == pytest.approx([0, 0], abs=2e-3)
+    center, pinch = (area @ shape / area.sum())[:2], shape[list(PINCH), :2]
+    assert np.all(center > pinch.min(axis=0) - 0.01) and np.all(center < pinch.max(axis=0) + 0.01)
     assert shape[FREE, 2] == shape[:, 2].min() < -0.9 * np.sqrt(2) * SIDE and shape[DRIVEN, 2] == shape[:, 2].max()
     x = s.positions[0]
     assert np.abs(x - x[DRIVEN] - shape).max() < 8e-3
