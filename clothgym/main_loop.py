@@ -103,8 +103,7 @@ def advance_block(
         # contacts of the sheet with itself press as before, so that solids bear what lies on them
         press(x, v, w, sheet, block, step, h, carried)
         # solids move on, and push out what is in them
-        look = step % look_every == 0
-        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, look, room)
+        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, step, look_every, room)
         # the contacts' impulses are corrected, and no vertex leaves its displacement bound
         keep_apart(x, v, w, sheet, block, h, carried)
     remeasure(x, weave, limited)

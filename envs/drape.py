@@ -60,7 +60,7 @@ class DrapeTask(Task):
         account=draping.account_reference, stop=draping.stop_at_target,
     )  # fmt: skip
     acting_steps = 60
-    settling_steps = 75
+    settling_steps = 85
     actions_per_attachment = 4
     observations = draping.observations(2, "whether each corner is held")
     points_relative_to = draping.RELATIVE_TO
@@ -138,7 +138,7 @@ class ClothDrapeEnv(ClothEnv):
     A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.75 to 0.9 L in front of a target
     that stands on the floor: a sphere (radius 0.2 to 0.3 L), a box (side 0.3 to 0.5 L) or a round-topped post (radius 0.1 to
     0.15 L, height 0.4 to 0.6 L).  The agent moves both corners and may let go of each.  When it holds none, or after 60
-    steps, the sheet settles for 75 steps, in which actions are ignored; then it is evaluated.
+    steps, the sheet settles for 85 steps, in which actions are ignored; then it is evaluated.
 
     The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), whole-sheet contact with friction
     0.5, strict self-collision, quadratic bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; solids stop

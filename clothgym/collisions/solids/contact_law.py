@@ -18,6 +18,8 @@ import numpy as np
 from clothgym._jit import inlined
 
 TINY = 1e-12  # speed that has no direction [m/s]
+# largest inward velocity against which a touch bears [m/s]: between solids that close in, impulses would otherwise grow without end
+FASTEST = 10.0
 RELAXED = 0.05  # share of a point's depth, beyond what the last substep moved it inward, that is corrected in a substep
 
 
@@ -48,26 +50,37 @@ def contact_change(distance, nx, ny, nz, ux, uy, uz, w, friction, carried, zero,
 
 
 @inlined
-def touch_change(gap, nx, ny, nz, ux, uy, uz, inverse_mass, friction, h, carried, zero, one, tiny, relaxed):
-    """The same for a point of a triangle, per inverse mass and weight of a corner: corner i changes by w_i b_i times the result,
-    with its barycentric weight b_i.
+def touch_change(gap, nx, ny, nz, ux, uy, uz, jx, jy, jz, inverse_mass, friction, h, carried, zero, one, most_speed, relaxed):
+    """The same for a point of a triangle that keeps an impulse j [N s] from substep to substep: its new impulse, its change, and a
+    push [kg m], three components each.  Corner i moves by w_i b_i (carried dj + push) and its velocity changes by w_i b_i dj, with
+    its barycentric weight b_i.
 
-    gap: signed distance of the point [m].  inverse_mass: of the point, sum w_i b_i^2 [1/kg].  h: the substep [s].  relaxed: see
-    ``RELAXED``.  Depth that the substep's inward velocity explains is corrected at once, the rest only by the share ``relaxed``.
+    gap: signed distance of the point [m], after j has acted.  u: its velocity relative to the solid [m/s], likewise.  inverse_mass:
+    of the point, sum w_i b_i^2 = 1/m [1/kg].  h: the substep [s].  most_speed: see ``FASTEST``.  relaxed: see ``RELAXED``.
+
+        j_n <- max(j_n + m (u* - u_n), 0),    j_t <- j_t - m u_t, shortened to mu j_n,
+
+    where u* <= 0 is the velocity that closes the gap and no more.  Depth that the substep's inward velocity explains is corrected
+    at once, the rest only by the share ``relaxed``.
     """
-    # a contact, if the point is inside and can move
-    depth = -gap
-    share = one / inverse_mass if (depth > zero) & (inverse_mass > zero) else zero
-    # normal and tangential velocity
+    jn_before = jx * nx + jy * ny + jz * nz
+    # a contact, if the point is inside or was borne, and can move
+    acts = ((gap < zero) | (jn_before > zero)) & (inverse_mass > zero)
+    mass = one / inverse_mass if acts else zero
+    # normal impulse
     un = ux * nx + uy * ny + uz * nz
-    tx, ty, tz = ux - un * nx, uy - un * ny, uz - un * nz
-    # depth to correct, and what the contact takes from each velocity
-    dv_n = max(-un, zero)
-    moved = min(depth, dv_n * h)
-    depth = moved + relaxed * (depth - moved)
-    speed = np.sqrt(tx * tx + ty * ty + tz * tz) + tiny
-    slowed = min(friction * dv_n / speed, one)
-    mx = share * (depth * nx - carried * slowed * tx)
-    my = share * (depth * ny - carried * slowed * ty)
-    mz = share * (depth * nz - carried * slowed * tz)
-    return mx, my, mz, share * (dv_n * nx - slowed * tx), share * (dv_n * ny - slowed * ty), share * (dv_n * nz - slowed * tz)
+    target = -max(gap - carried * un, zero) / h
+    jn = min(max(jn_before + (target - un) * mass, zero), most_speed * mass)
+    # friction
+    tx, ty, tz = jx - jn_before * nx, jy - jn_before * ny, jz - jn_before * nz
+    tx, ty, tz = tx - mass * (ux - un * nx), ty - mass * (uy - un * ny), tz - mass * (uz - un * nz)
+    length = np.sqrt(tx * tx + ty * ty + tz * tz)
+    share = friction * jn / length if length > friction * jn else one
+    px, py, pz = jn * nx + share * tx, jn * ny + share * ty, jn * nz + share * tz
+    px, py, pz = px if acts else zero, py if acts else zero, pz if acts else zero
+    # depth that is left, and how much of it is corrected
+    taken = (jn - jn_before) * inverse_mass
+    depth = max(-(gap + carried * taken), zero)
+    moved = min(depth, max(taken, zero) * (h - carried))
+    push = mass * (moved + relaxed * (depth - moved))
+    return px, py, pz, px - jx, py - jy, pz - jz, push * nx, push * ny, push * nz

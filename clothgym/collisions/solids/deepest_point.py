@@ -40,6 +40,7 @@ MESH_ROUNDS, BOX_STEPS = 3, 8  # rounds at a mesh, and steps at a box with half 
 SLOW_ROUND = 0.98  # largest ratio of the moves of two rounds that the extrapolation assumes
 DEPTH = 2.0  # initial rho, in thicknesses
 SOON = 0.25  # gap, in thicknesses, within which a triangle may touch the solid before the next search
+BALL = 5.0  # least radius of a ball that stands for the solid until the next search, in thicknesses
 CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid
 LYING = 1e-3  # share of the radius by which cloth that lies on a solid may be inside
 LEAST_COSINE = 0.5  # between the normals of contact and of the solid: at a box's corner it is 0.58
@@ -214,25 +215,27 @@ def find_deepest(scratch, shapes, k):
 @kernel
 def turn_normal(scratch):
     """Replace the solid's normal in S_CONTACT by that of contact, from core to triangle, and the distance by the gap along it.
-    Returns whether any lane has a contact.
+    S_RHO becomes how far below the triangle the core's point lies, at least ``BALL``.  Returns whether any lane has a contact.
 
     A lane whose gap is wider than ``SOON`` thicknesses, or which surely does not touch, gets ``NO_CONTACT``.
     """
     zero, one, tiny, none = scratch.dtype.type(0), scratch.dtype.type(1), scratch.dtype.type(1e-18), scratch.dtype.type(NO_CONTACT)
-    least_cosine, soon = scratch.dtype.type(LEAST_COSINE), scratch.dtype.type(SOON)
+    least_cosine, soon, deep = scratch.dtype.type(LEAST_COSINE), scratch.dtype.type(SOON), scratch.dtype.type(BALL)
     for l in range(scratch.shape[1]):
         nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
         # the direction from the core; the solid's normal where the two differ too much
         dx = scratch[S_SPOT, l] - scratch[S_CORE, l]
         dy = scratch[S_SPOT + 1, l] - scratch[S_CORE + 1, l]
         dz = scratch[S_SPOT + 2, l] - scratch[S_CORE + 2, l]
-        scale = one / np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
+        length = np.sqrt(max(dx * dx + dy * dy + dz * dz, tiny))
+        scale = one / length
         dx, dy, dz = dx * scale, dy * scale, dz * scale
         cosine = dx * nx + dy * ny + dz * nz
         usable = cosine >= least_cosine
         scratch[S_CONTACT + 1, l] = dx if usable else nx
         scratch[S_CONTACT + 2, l] = dy if usable else ny
         scratch[S_CONTACT + 3, l] = dz if usable else nz
+        scratch[S_RHO, l] = max(length, deep * scratch[R_THICKNESS, l])
         # the gap along it, if it is small enough
         gap = scratch[S_CONTACT, l] / cosine if usable else scratch[S_CONTACT, l]
         scratch[S_CONTACT, l] = gap if (scratch[S_CLEAR, l] == zero) & (gap < soon * scratch[R_THICKNESS, l]) else none

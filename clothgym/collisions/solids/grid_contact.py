@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import disjoint, inlined, kernel, uncounted
-from clothgym.collisions.solids.contact_law import RELAXED, TINY, contact_change, touch_change
+from clothgym.collisions.solids.contact_law import TINY, contact_change
 from clothgym.collisions.solids.deepest_point import NO_CONTACT, find_deepest, turn_normal
 from clothgym.collisions.solids.shapes import (
     KIND_MESH,
@@ -30,6 +30,7 @@ from clothgym.collisions.solids.signed_distance import (
     S_CLEAR,
     S_CONTACT,
     S_CORNERS,
+    S_RHO,
     S_SPOT,
     S_WEIGHTS,
     SCRATCH_ROWS,
@@ -38,7 +39,17 @@ from clothgym.collisions.solids.signed_distance import (
     normal_to_world,
     rounded_box,
 )
-from clothgym.collisions.solids.triangle_contact import SINK, TOUCH_ROWS, may_touch_mesh, may_touch_triangle
+from clothgym.collisions.solids.touch_response import (
+    T_CORE,
+    T_IMPULSE,
+    T_RHO,
+    TOUCH_ROWS,
+    bear_touches_on_sheet,
+    follow_touches_on_sheet,
+    move_solids,
+    press_touches_on_sheet,
+)
+from clothgym.collisions.solids.triangle_contact import SINK, may_touch_mesh, may_touch_triangle
 
 COLUMNS = 32  # triangles in a scratch array
 PARTICLE_ROWS = 9  # rows of scratch: positions in the solid's axes, distance and normal, how near cells are
@@ -49,7 +60,8 @@ NEAREST = 0.58  # no point of a triangle is farther from all corners than this s
 @kernel
 def room_on_sheet(x, triangles, shapes):
     """Room for contact of one sheet: touches, (most, TOUCH_ROWS), their triangles and solids, (most, 2), how many, (1,); scratch
-    for particles, (PARTICLE_ROWS, particles), and triangles, (triangles,); and for ``signed_distance``, (SCRATCH_ROWS, COLUMNS).
+    for particles, (PARTICLE_ROWS, particles), and triangles, (triangles,); and for ``signed_distance``, (SCRATCH_ROWS, COLUMNS);
+    impulses of each triangle at each solid [N s], (colliders, triangles, 3).
     """
     solids = 0
     for k in range(shapes.kinds.shape[0]):
@@ -58,7 +70,7 @@ def room_on_sheet(x, triangles, shapes):
     return (
         np.empty((most, TOUCH_ROWS), x.dtype), np.empty((most, 2), np.int64), np.zeros(1, np.int64),
         np.empty((PARTICLE_ROWS, x.shape[1]), x.dtype), np.empty(triangles.shape[0], np.int64), np.empty((SCRATCH_ROWS, COLUMNS),
-    x.dtype), )  # fmt: skip
+    x.dtype), np.zeros((shapes.kinds.shape[0], triangles.shape[0], 3), x.dtype), )  # fmt: skip
 
 
 # --- particles ----------------------------------------------------------------------------------------------------------
@@ -154,21 +166,14 @@ def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, frict
 
 
 @uncounted
-def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """Move the solids on, and resolve one sheet's particles' contacts with them after a substep; see
-    ``particle_contact.resolve_particles``.
+def _resolve_particles(r, s, m, shapes, colliders, carried, rows, scratch):
+    """Resolve one sheet's particles' contacts with solids.
 
-    x: [m], v: [m/s], (3, particles, 1).  w: inverse masses [1/kg], (particles, 1).  colliders: rows, (colliders, COLLIDER_ROWS,
-    1).  h: the substep [s].  room: from ``room_on_sheet``.
+    r: [m], s: [m/s], (3, particles).  m: inverse masses [1/kg], (particles,).  rows, scratch: from ``room_on_sheet``.
     """
-    _, _, _, rows, _, scratch = room
-    kinds, n = shapes.kinds, x.shape[1]
-    r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
+    kinds = shapes.kinds
     for k in range(kinds.shape[0]):
         c = colliders[k].reshape(colliders.shape[1])
-        # move the solid by its velocity
-        for e in range(3):
-            c[R_POINT + e] += h * c[R_VELOCITY + e]
         px, py, pz = c[R_POINT], c[R_POINT + 1], c[R_POINT + 2]
         sx, sy, sz, friction = c[R_VELOCITY], c[R_VELOCITY + 1], c[R_VELOCITY + 2], c[R_FRICTION]
         # a plane: heights, then the particles from the first to the last below it
@@ -205,6 +210,19 @@ def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried
         _respond(
             r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried
         )  # fmt: skip
+
+
+@uncounted
+def resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+    """Move the solids on, and resolve one sheet's particles' contacts with them after a substep; see
+    ``particle_contact.resolve_particles``.
+
+    x: [m], v: [m/s], (3, particles, 1).  w: inverse masses [1/kg], (particles, 1).  colliders: rows, (colliders, COLLIDER_ROWS,
+    1).  h: the substep [s].  room: from ``room_on_sheet``.
+    """
+    n = x.shape[1]
+    move_solids(colliders, h)
+    _resolve_particles(x.reshape((3, n)), v.reshape((3, n)), w.reshape(n), shapes, colliders, carried, room[3], room[5])
 
 
 @uncounted
@@ -309,7 +327,7 @@ def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
 
     The triangles of a grid come two to a cell, row by row.
     """
-    touches, which, count, rows, chosen, scratch = room
+    touches, which, count, rows, chosen, scratch, kept = room
     n, c = x.shape[1], collider.reshape(collider.shape[0])
     r = x.reshape((3, n))
     # without its thickness, and less the depth that triangles may sink in
@@ -333,75 +351,47 @@ def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
             continue
         if not find_deepest(scratch, shapes, k) or not turn_normal(scratch):
             continue
-        # the plane, by its offset from the solid's point along the normal
-        for l in range(scratch.shape[1]):
-            nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-            if scratch[S_CONTACT, l] < scratch.dtype.type(NO_CONTACT):
-                scratch[S_CONTACT, l] -= nx * scratch[S_SPOT, l] + ny * scratch[S_SPOT + 1, l] + nz * scratch[S_SPOT + 2, l]
         normal_to_world(scratch)
-        # write the touches
+        # write the touches, each with its ball, and the impulse that it had
         for l in range(filled):
             if scratch[S_CONTACT, l] >= scratch.dtype.type(NO_CONTACT):
                 continue
+            t, rho = chosen[begin + l], scratch[S_RHO, l]
             for e in range(3):
-                touches[count[0], e] = scratch[S_WEIGHTS + e, l]
-            for e in range(4):
-                touches[count[0], 3 + e] = scratch[S_CONTACT + e, l]
+                spot = -c[R_POINT + e]
+                for corner in range(3):
+                    spot += scratch[S_WEIGHTS + corner, l] * r[e, triangles[t, corner]]
+                touches[count[0], T_CORE + e] = spot - rho * scratch[S_CONTACT + 1 + e, l]
+                touches[count[0], T_IMPULSE + e] = kept[k, t, e]
+            touches[count[0], T_RHO] = rho - scratch[S_CONTACT, l]
             which[count[0], 0], which[count[0], 1] = chosen[begin + l], k
             count[0] += 1
 
 
 @uncounted
-def press_touches_on_sheet(x, v, w, triangles, colliders, room, h, carried):
-    """Resolve the touches of one sheet, one after the other; see ``triangle_contact.press_touches``."""
-    touches, which, count, _, _, _ = room
-    n = x.shape[1]
-    r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
-    zero, one = x.dtype.type(0), x.dtype.type(1)
-    tiny, relaxed = x.dtype.type(TINY), x.dtype.type(RELAXED)
-    for t in range(count[0]):
-        # the touch, and the signed distance of its point from its plane
-        c = colliders[which[t, 1]]
-        i, j, k = triangles[which[t, 0], 0], triangles[which[t, 0], 1], triangles[which[t, 0], 2]
-        a, b, d = touches[t, 0], touches[t, 1], touches[t, 2]
-        gap, nx, ny, nz = touches[t, 3], touches[t, 4], touches[t, 5], touches[t, 6]
-        gap += nx * (a * r[0, i] + b * r[0, j] + d * r[0, k] - c[R_POINT, 0])
-        gap += ny * (a * r[1, i] + b * r[1, j] + d * r[1, k] - c[R_POINT + 1, 0])
-        gap += nz * (a * r[2, i] + b * r[2, j] + d * r[2, k] - c[R_POINT + 2, 0])
-        if not gap < zero:
-            continue
-        # velocity of the point relative to the solid, and its inverse mass
-        ux = a * s[0, i] + b * s[0, j] + d * s[0, k] - c[R_VELOCITY, 0]
-        uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[R_VELOCITY + 1, 0]
-        uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[R_VELOCITY + 2, 0]
-        inverse_mass = m[i] * a * a + m[j] * b * b + m[k] * d * d
-        mx, my, mz, cx, cy, cz = touch_change(
-            gap, nx, ny, nz, ux, uy, uz, inverse_mass, c[R_FRICTION, 0], h, carried, zero, one, tiny, relaxed
-        )
-        # correct the corners
-        for p, weight in ((i, a), (j, b), (k, d)):
-            share = m[p] * weight
-            r[0, p] += share * mx
-            r[1, p] += share * my
-            r[2, p] += share * mz
-            s[0, p] += share * cx
-            s[1, p] += share * cy
-            s[2, p] += share * cz
+def resolve_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+    """Contact of one sheet, of its particles and between them; see ``particle_contact.resolve``.
 
-
-@uncounted
-def resolve_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """``resolve_particles_on_sheet``, then the sheet between the particles.
-
-    triangles: (triangles, 3).  look: whether to search for touches in this substep.
+    triangles: (triangles, 3).
     """
-    resolve_particles_on_sheet(x, v, w, triangles, shapes, colliders, h, carried, look, room)
-    count, kinds = room[2], shapes.kinds
-    # search for touches with all solids but planes, which touch particles first
-    if look:
+    touches, which, count, rows, _, scratch, kept = room
+    kinds, n = shapes.kinds, x.shape[1]
+    r, s, m = x.reshape((3, n)), v.reshape((3, n)), w.reshape(n)
+    move_solids(colliders, h)
+    # search for touches with all solids but planes, which touch particles first; those found again keep their impulses
+    if step % look_every == 0:
+        kept[:] = 0
+        if step > 0:
+            for t in range(count[0]):
+                for e in range(3):
+                    kept[which[t, 1], which[t, 0], e] = touches[t, T_IMPULSE + e]
         count[0] = 0
         for k in range(kinds.shape[0]):
             if kinds[k] != KIND_PLANE:
                 find_touches_on_sheet(x, triangles, shapes, k, colliders[k], room)
-    # resolve them
-    press_touches_on_sheet(x, v, w, triangles, colliders, room, h, carried)
+    # where they are now; they bear what lies on them, and after the particles they are corrected
+    number = count[0]
+    follow_touches_on_sheet(r, triangles, colliders, touches[:number], which, scratch)
+    bear_touches_on_sheet(r, s, m, triangles, touches[:number], which, carried)
+    press_touches_on_sheet(r, s, m, triangles, colliders, touches[:number], which, h, carried)
+    _resolve_particles(r, s, m, shapes, colliders, carried, rows, scratch)

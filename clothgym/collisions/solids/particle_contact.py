@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from clothgym._jit import apart, inlined, kernel, placeholder, specialize
 from clothgym.collisions.solids.contact_law import TINY, contact_change
 from clothgym.collisions.solids.grid_contact import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
-from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_POINT, R_VELOCITY
+from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import (
     S_CONTACT,
     S_INVERSE_MASS,
@@ -32,7 +32,8 @@ from clothgym.collisions.solids.signed_distance import (
     normal_to_world,
     to_axes,
 )
-from clothgym.collisions.solids.triangle_contact import find_touches, may_touch_sheet, press_touches, room_for_touches
+from clothgym.collisions.solids.touch_response import T_IMPULSE, bear_touches, follow_touches, move_solids, press_touches
+from clothgym.collisions.solids.triangle_contact import find_touches, may_touch_sheet, room_for_touches
 from clothgym.state import Layout
 
 may_touch = placeholder("may_touch", "of (x, p, collider): whether particle p of any lane may touch the solid")
@@ -97,22 +98,12 @@ _resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_s
 
 
 @apart
-def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """Move the solids of one block on, and resolve its particles' contacts with them after a substep.
-
-    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes); attached particles are left alone.
-    colliders: rows, (colliders, COLLIDER_ROWS, lanes).  h: the substep [s].  carried: time for which the velocity has already moved
-    the positions [s].  room: from ``room_in_lanes``.  triangles and look are for ``resolve``.
-    """
-    kinds, scratch = shapes.kinds, room[1]
+def _resolve_each(x, v, w, shapes, colliders, carried, scratch):
+    """Resolve the contacts of one block's particles with each solid."""
+    kinds = shapes.kinds
     for k in range(kinds.shape[0]):
         collider = colliders[k]
-        # move the solid by its velocity
-        for c in range(3):
-            for l in range(x.shape[2]):
-                collider[R_POINT + c, l] += h * collider[R_VELOCITY + c, l]
         lay_out(collider, scratch)
-        # its contacts
         if kinds[k] == KIND_PLANE:
             _resolve_plane(x, v, w, collider, shapes, k, carried, scratch)
         elif kinds[k] == KIND_ROUNDED_BOX:
@@ -122,27 +113,48 @@ def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, r
 
 
 @apart
-def resolve(x, v, w, triangles, shapes, colliders, h, carried, look, room):
-    """``resolve_particles``, then the sheet between the particles.
+def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+    """Move the solids of one block on, and resolve its particles' contacts with them after a substep.
 
-    triangles: (triangles, 3).  look: whether to search for touches in this substep.
+    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes); attached particles are left alone.
+    colliders: rows, (colliders, COLLIDER_ROWS, lanes).  h: the substep [s].  carried: time for which the velocity has already moved
+    the positions [s].  room: from ``room_in_lanes``.  triangles, step and look_every are for ``resolve``.
     """
-    resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, look, room)
+    move_solids(colliders, h)
+    _resolve_each(x, v, w, shapes, colliders, carried, room[1])
+
+
+@apart
+def resolve(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+    """The same, and the sheet between the particles, see ``touch_response``.
+
+    triangles: (triangles, 3).  step: of the control step, before which no touch has borne anything.  look_every: substeps after
+    which touches are searched for again.
+    """
     touches, scratch = room
+    rows, which, count, kept, _ = touches
     kinds = shapes.kinds
-    # search for touches with all solids but planes, which touch particles first
-    if look:
-        touches[2][0] = 0
+    move_solids(colliders, h)
+    # search for touches with all solids but planes, which touch particles first; those found again keep their impulses
+    if step % look_every == 0:
+        kept[:] = 0
+        if step > 0:
+            for n in range(count[0]):
+                kept[which[n, 1], which[n, 0]] = rows[n, T_IMPULSE : T_IMPULSE + 3]
+        count[0] = 0
         for k in range(kinds.shape[0]):
             if kinds[k] != KIND_PLANE and may_touch_sheet(x, colliders[k], scratch):
                 lay_out(colliders[k], scratch)
                 find_touches(x, triangles, shapes, k, touches, scratch)
-    # resolve them
-    press_touches(x, v, w, triangles, colliders, touches, h, carried, scratch)
+    # where they are now; they bear what lies on them, and after the particles they are corrected
+    follow_touches(x, triangles, colliders, touches, scratch)
+    bear_touches(x, v, w, triangles, touches, carried)
+    _resolve_each(x, v, w, shapes, colliders, carried, scratch)
+    press_touches(x, v, w, triangles, colliders, touches, h, carried)
 
 
 @kernel
-def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, look, room):
+def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
     """``resolve`` without solids."""
 
 

@@ -2,14 +2,10 @@
 
 For each triangle near a solid the point is found that lies deepest in it, its touch (see ``deepest_point``).
 
-The search is repeated at intervals (``simulation.SURFACE_INTERVAL``).  In between, each touch stands for a plane that moves with
-the solid.  In every substep a point beyond its plane is pushed back, loses its inward velocity and feels friction
-(``contact_law``); the corners of the triangle share this by barycentric weight times inverse mass.  Friction must act in every
-substep: a sheet that is left without it for three creeps off a capsule within seconds, even if its mean motion is taken back.
+The search is repeated at intervals (``simulation.SURFACE_INTERVAL``).  In between, each touch stands for a ball in the solid that
+moves with it: what the touch does is in ``touch_response``.
 
 Particles keep the full thickness; between them the sheet may sink into the true surface by ``SINK`` of the solid's least width.
-Where the sheet is fine enough its particles carry it alone and come to rest, and touches only catch what they miss.  Touches that
-share corners are solved one after the other, which leaves a jitter of some mm/s to cm/s.
 """
 
 from __future__ import annotations
@@ -17,36 +13,30 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.collisions.solids.contact_law import RELAXED, TINY, touch_change
 from clothgym.collisions.solids.deepest_point import LYING, NO_CONTACT, find_deepest, turn_normal
 from clothgym.collisions.solids.shapes import (
     KIND_MESH,
     KIND_PLANE,
-    R_FRICTION,
     R_HALF,
     R_POINT,
     R_RADIUS,
     R_REACH2,
     R_THICKNESS,
-    R_VELOCITY,
 )
 from clothgym.collisions.solids.signed_distance import (
     S_CLEAR,
     S_CONTACT,
     S_CORE,
     S_CORNERS,
-    S_INVERSE_MASS,
-    S_MOTION,
     S_RHO,
     S_SPOT,
     S_WEIGHTS,
-    lay_out,
     measure,
     normal_to_world,
     to_axes,
 )
+from clothgym.collisions.solids.touch_response import T_CORE, T_IMPULSE, T_RHO, TOUCH_ROWS, copy_rows
 
-TOUCH_ROWS = 7  # rows of a touch: three weights; offset of the plane from the solid's point along the normal; normal
 SINK = 0.003  # depth that the sheet between its particles may sink in, as a share of the solid's least width
 
 
@@ -118,68 +108,12 @@ def may_touch_triangle(scratch):
 
 
 @inlined
-def _push_triangle_out(h, carried, scratch):
-    """The contact law at a touch, per inverse mass and weight of a corner: changes of positions to S_SPOT, of velocities to
-    S_MOTION.
-    """
-    zero, one = scratch.dtype.type(0), scratch.dtype.type(1)
-    tiny, relaxed = scratch.dtype.type(TINY), scratch.dtype.type(RELAXED)
-    for l in range(scratch.shape[1]):
-        nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-        ux = scratch[S_MOTION, l] - scratch[R_VELOCITY, l]
-        uy = scratch[S_MOTION + 1, l] - scratch[R_VELOCITY + 1, l]
-        uz = scratch[S_MOTION + 2, l] - scratch[R_VELOCITY + 2, l]
-        mx, my, mz, cx, cy, cz = touch_change(
-            scratch[S_CONTACT, l],
-            nx,
-            ny,
-            nz,
-            ux,
-            uy,
-            uz,
-            scratch[S_INVERSE_MASS, l],
-            scratch[R_FRICTION, l],
-            h,
-            carried,
-            zero,
-            one,
-            tiny,
-            relaxed,
-        )
-        scratch[S_SPOT, l] = mx
-        scratch[S_SPOT + 1, l] = my
-        scratch[S_SPOT + 2, l] = mz
-        scratch[S_MOTION, l] = cx
-        scratch[S_MOTION + 1, l] = cy
-        scratch[S_MOTION + 2, l] = cz
-
-
-@inlined
-def _move_corner(x, v, w, p, weight, scratch):
-    """Move corner p by its share of the change: x_p += w_p b dx and v_p += w_p b dv, with its barycentric weight b."""
-    for c in range(3):
-        for l in range(scratch.shape[1]):
-            x[c, p, l] += w[p, l] * weight[l] * scratch[S_SPOT + c, l]
-        for l in range(scratch.shape[1]):
-            v[c, p, l] += w[p, l] * weight[l] * scratch[S_MOTION + c, l]
-
-
-@inlined
 def _to_local(x, p, scratch, local):
     """Position of particle p in the solid's axes [m]: ``local``, (3, lanes)."""
     to_axes(x, p, scratch, S_CORE)
     for c in range(3):
         for l in range(scratch.shape[1]):
             local[c, l] = scratch[S_CORE + c, l]
-
-
-@inlined
-def _fetch(rows, scratch, at):
-    """Copy rows to the scratch from row ``at`` on; they are contiguous, so one loop does it."""
-    size = rows.shape[0] * rows.shape[1]
-    source, target = rows.reshape(size), scratch[at : at + rows.shape[0]].reshape(size)
-    for e in range(size):
-        target[e] = source[e]
 
 
 @kernel
@@ -197,14 +131,16 @@ def may_touch_mesh(scratch, shapes, k):
 @kernel
 def room_for_touches(x, triangles, shapes):
     """Arrays for the touches of one block: rows, (touches, TOUCH_ROWS, lanes); triangle and solid of each, (touches, 2); their
-    number, (1,); scratch for positions, (particles, 3, lanes).
+    number, (1,); impulses of each triangle at each solid [N s], (colliders, triangles, 3, lanes); scratch for positions,
+    (particles, 3, lanes).
     """
     solids = 0
     for k in range(shapes.kinds.shape[0]):
         solids += shapes.kinds[k] != KIND_PLANE
     most = triangles.shape[0] * solids
     rows, scratch = np.empty((most, TOUCH_ROWS, x.shape[2]), x.dtype), np.empty((x.shape[1], 3, x.shape[2]), x.dtype)
-    return rows, np.empty((most, 2), np.int64), np.zeros(1, np.int64), scratch
+    kept = np.zeros((shapes.kinds.shape[0], triangles.shape[0], 3, x.shape[2]), x.dtype)
+    return rows, np.empty((most, 2), np.int64), np.zeros(1, np.int64), kept, scratch
 
 
 @apart
@@ -213,7 +149,7 @@ def find_touches(x, triangles, shapes, k, touches, scratch):
 
     x: [m], (3, particles, lanes).  touches: from ``room_for_touches``.  scratch: with the solid's rows, (SCRATCH_ROWS, lanes).
     """
-    rows, which, count, local = touches
+    rows, which, count, kept, local = touches
     # without its thickness, and less the depth that triangles may sink in
     for l in range(scratch.shape[1]):
         half = min(scratch[R_HALF, l], min(scratch[R_HALF + 1, l], scratch[R_HALF + 2, l])) + scratch[R_RADIUS, l]
@@ -224,71 +160,27 @@ def find_touches(x, triangles, shapes, k, touches, scratch):
     for t in range(triangles.shape[0]):
         # triangles that may touch it
         for c in range(3):
-            _fetch(local[triangles[t, c]], scratch, S_CORNERS + 3 * c)
+            copy_rows(local[triangles[t, c]], scratch, S_CORNERS + 3 * c)
         if not may_touch_triangle(scratch):
             continue
         if shapes.kinds[k] == KIND_MESH and not may_touch_mesh(scratch, shapes, k):
             continue
         # the deepest point, and the normal there
         if find_deepest(scratch, shapes, k) and turn_normal(scratch):
-            # the plane, by its offset from the solid's point along the normal
-            for l in range(scratch.shape[1]):
-                nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-                scratch[S_CONTACT, l] -= nx * scratch[S_SPOT, l] + ny * scratch[S_SPOT + 1, l] + nz * scratch[S_SPOT + 2, l]
             normal_to_world(scratch)
-            # write the touch
+            # write the touch: its ball, and the impulse that it had
             touch = rows[count[0]]
             for c in range(3):
+                i, j, m = triangles[t, 0], triangles[t, 1], triangles[t, 2]
                 for l in range(scratch.shape[1]):
-                    touch[c, l] = scratch[S_WEIGHTS + c, l]
-            for c in range(4):
+                    wi, wj, wm = scratch[S_WEIGHTS, l], scratch[S_WEIGHTS + 1, l], scratch[S_WEIGHTS + 2, l]
+                    spot = wi * x[c, i, l] + wj * x[c, j, l] + wm * x[c, m, l] - scratch[R_POINT + c, l]
+                    touch[T_CORE + c, l] = spot - scratch[S_RHO, l] * scratch[S_CONTACT + 1 + c, l]
                 for l in range(scratch.shape[1]):
-                    touch[3 + c, l] = scratch[S_CONTACT + c, l]
+                    touches_it = scratch[S_CONTACT, l] < scratch.dtype.type(NO_CONTACT)
+                    touch[T_IMPULSE + c, l] = kept[k, t, c, l] if touches_it else scratch.dtype.type(0)
+            for l in range(scratch.shape[1]):
+                touch[T_RHO, l] = scratch[S_RHO, l] - scratch[S_CONTACT, l]
             which[count[0], 0] = t
             which[count[0], 1] = k
             count[0] += 1
-
-
-@apart
-def press_touches(x, v, w, triangles, colliders, touches, h, carried, scratch):
-    """Resolve the touches of one block, one after the other.
-
-    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  h: the substep [s].  carried: time for
-    which the velocity has already moved the positions [s].  scratch: (SCRATCH_ROWS, lanes).
-    """
-    rows, which, count, _ = touches
-    solid = -1
-    for n in range(count[0]):
-        # the solid, when it changes
-        if which[n, 1] != solid:
-            solid = which[n, 1]
-            lay_out(colliders[solid], scratch)
-        # the touch
-        i, j, m = triangles[which[n, 0], 0], triangles[which[n, 0], 1], triangles[which[n, 0], 2]
-        touch = rows[n]
-        _fetch(touch[3:TOUCH_ROWS], scratch, S_CONTACT)
-        a, b, c = touch[0], touch[1], touch[2]
-        # its point, and the signed distance from its plane
-        for e in range(3):
-            for l in range(scratch.shape[1]):
-                scratch[S_SPOT + e, l] = a[l] * x[e, i, l] + b[l] * x[e, j, l] + c[l] * x[e, m, l] - scratch[R_POINT + e, l]
-        for l in range(scratch.shape[1]):
-            nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-            scratch[S_CONTACT, l] += nx * scratch[S_SPOT, l] + ny * scratch[S_SPOT + 1, l] + nz * scratch[S_SPOT + 2, l]
-        # nothing to do if it is outside in all lanes
-        touching = False
-        for l in range(scratch.shape[1]):
-            touching |= scratch[S_CONTACT, l] < 0
-        if touching:
-            # velocity and inverse mass of the point
-            wi, wj, wm = w[i], w[j], w[m]
-            for e in range(3):
-                for l in range(scratch.shape[1]):
-                    scratch[S_MOTION + e, l] = a[l] * v[e, i, l] + b[l] * v[e, j, l] + c[l] * v[e, m, l]
-            for l in range(scratch.shape[1]):
-                scratch[S_INVERSE_MASS, l] = wi[l] * a[l] * a[l] + wj[l] * b[l] * b[l] + wm[l] * c[l] * c[l]
-            # correct the corners
-            _push_triangle_out(h, carried, scratch)
-            for corner in range(3):
-                p = triangles[which[n, 0], corner]
-                _move_corner(x, v, w, p, touch[corner], scratch)
