@@ -1,6 +1,6 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
-# make bits: the committed digests of every id, method and contact, compiled for two other instruction sets of x86-64
+# make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make oldest: tests with the oldest dependencies; each in an environment of its own
 PYTHON ?= python3
 VENV ?= .venv
@@ -28,8 +28,9 @@ test: lint
 	$(BIN)/python -m pytest -q -n 2 --durations=10
 
 bits: $(VENV)/ready
-	NUMBA_CPU_NAME=generic $(BIN)/python benchmarks/bits.py --compare benchmarks/results/bits.json
-	NUMBA_CPU_NAME=haswell $(BIN)/python benchmarks/bits.py --compare benchmarks/results/bits.json
+	$(BIN)/python benchmarks/bits.py --json $(VENV)/bits.json
+	NUMBA_CPU_NAME=generic $(BIN)/python benchmarks/bits.py --compare $(VENV)/bits.json
+	NUMBA_CPU_NAME=haswell $(BIN)/python benchmarks/bits.py --compare $(VENV)/bits.json
 
 clients:
 	$(PYTHON) -m venv $(VENV)-clients
