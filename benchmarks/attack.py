@@ -49,7 +49,7 @@ from clothgym.lab.bench import machine
 FAMILIES = ("constructors", "resets", "actions", "states", "files", "kills", "disk", "protocol")
 OUTCOMES = ("fine", "clear", "obscure", "hang", "crash", "nonsense")
 RESULTS = Path(__file__).parent / "results" / "attack.json"
-LIMIT = 120.0  # of an attack [s]; a kernel may be compiled in it
+LIMIT = 300.0  # of an attack [s]; a kernel may be compiled in it, beside others
 MEMORY = 16 * 2**30  # of a process [bytes], most of which is address space that libraries reserve
 LISTED = 20  # lines of a family's report, and findings that are kept of one line of code
 OURS = tuple(str(Path(module.__file__ or "").resolve().parent) for module in (clothgym, clothgym.envs))
