@@ -1,5 +1,6 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
+# make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make oldest: tests with the oldest dependencies; each in an environment of its own
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,7 +10,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test clients oldest bench clean
+.PHONY: train check lint test bits clients oldest bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -25,6 +26,11 @@ check: lint
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --durations=10
+
+bits: $(VENV)/ready
+	$(BIN)/python benchmarks/bits.py --json $(VENV)/bits.json
+	NUMBA_CPU_NAME=generic $(BIN)/python benchmarks/bits.py --compare $(VENV)/bits.json
+	NUMBA_CPU_NAME=haswell $(BIN)/python benchmarks/bits.py --compare $(VENV)/bits.json
 
 clients:
 	$(PYTHON) -m venv $(VENV)-clients

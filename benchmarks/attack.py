@@ -8,7 +8,8 @@ Attacks are drawn from a seed.  Each family is a module of ``attacks/``, in a pr
 attack has one of these outcomes:
 
     fine        it was taken, and what came of it is sound
-    clear       it was refused: a ValueError or TypeError that our own code raises, with the argument's name or what would do
+    clear       it was refused: a ValueError or TypeError that our own code raises, with the argument's name or what would do; or,
+                where there is no file, a FileNotFoundError
     obscure     any other exception
     hang        it did not end within the time limit
     crash       the process died
@@ -48,9 +49,9 @@ from clothgym.lab.bench import machine
 FAMILIES = ("constructors", "resets", "actions", "states", "files", "kills", "disk", "protocol")
 OUTCOMES = ("fine", "clear", "obscure", "hang", "crash", "nonsense")
 RESULTS = Path(__file__).parent / "results" / "attack.json"
-LIMIT = 120.0  # of an attack [s]; a kernel may be compiled in it
+LIMIT = 300.0  # of an attack [s]; a kernel may be compiled in it, beside others
 MEMORY = 16 * 2**30  # of a process [bytes], most of which is address space that libraries reserve
-LISTED = 20  # lines of a family's report
+LISTED = 20  # lines of a family's report, and findings that are kept of one line of code
 OURS = tuple(str(Path(module.__file__ or "").resolve().parent) for module in (clothgym, clothgym.envs))
 OURS = (*OURS, str(Path(__file__).resolve().parents[1] / "training"))
 REMEDY = re.compile(
@@ -77,7 +78,7 @@ def outcome_of(text: str, error: BaseException | None) -> tuple[str, str]:
     where = f"{said[:400]}  [{Path(last.filename).name}:{last.lineno}]"
     if isinstance(error, AssertionError) and Path(last.filename).parent.name == "attacks":
         return "nonsense", where
-    if not isinstance(error, (ValueError, TypeError)):
+    if not isinstance(error, (ValueError, TypeError, FileNotFoundError)):
         return "obscure", where
     # raised on purpose, by us, and of use to whoever reads it
     ours = any(str(Path(last.filename).resolve()).startswith(f"{folder}/") for folder in OURS)
@@ -149,12 +150,14 @@ def findings(family: str, seed: int, limit: float = LIMIT) -> Iterator[Finding]:
 
 def attacked(family: str, seed: int, seconds: float, bar: Any, most: int = 0, limit: float = LIMIT) -> dict[str, Any]:
     """What a family of attacks finds in so many seconds, or in ``most`` attacks."""
-    counts, notes = Counter(dict.fromkeys(OUTCOMES, 0)), []
+    counts, places, notes = Counter(dict.fromkeys(OUTCOMES, 0)), Counter[tuple[str, str]](), []
     until = None
     for text, outcome, said in (found := findings(family, seed, limit)):
         until = until or time.monotonic() + seconds  # the first attack waits for imports and kernels
         counts[outcome] += 1
-        if outcome not in ("fine", "clear"):
+        place = outcome, said.rpartition("[")[2]
+        places[place] += 1
+        if outcome not in ("fine", "clear") and places[place] <= LISTED:
             notes.append({"outcome": outcome, "attack": text, "said": said})
         bar.update()
         if time.monotonic() > until or sum(counts.values()) == most:
@@ -194,10 +197,12 @@ def table(results: dict[str, Any]) -> str:
     for name, counts in [*((family, row["counts"]) for family, row in families.items()), ("all", total)]:
         lines.append(f"{name:<14}" + "".join(f"{counts[outcome]:>10}" for outcome in OUTCOMES))
     for family, row in families.items():
-        for one in row["findings"][:LISTED]:
+        listed = row["findings"][:LISTED]
+        for one in listed:
             lines += [f"\n{one['outcome']}: {one['attack']}", f"    {one['said']}"]
-        if len(row["findings"]) > LISTED:
-            lines.append(f"\n... and {len(row['findings']) - LISTED} more of {family}, see --json")
+        more = sum(row["counts"][name] for name in OUTCOMES[2:]) - len(listed)
+        if more:
+            lines.append(f"\n... and {more} more of {family}; --json has up to {LISTED} of each line of code")
     return "\n".join(lines)
 
 

@@ -46,6 +46,9 @@ class GripperTask(Task):
         super().__init__(num_envs, **kwargs)
         self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
 
+    def _drawn(self) -> list[NDArray]:
+        return [*super()._drawn(), self.gripper_starts]
+
     def place_attachments(self, envs: NDArray) -> None:
         """Put the grippers where their episodes begin with them."""
         self.simulation.grippers.place(self.gripper_starts[envs], envs)

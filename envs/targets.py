@@ -63,7 +63,7 @@ class Target:
         if self.shape in ("sphere", "box") and not math.isclose(self.height, 2 * self.radius, rel_tol=1e-6):
             raise ValueError(f"target height={self.height!r}: must be twice the radius {self.radius!r} of a {self.shape}")
         if self.shape == "post" and self.height < self.radius:
-            raise ValueError(f"target height={self.height!r}: that of a post is at least its radius {self.radius!r}")
+            raise ValueError(f"target height={self.height!r}: must be at least the radius {self.radius!r} of a post")
 
     @staticmethod
     def draw(rng: np.random.Generator, side: float, spread: float, shape: str | None = None) -> Target:

@@ -230,12 +230,14 @@ class Task(TaskDefinition):
         if not len(envs):
             return
         # draw what is new; what has been drawn is put back if it is refused
-        before = self.episode[envs], self.air[envs], self._seeded[envs]
+        drawn = self._drawn()
+        before = [array[envs] for array in drawn]
         generators = [(self.generators[env], self.generators[env].bit_generator.state) for env in envs.tolist()]
         try:
             start = self.simulation.checked_start(envs, self._draw(envs, seeds, options))
         except BaseException:
-            self.episode[envs], self.air[envs], self._seeded[envs] = before
+            for array, value in zip(drawn, before):
+                array[envs] = value
             for env, (generator, state) in zip(envs.tolist(), generators):
                 self.generators[env], generator.bit_generator.state = generator, state
             raise
@@ -244,6 +246,10 @@ class Task(TaskDefinition):
         self.simulation.begin(*start)
         self._begin(envs, warn="material" in options)
         self.turn.finish(envs.tolist())
+
+    def _drawn(self) -> list[NDArray]:
+        """All that drawing an episode writes, beside the generators, live, (num_envs, ...)."""
+        return [self.episode, self.air, self._seeded]
 
     def _draw(self, envs: NDArray, seeds: Sequence[int | None], options: Mapping[str, Any]) -> NDArray:
         """Draw each episode from its own generator; returns the sheets [m], (len(envs), particles, 3)."""

@@ -95,6 +95,13 @@ def test_what_was_obscure_is_a_sentence(campaign, text, error):
         campaign.run(text)
 
 
+def test_a_missing_file_is_a_clear_refusal_and_an_error_of_the_system_is_none(campaign, tmp_path):
+    from clothgym.adapters import runs
+
+    assert campaign.tried("", lambda: runs.read_config(tmp_path))[0] == "clear"
+    assert campaign.tried("", lambda: (tmp_path / "none").read_text())[0] == "obscure"
+
+
 def test_tensors_and_lists_are_arrays(campaign):
     torch = pytest.importorskip("torch")
     from attacks.resets import victim
@@ -108,6 +115,20 @@ def test_tensors_and_lists_are_arrays(campaign):
     assert all(np.array_equal(seen[0], other) for other in seen[1:])
     with pytest.raises(ValueError, match="action="):
         env.step(torch.zeros((3, 3), device="meta"))
+
+
+def test_findings_of_one_line_of_code_are_counted_and_a_few_kept(campaign, monkeypatch):
+    found = [("f()", "obscure", "KeyError: 1  [a.py:1]")] * 50 + [("g()", "obscure", "KeyError: 2  [a.py:2]"), ("h()", "fine", "")]
+    monkeypatch.setattr(campaign, "findings", lambda *_: (one for one in found))
+
+    class Bar:
+        def update(self):
+            pass
+
+    row = campaign.attacked("actions", 0, 60.0, Bar(), most=len(found))
+    assert row["counts"]["obscure"] == 51 and row["counts"]["fine"] == 1
+    assert [one["attack"] for one in row["findings"]] == ["f()"] * 20 + ["g()"]
+    assert "... and 31 more of actions" in campaign.table({"families": {"actions": row}})
 
 
 def test_the_command_writes_its_results(campaign, tmp_path):

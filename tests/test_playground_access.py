@@ -241,6 +241,37 @@ def test_a_visit_ends_with_its_visitor_whose_thread_counts_until_it_does(running
 # --- what a browser may send --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("message", [b"\xc1", b"\x05", "text", {"type": "no such"}, {"type": "GuiUpdateMessage"}])
+def test_a_message_that_cannot_be_read_ends_its_visit_with_a_sentence(running, message, capsys, caplog):
+    import msgspec
+    from websockets.exceptions import ConnectionClosed
+
+    with connected(running.access.port) as client, pytest.raises(ConnectionClosed, match="cannot be read"):
+        client.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
+        while True:
+            client.recv(timeout=DEADLINE)
+    said = capsys.readouterr().err
+    assert said.startswith("A visitor has sent what makes no sense: ") and said.count("\n") == 1
+    assert not any(record.exc_info for record in caplog.records)
+
+
+def test_a_message_that_cannot_be_followed_is_a_sentence_and_the_visit_goes_on(running, capsys, caplog):
+    import msgspec
+
+    until(lambda: not running.visits)
+    with connected(running.access.port) as client:
+        come(client)
+        visit = until(lambda: next(iter(running.visits.values()), None))
+        until(lambda: visit.frames)
+        (uuid, *_) = visit.page.client.gui._gui_input_handle_from_uuid
+        client.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"no such": 1}}))
+        said = until(lambda: capsys.readouterr().err)
+        frames = visit.frames
+        until(lambda: visit.frames > frames)
+    assert said.startswith("A visitor has sent what makes no sense: AssertionError") and said.count("\n") == 1
+    assert not any(record.exc_info for record in caplog.records)
+
+
 def page(left=lambda: False):
     client, gallery = NullClient(), server.Gallery()
     return Page(client, gallery.open, gallery.titles, "patch", left), client

@@ -105,6 +105,15 @@ def test_a_start_that_strict_mode_refuses_changes_nothing():
     assert digest(env) == before
 
 
+def test_a_refused_reset_leaves_where_grippers_start():
+    env = advanced(make("ClothDrapeGripper-v0").unwrapped)
+    before, begin = env.task.gripper_starts.copy(), env.task.begin
+    env.task.begin = lambda *given: begin(*given) * np.nan
+    with pytest.raises(ValueError):
+        env.reset(seed=5)
+    assert np.array_equal(env.task.gripper_starts, before)
+
+
 # --- interruptions ----------------------------------------------------------------------------------------------------------------
 
 

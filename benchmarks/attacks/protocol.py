@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import http.client
 import io
-import logging
 import socket
 import threading
 import time
@@ -179,8 +178,5 @@ def _stands() -> None:
 
 @cache
 def _running() -> Any:
-    # viser says with a traceback which messages it could not read
-    for name in ("asyncio", "websockets"):
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with contextlib.redirect_stdout(io.StringIO()):
         return server.serve("patch", port=0, tell=lambda _: None)

@@ -8,13 +8,17 @@ request also needs the token of the printed address, in its own address or in th
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import hmac
 import http
 import ipaddress
 import secrets
 import socket
-from collections.abc import Callable, Iterator
+import sys
+import traceback
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -97,13 +101,14 @@ class Access:
 
     @contextlib.contextmanager
     def guarding(self) -> Iterator[None]:
-        """While a server is made: it is made with this guard.  viser offers no door for it."""
+        """While a server is made: it is made with this guard, and tells of messages in sentences.  viser offers no door for it."""
         from websockets.asyncio import server
 
         plain = server.serve
 
-        def serve(*args: Any, process_request: Any = None, **kwargs: Any) -> Any:
-            return plain(*args, process_request=self.guarded(process_request), **kwargs)
+        def serve(handler: Any, *args: Any, process_request: Any = None, **kwargs: Any) -> Any:
+            asyncio.get_running_loop().set_exception_handler(lambda _, context: tell_of_a_message(context.get("exception")))
+            return plain(in_sentences(handler), *args, process_request=self.guarded(process_request), **kwargs)
 
         server.serve = serve  # type: ignore[assignment,misc]
         try:
@@ -138,6 +143,26 @@ class Access:
                 name, _, value = part.strip().partition("=")
                 offered += [value] if name == self._cookie else []
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in offered)
+
+
+def in_sentences(handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
+    """A websocket server's handler that ends a connection with a sentence where a message cannot be read."""
+
+    async def handle(connection: Any) -> None:
+        try:
+            await handler(connection)
+        except Exception as error:
+            tell_of_a_message(error)
+            await connection.close(1003, "a message that cannot be read")
+
+    return handle
+
+
+def tell_of_a_message(error: BaseException | None) -> None:
+    """Say in the terminal that a message made no sense: a browser can send anything, and viser would print a traceback."""
+    frames = traceback.extract_tb(error.__traceback__) if error is not None else ()
+    where = f" in {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+    print(f"A visitor has sent what makes no sense: {shown(error)}{where}", file=sys.stderr, flush=True)
 
 
 def is_loopback(host: str) -> bool:
