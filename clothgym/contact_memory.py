@@ -63,6 +63,10 @@ FIELDS = {
     "members": Kept("constraints", np.int32, G_SIZE),
     "planes": Kept("constraints", np.float64, PLANE_SIZE),
     "looks": Kept("environment", np.int32),
+    "outside": Kept("particle", np.bool_, saved=False),
+    "any_outside": Kept("environment", np.bool_, saved=False),
+    "query_due": Kept("environment", np.bool_, saved=False),
+    "active": Kept("constraints", np.int32, saved=False),
     "report": Kept("environment", np.float64, REPORT_SIZE, saved=False),
 }
 MOST_PER_VERTEX = {"contacts": MOST_CONTACTS, "constraints": MOST_CONSTRAINTS}  # for each vertex

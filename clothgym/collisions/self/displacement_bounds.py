@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import disjoint, inlined, kernel
+from clothgym._jit import apart, disjoint, inlined, kernel
 from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
 from clothgym.collisions.self.narrow_phase import MARGIN, SHARE, query
 from clothgym.collisions.self.spread import least_stretch
@@ -38,23 +38,21 @@ def confine(x, v, w, sheet, block, h):
         if memory.behind[block, l] > 0:
             memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
     # which vertices have left their bounds, and in which lanes a query is due
-    outside = np.empty((x.shape[1], lanes), np.bool_)
-    any_outside, query_due = np.zeros(lanes, np.bool_), np.zeros(lanes, np.bool_)
+    outside, any_outside, query_due = memory.outside[block], memory.any_outside[block], memory.query_due[block]
+    any_outside[:] = False
+    query_due[:] = False
     if lanes == 1:
         any_outside[0], query_due[0] = _find_outside_in_lane(x, start, bounds, limits, samples, 0, outside[:, 0])
     else:
         _find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due)
     # what follows costs nothing in the other lanes
-    own_outside = np.empty(x.shape[1], np.bool_)
     for l in range(memory.used[block]):
         if not any_outside[l]:
             continue
-        due = query_due[l]
+        due, own_outside = query_due[l], outside[:, l]
         # within their limits, vertices are certified by their gap constraints: evaluate the active ones
         if not due and setting.strict:
-            for p in range(x.shape[1]):
-                own_outside[p] = outside[p, l]
-            active = np.empty(memory.constraints[block, l], np.int32)
+            active = memory.active[block, l, : memory.constraints[block, l]]
             number = list_active(memory.members[block, l], own_outside, active)
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
@@ -161,7 +159,7 @@ def _catch_up(x, w, lag, l, h):
     return largest
 
 
-@inlined
+@apart
 def _query_again(x, v, w, sheet, block, l, h, outside):
     """Query lane l at its certified positions, and in strict mode clamp the vertices to their new limits.
 
@@ -197,7 +195,7 @@ def _query_again(x, v, w, sheet, block, l, h, outside):
         if violated:
             _clamp(x, v, memory, block, l, h, p64, limits, held, zero, zero, zero)
             outside[:] = True
-            active = np.empty(constraints, np.int32)
+            active = memory.active[block, l, :constraints]
             hold_apart(x, v, w, sheet, block, l, outside, active, list_active(members, outside, active))
         note_lag(w, memory, block, l)
 

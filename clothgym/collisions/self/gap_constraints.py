@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import apart, inlined, kernel, uncounted
 from clothgym.collisions.self.narrow_phase import GROUP_JAMMED
 from clothgym.contact_memory import G_GROUP, G_KEPT, G_NUMBER, G_OWN, G_VERTICES, REPORT_CLAMPED, REPORT_LAG
 
@@ -59,7 +59,7 @@ def is_violated(x, members, planes, t, l):
     return nearest - farthest < planes[t, G_KEPT]
 
 
-@kernel
+@uncounted
 def evaluate_constraints(x, memory, block, l, active):
     """Whether a query is due because of the active gap constraints of lane l, and whether one of them is violated.
 

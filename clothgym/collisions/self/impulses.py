@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, disjoint, inlined, kernel
+from clothgym._jit import apart, disjoint, inlined, kernel, uncounted
 from clothgym.collisions.self.narrow_phase import SLOP
 from clothgym.contact_memory import C_NORMAL, C_THICKNESS, REPORT_TOUCHING
 
@@ -35,7 +35,7 @@ FASTEST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness up to which a contact may act soon
 
 
-@kernel
+@uncounted
 def press_again(x, v, w, pressed, carried):
     """Apply the impulses of the last sweep to one block's sheets, v_i += w_i sum_k c_i j_k, before the solids, which so carry what
     lies on them.
@@ -62,7 +62,7 @@ def _apply_impulses(x, v, w, pressed, carried, negative_zero):
         v[e] += change
 
 
-@apart
+@uncounted
 def repel(x, v, w, sheet, block, h, carried):
     """Correct the impulses of one block's sheets, in each lane in which a sweep is due.
 
@@ -79,13 +79,19 @@ def repel(x, v, w, sheet, block, h, carried):
             continue
         if lanes == 1:
             _sweep_contacts(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
-        else:  # contacts read each particle many times, so a lane, whose values lie far apart, is copied
-            own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
-            _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, carried)
-            x[:, :, l], v[:, :, l] = own_x, own_v
+        else:
+            _sweep_copy(x, v, w, sheet, block, l, h, carried)
 
 
-@kernel
+@apart
+def _sweep_copy(x, v, w, sheet, block, l, h, carried):
+    """The same on a copy of lane l: contacts read each particle many times, and the values of a lane lie far apart."""
+    own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
+    _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, carried)
+    x[:, :, l], v[:, :, l] = own_x, own_v
+
+
+@uncounted
 def _sweep_contacts(x, v, w, sheet, block, l, h, carried):
     """One sweep over the contacts of one lane; x, v: [m], [m/s], (3, particles), w: [1/kg], (particles,)."""
     memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]

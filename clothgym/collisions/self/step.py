@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import inlined, kernel, uncounted
 from clothgym.collisions.self.broad_phase import Reach
 from clothgym.collisions.self.displacement_bounds import confine, note_uncertain
 from clothgym.collisions.self.impulses import press_again, repel
@@ -52,6 +52,8 @@ class Memory(NamedTuple):
     chosen: the active contacts, (blocks, lanes, room), of which there are ``choices``, (blocks, lanes).
     constraints: how many gap constraints; members, planes: see ``contact_memory``, (blocks, lanes, room, G_SIZE) and (..., 4);
     looks: evaluations of gap constraints since the last query, (blocks, lanes).
+    outside: scratch, which vertices are outside their bounds, (blocks, particles, lanes); any_outside, query_due: whether one is,
+    and whether a query is due, (blocks, lanes); active: the active gap constraints, (blocks, lanes, room).
     used: lanes that are not padding, (blocks,).  report: see ``contact_memory``, (blocks, lanes, REPORT_SIZE).
     """
 
@@ -73,6 +75,10 @@ class Memory(NamedTuple):
     members: NDArray
     planes: NDArray
     looks: NDArray
+    outside: NDArray
+    any_outside: NDArray
+    query_due: NDArray
+    active: NDArray
     chosen: NDArray
     choices: NDArray
     used: NDArray
@@ -102,7 +108,7 @@ class Sheet(NamedTuple):
     memory: Memory
 
 
-@apart
+@uncounted
 def press(x, v, w, sheet, block, step, h, carried):
     """Stage 1, before the solids: the contacts of one block apply their impulses of the previous substep.
 
@@ -126,7 +132,7 @@ def press(x, v, w, sheet, block, step, h, carried):
         press_again(x, v, w, memory.pressed[block], carried)
 
 
-@apart
+@uncounted
 def keep_apart(x, v, w, sheet, block, h, carried):
     """Stages 2 and 3, after the solids: impulses, then bounds.  Arguments as in ``press``."""
     if _any_contact(sheet.memory, block):
