@@ -362,7 +362,7 @@ def laid(env, offset, sheet=flat):
 
 def test_a_sheet_laid_on_the_target_succeeds_and_one_laid_beside_its_centre_does_not():
     env = gym.make(DRAPE)
-    centered, aside = laid(env, 0.0), laid(env, 0.25)
+    centered, aside = laid(env, 0.02), laid(env, 0.25)
     assert centered["is_success"] and centered["normalized_performance"] > 0.9
     # what hangs over has no width: the center of area comes nearer than it was laid
     assert 0.1 < aside["off_center"] < 0.25

@@ -42,7 +42,10 @@ from clothgym.collisions.solids.signed_distance import (
 from clothgym.collisions.solids.touch_response import (
     T_CORE,
     T_IMPULSE,
+    T_NORMAL,
+    T_OFFSET,
     T_RHO,
+    T_WEIGHTS,
     TOUCH_ROWS,
     bear_touches_on_sheet,
     follow_touches_on_sheet,
@@ -352,18 +355,21 @@ def find_touches_on_sheet(x, triangles, shapes, k, collider, room):
         if not find_deepest(scratch, shapes, k) or not turn_normal(scratch):
             continue
         normal_to_world(scratch)
-        # write the touches, each with its ball, and the impulse that it had
+        # write the touches: weights, plane, the impulse that each had, and its ball
         for l in range(filled):
             if scratch[S_CONTACT, l] >= scratch.dtype.type(NO_CONTACT):
                 continue
-            t, rho = chosen[begin + l], scratch[S_RHO, l]
+            t, rho, touch = chosen[begin + l], scratch[S_RHO, l], touches[count[0]]
+            touch[T_OFFSET] = scratch[S_CONTACT, l]
             for e in range(3):
-                spot = -c[R_POINT + e]
+                spot, normal = -c[R_POINT + e], scratch[S_CONTACT + 1 + e, l]
                 for corner in range(3):
                     spot += scratch[S_WEIGHTS + corner, l] * r[e, triangles[t, corner]]
-                touches[count[0], T_CORE + e] = spot - rho * scratch[S_CONTACT + 1 + e, l]
-                touches[count[0], T_IMPULSE + e] = kept[k, t, e]
-            touches[count[0], T_RHO] = rho - scratch[S_CONTACT, l]
+                touch[T_WEIGHTS + e], touch[T_NORMAL + e] = scratch[S_WEIGHTS + e, l], normal
+                touch[T_OFFSET] -= normal * spot
+                touch[T_IMPULSE + e] = kept[k, t, e]
+                touch[T_CORE + e] = spot - rho * normal
+            touch[T_RHO] = -1 if shapes.kinds[k] == KIND_MESH else rho - scratch[S_CONTACT, l]
             which[count[0], 0], which[count[0], 1] = chosen[begin + l], k
             count[0] += 1
 

@@ -3,7 +3,8 @@
 Until the next search (see ``triangle_contact``) a touch stands for a ball in the solid that moves with it.  Its core is the point
 from which the search found the deepest point of the triangle: for a sphere the center, for a capsule a point of its axis.  In every
 substep the triangle's point closest to the core is the touch, the direction to it the normal, and its distance less the ball's
-radius the gap.  (Where these stay as they were found, a triangle that rolls on a ball swings up: its support lags behind.)
+radius the gap.  (Where these stay as they were found, a triangle that rolls on a ball swings up: its support lags behind.)  At a
+mesh, whose edges may be sharper than any ball, they stay.
 
 A touch keeps its impulse from substep to substep: that is applied again before the particles' contacts, and then corrected, one
 touch after the other (projected Gauss-Seidel with a warm start; ``contact_law.touch_change``).  So what lies on a solid comes to
@@ -21,7 +22,7 @@ from clothgym.collisions.solids.shapes import R_FRICTION, R_POINT, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import S_CONTACT, S_CORE, S_CORNERS, S_RHO, S_SPOT, S_WEIGHTS
 
 # rows of a touch: three weights; offset of its plane from the solid's point along the normal; normal; impulse [N s]; the ball's
-# core relative to the solid's point [m]; the ball's radius [m]
+# core relative to the solid's point [m]; the ball's radius [m], not positive where weights and plane stay as they were found
 T_WEIGHTS, T_OFFSET, T_NORMAL, T_IMPULSE, T_CORE, T_RHO = 0, 3, 4, 7, 10, 13
 TOUCH_ROWS = 14
 
@@ -85,6 +86,8 @@ def follow_touches_on_sheet(r, triangles, colliders, touches, which, scratch):
         _to_ball(scratch)
         for l in range(min(columns, number - begin)):
             touch = touches[begin + l]
+            if touch[T_RHO] <= 0:
+                continue
             for e in range(3):
                 touch[T_WEIGHTS + e] = scratch[S_WEIGHTS + e, l]
             for e in range(4):
@@ -171,10 +174,10 @@ def follow_touches(x, triangles, colliders, touches, scratch):
         _to_ball(scratch)
         for c in range(3):
             for l in range(scratch.shape[1]):
-                touch[T_WEIGHTS + c, l] = scratch[S_WEIGHTS + c, l]
+                touch[T_WEIGHTS + c, l] = scratch[S_WEIGHTS + c, l] if touch[T_RHO, l] > 0 else touch[T_WEIGHTS + c, l]
         for c in range(4):
             for l in range(scratch.shape[1]):
-                touch[T_OFFSET + c, l] = scratch[S_CONTACT + c, l]
+                touch[T_OFFSET + c, l] = scratch[S_CONTACT + c, l] if touch[T_RHO, l] > 0 else touch[T_OFFSET + c, l]
 
 
 @inlined

@@ -35,7 +35,16 @@ from clothgym.collisions.solids.signed_distance import (
     normal_to_world,
     to_axes,
 )
-from clothgym.collisions.solids.touch_response import T_CORE, T_IMPULSE, T_RHO, TOUCH_ROWS, copy_rows
+from clothgym.collisions.solids.touch_response import (
+    T_CORE,
+    T_IMPULSE,
+    T_NORMAL,
+    T_OFFSET,
+    T_RHO,
+    T_WEIGHTS,
+    TOUCH_ROWS,
+    copy_rows,
+)
 
 SINK = 0.003  # depth that the sheet between its particles may sink in, as a share of the solid's least width
 
@@ -168,19 +177,24 @@ def find_touches(x, triangles, shapes, k, touches, scratch):
         # the deepest point, and the normal there
         if find_deepest(scratch, shapes, k) and turn_normal(scratch):
             normal_to_world(scratch)
-            # write the touch: its ball, and the impulse that it had
+            # write the touch: weights, plane, the impulse that it had, and its ball
             touch = rows[count[0]]
+            for l in range(scratch.shape[1]):
+                touch[T_OFFSET, l] = scratch[S_CONTACT, l]
             for c in range(3):
                 i, j, m = triangles[t, 0], triangles[t, 1], triangles[t, 2]
                 for l in range(scratch.shape[1]):
                     wi, wj, wm = scratch[S_WEIGHTS, l], scratch[S_WEIGHTS + 1, l], scratch[S_WEIGHTS + 2, l]
                     spot = wi * x[c, i, l] + wj * x[c, j, l] + wm * x[c, m, l] - scratch[R_POINT + c, l]
+                    touch[T_WEIGHTS + c, l], touch[T_NORMAL + c, l] = scratch[S_WEIGHTS + c, l], scratch[S_CONTACT + 1 + c, l]
+                    touch[T_OFFSET, l] -= scratch[S_CONTACT + 1 + c, l] * spot
                     touch[T_CORE + c, l] = spot - scratch[S_RHO, l] * scratch[S_CONTACT + 1 + c, l]
                 for l in range(scratch.shape[1]):
                     touches_it = scratch[S_CONTACT, l] < scratch.dtype.type(NO_CONTACT)
                     touch[T_IMPULSE + c, l] = kept[k, t, c, l] if touches_it else scratch.dtype.type(0)
             for l in range(scratch.shape[1]):
-                touch[T_RHO, l] = scratch[S_RHO, l] - scratch[S_CONTACT, l]
+                ball = scratch[S_RHO, l] - scratch[S_CONTACT, l]
+                touch[T_RHO, l] = scratch.dtype.type(-1) if shapes.kinds[k] == KIND_MESH else ball
             which[count[0], 0] = t
             which[count[0], 1] = k
             count[0] += 1
