@@ -13,7 +13,7 @@ from clothgym.envs.reference import layers_over, reference_coverage
 GRIPPER = "clothgym:ClothDrapeGripper-v0"
 SIDE, ROWS = 0.6, 17
 STEP, SPEED, REACH = 1 / 30, 1.0, 0.03
-ACTING, STEPS = 100, 140
+ACTING, STEPS = 100, 160
 CORNERS = [ROWS * (ROWS - 1), ROWS * ROWS - 1]  # those of the edge at the target
 SHARE = SHEET.area / SHEET.area.sum()
 STRUCTURAL = np.abs(SHEET.springs.rest_length - SIDE / (ROWS - 1)) < 1e-6
@@ -149,7 +149,7 @@ def test_a_new_episode_begins_with_open_fingers_that_were_told_nothing():
     assert np.all(grippers.openings[0] == 1) and np.array_equal(grippers.openings[1], before)
 
 
-def test_fingers_open_after_100_steps_and_the_evaluation_is_at_140():
+def test_fingers_open_after_100_steps_and_the_evaluation_is_at_160():
     env, _ = start()
     for step in range(1, STEPS + 1):
         moves = np.array([0, 0, 0.2, CLOSED, 0, 0, 0.2, CLOSED])
@@ -256,11 +256,11 @@ def test_success_asks_for_a_centred_sheet_at_rest(offset, speed, success):
     task = env.task
     env.step(np.zeros(8))
     task.simulation.set_parameters(gravity=(0, 0, 0))
-    task.simulation.reset(positions=SHEET.rest_positions + (offset * SIDE, 0, 0.243), velocities=(speed, 0, 0))
+    task.simulation.reset(positions=SHEET.rest_positions + (offset * SIDE, 0, 0.246), velocities=(speed, 0, 0))
     task.episode["settling_since"][0], task.episode["step"][0] = ACTING, STEPS - 1
     *_, terminated, _, info = env.step(np.zeros(8))
     performance, *_, off, rms = evaluation(env)
-    assert terminated and off == pytest.approx(offset + speed / 60 / SIDE, abs=0.015) and (rms > 0.05) == (speed > 0)
+    assert terminated and off == pytest.approx(offset + speed / 60 / SIDE, abs=0.015) and (rms > 0.02) == (speed > 0)
     assert info["coverage"] > 0.9 and info["is_success"] == success
     assert info["normalized_performance"] == pytest.approx(performance, abs=1e-5)
 
@@ -284,7 +284,7 @@ def test_the_observation_is_what_the_manual_page_says(shape):
     assert observation[57:59].tolist() == [1, 0]
     assert observation[59:62].tolist() == [shape == "sphere", shape == "box", shape == "post"]
     assert observation[62:65] == pytest.approx([target.radius / SIDE, target.height / SIDE, target.yaw * 4 / np.pi], abs=1e-6)
-    assert observation[65:68] == pytest.approx([0, 125 / 140, 85 / 100], abs=1e-6)
+    assert observation[65:68] == pytest.approx([0, 145 / 160, 85 / 100], abs=1e-6)
     for attachment, first in ((0, 68), (1, 75)):
         tip = state.attachment_positions[0, attachment].astype(float)
         assert observation[first : first + 3] == pytest.approx((tip - origin) / SIDE, abs=2e-5)
@@ -292,7 +292,7 @@ def test_the_observation_is_what_the_manual_page_says(shape):
         assert observation[first + 6] == pytest.approx([0, 1 / 3][attachment], abs=1e-5)
     for _ in range(ACTING - 15):
         observation, *_ = env.step(np.zeros(8))
-    assert observation[65:68] == pytest.approx([1, 40 / 140, 0], abs=1e-6)
+    assert observation[65:68] == pytest.approx([1, 60 / 160, 0], abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -400,4 +400,4 @@ def test_a_rumpled_sheet_stays_as_it_lies():
     for _ in range(15):
         *_, info = env.step(np.zeros((16, 8)))
     moved = np.linalg.norm(positions(env) - before, axis=2)
-    assert not any(info["failure"]) and moved.mean() < 5e-3 and info["strain_max"].max() < 0.1
+    assert not any(info["failure"]) and moved.mean() < 8e-3 and info["strain_max"].max() < 0.1

@@ -265,11 +265,14 @@ def test_randomized_materials_stay_in_their_range_and_differ(env_id):
 
 @every_id
 def test_a_diverged_environment_is_contained(env_id):
-    """An explicit step far beyond the bound in one lane: it ends with a penalty and its last finite observation."""
+    """An explicit step far beyond the bound in one lane: it ends with a penalty and its last finite observation.
+
+    Without self-collision, whose displacement bounds hold such a sheet together until it tears.
+    """
     stiff = np.array([False, True, False])
     runs = []
     for spoil in (False, True):
-        env = make_vec(env_id, 3, autoreset_mode="Disabled", integrator="semi_implicit_euler")
+        env = make_vec(env_id, 3, autoreset_mode="Disabled", integrator="semi_implicit_euler", self_collision=False)
         env.reset(seed=0)
         env.step(still(env))
         if spoil:

@@ -98,7 +98,7 @@ def test_at_rest_the_most_stretched_thread_is_4_percent_longer():
 
 
 def test_tension_is_the_force_of_springs_weight_and_air_on_the_clipped_particles():
-    env, _ = start(wind={"speed": [2, 2], "gust": 1.0})
+    env, _ = start(wind={"speed": [2, 2], "gust": 1.0}, bending="springs")
     rng, sizes = np.random.default_rng(2), []
     for step in range(12):
         *_, info = env.step(np.concatenate([*[rng.uniform(-0.6, 0.6, 3)] * 2]) + rng.uniform(-0.1, 0.1, 6))
@@ -262,7 +262,7 @@ def test_clips_move_as_one_no_faster_than_the_limit_and_stay_in_their_room():
 
 @pytest.mark.parametrize("next_one", [0, 1, 2])
 def test_the_observation_is_what_the_manual_page_says(next_one):
-    env, first = start(seed=8, threshold=0.07)
+    env, first = start(seed=8, threshold=0.07, bending="springs")
     assert first.shape == (78,)
     env.task.episode["next"][0] = next_one
     for _ in range(6):
