@@ -152,6 +152,11 @@ class Observed:
         return np.where(np.isfinite(self.positions).all(axis=(1, 2)), depth, np.nan)
 
     @property
+    def self_collision(self) -> str | None:
+        """How the sheet collides with itself, "fast" or "strict", or None."""
+        return None if self._contact.options is None else self._contact.options.mode
+
+    @property
     def self_contacts(self) -> SelfContacts | None:
         """Contacts of each sheet with itself in the last control step; None without ``self_collision``."""
         return self._contact.report()

@@ -142,7 +142,7 @@ def test_costs_are_evaluated(tmp_path):
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_demonstrations_are_what_the_expert_would_do_undisturbed(scripts, noise):
-    """The reach's expert goes to its place at four times the distance a second: what it does can be read off what is seen."""
+    """The reach's expert goes to its place at 1.5 times the distance a second: what it does can be read off what is seen."""
     from clone import demonstrations
     from stable_baselines3.common.vec_env import VecMonitor
 
@@ -152,7 +152,7 @@ def test_demonstrations_are_what_the_expert_would_do_undisturbed(scripts, noise)
     observations, actions = demonstrations(env, 2, noise, seed=0)
     assert observations.shape == (2 * 40 * 4, 58) and actions.shape == (2 * 40 * 4, 3)
     way = observations[:, 54:57] * 0.6 / 10
-    assert actions == pytest.approx(np.clip(4 * way / 0.5, -1, 1), abs=1e-4)
+    assert actions == pytest.approx(np.clip(1.5 * way / 0.5, -1, 1), abs=1e-4)
     # the batch is seen step by step: where an action was followed, the way grows shorter by it
     steps = way.reshape(80, 4, 3)[:39], way.reshape(80, 4, 3)[1:40]
     wanted = actions.reshape(80, 4, 3)[:39]

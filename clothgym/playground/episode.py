@@ -278,6 +278,7 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
         integrator=simulation.integrator.name,
         bending=simulation.bending.name,
         strain_limit=simulation.strain_limit,
+        self_collision=simulation.self_collision or "off",
         substeps=simulation.substeps,
     )
 
