@@ -51,7 +51,7 @@ def robust(x: NDArray) -> NDArray:
 
 
 def main() -> None:
-    options = {"time_step": PHYSICS.time_step, "substeps": PHYSICS.substeps, "air_density": PHYSICS.air_density}
+    options = {name: getattr(PHYSICS, name) for name in ("time_step", "substeps", "air_density", "bending", "contact")}
     made = [
         starts.make(SHEET, PHYSICS.material, "rumpled", AT_ONCE, seed=seed, thickness=3 * ON_FLOOR, **options)
         for seed in tqdm(range(0, COUNT, AT_ONCE), unit="batch")
