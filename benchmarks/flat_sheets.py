@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from clothgym.envs.draping import ENOUGH_CENTERING, ENOUGH_COVERAGE, ENOUGH_REST, ENOUGH_SPREAD, SHEET, SIDE
+from clothgym.envs.draping import ENOUGH_CENTERING, ENOUGH_COVERAGE, ENOUGH_REST, ENOUGH_SPREAD
+from clothgym.envs.draping import PHYSICS as OWN
 from clothgym.envs.targets import SHAPES, THICKNESS
 
 TARGETS, SEED = 200, 0
+SHEET, SIDE = OWN.mesh, OWN.side
 PHYSICS = {"fast": "fast", "true": "true", "doubled": "true"}
 APART = 4 * THICKNESS  # of the layers of a sheet that is doubled over [m]
 

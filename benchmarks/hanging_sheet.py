@@ -206,7 +206,7 @@ def drape_end(substeps: int, dtype: str) -> NDArray:
 
 def measure_drape(substeps: int) -> Row:
     error = rms(drape_end(substeps, "float32"), drape_end(CONVERGED, "float64"))
-    return {"error_mm": error, "error_mm_per_m": error / DrapeTask.physics.mesh.size[0]}
+    return {"error_mm": error, "error_mm_per_m": error / DrapeTask.physics.side}
 
 
 def claims(results: Row) -> list[Row]:

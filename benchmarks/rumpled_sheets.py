@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from clothgym import starts
-from clothgym.envs.drape_gripper import REACH, UNEVEN
-from clothgym.envs.draping import PHYSICS, SHEET, SIDE
+from clothgym.envs.drape_gripper import REACH
+from clothgym.envs.draping import PHYSICS
+from clothgym.envs.rumpled import UNIT, robust
 from clothgym.envs.targets import ON_FLOOR
-from clothgym.geometry.intersections import find_intersections
 
 KEPT, COUNT, AT_ONCE = 64, 256, 32
-UNIT = 1e-4  # [m]: of what is written
-TRIALS = 20  # uneven starts of each sheet that must be free of intersections
+SHEET, SIDE = PHYSICS.mesh, PHYSICS.side
 CORNERS = SHEET.corners[2:]
 BANK = Path(__file__).parent.parent / "envs" / "rumpled.npz"
 
@@ -41,15 +40,6 @@ def graspable(x: NDArray) -> NDArray:
     return free
 
 
-def robust(x: NDArray) -> NDArray:
-    """Whether each sheet, (sheets, particles, 3), stays free of intersections when its particles are raised unevenly."""
-    fine, rng = np.ones(len(x), bool), np.random.default_rng(0)
-    for _ in range(TRIALS):
-        uneven = x + np.abs(rng.normal(scale=3 * UNEVEN, size=x.shape)) * (0, 0, 1)
-        fine[np.unique(find_intersections(SHEET.triangles, uneven)[:, 0])] = False
-    return fine
-
-
 def main() -> None:
     options = {name: getattr(PHYSICS, name) for name in ("time_step", "substeps", "air_density", "bending", "contact")}
     made = [
@@ -60,7 +50,7 @@ def main() -> None:
     x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
     x[:, :, 2] += ON_FLOOR - x[:, :, 2].min(axis=1, keepdims=True)
     x = np.round(x / UNIT) * UNIT
-    can_be_taken, free = graspable(x), robust(x)
+    can_be_taken, free = graspable(x), robust(SHEET, x)
     print(f"of {COUNT} sheets {can_be_taken.sum()} can be taken by their corners, {free.sum()} bear unevenness")
     x = x[can_be_taken & free]
     x = x[np.argsort(-x[:, :, 2].mean(axis=1), kind="stable")[:KEPT]]

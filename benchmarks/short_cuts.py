@@ -43,7 +43,7 @@ def watched(env_id: str, physics: str, actor: str) -> dict[str, Any]:
         crossed += int(np.count_nonzero(count_intersections(task.physics.mesh.triangles, task.simulation.positions)))
         deepest = max(deepest, float(task.simulation.penetration().max()))
         frames += AT_ONCE
-    found = {"steps": frames, "intersecting": crossed / frames, "deepest": deepest / max(task.physics.mesh.size)}
+    found = {"steps": frames, "intersecting": crossed / frames, "deepest": deepest / task.physics.side}
     return found | ({"success": float(np.mean(successes[:EPISODES]))} if actor == "expert" else {})
 
 

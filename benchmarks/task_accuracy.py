@@ -72,7 +72,7 @@ def simulation(physics: Physics, method: dict[str, Any] | str, substeps: int, **
 
 def swing(physics: Physics, method: dict[str, Any] | str, substeps: int, dtype: str) -> NDArray:
     """Positions after half a second [m], (particles, 3)."""
-    cloth = simulation(physics, method, substeps, dtype=dtype, anchors=physics.anchors)
+    cloth = simulation(physics, method, substeps, dtype=dtype, anchors=physics.held)
     cloth.step(round(0.5 / physics.time_step))
     return cloth.positions[0].astype(np.float64)
 
@@ -102,9 +102,9 @@ def measure(task: str, name: str, options: dict[str, float], substeps: int) -> R
     method = {"name": name, **options}
     with np.errstate(all="ignore"):
         away = swing(physics, method, substeps, "float32") - end
-        error = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) * 1000 / max(physics.mesh.size)
+        error = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) * 1000 / physics.side
         softness = stretch(physics, method, substeps, "float32") / fall - 1
-    cloth = simulation(physics, method, substeps, num_envs=LANES, anchors=physics.anchors)
+    cloth = simulation(physics, method, substeps, num_envs=LANES, anchors=physics.held)
     cloth.step()
     times = []
     for _ in range(FRAMES):

@@ -129,7 +129,7 @@ class TaskDefinition:
 
         By default it reaches two sides of the sheet from the origin in each direction, and down to a centimeter above the floor.
         """
-        far = 2 * max(self.physics.mesh.size)
+        far = 2 * self.physics.side
         return np.array([-far, -far, 0.01]), np.array([far, far, far])
 
     def constants(self) -> dict[str, Any]:

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.collisions import Collider
 from clothgym.envs import draping
-from clothgym.envs.draping import SHEET, SIDE
-from clothgym.envs.episode import Fields
+from clothgym.envs.draping import DrapingTask
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import Target
-from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
-GUIDE_REACH = 0.15 * SIDE
 LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
@@ -51,10 +46,10 @@ def _holds_nothing(own, rules, sheet):
     return True
 
 
-class DrapeTask(Task):
+class DrapeTask(DrapingTask):
     """The task of ``ClothDrape-v0``, see ``ClothDrapeEnv``."""
 
-    physics = replace(draping.PHYSICS, anchors=(SHEET.corners[2], SHEET.corners[3]))
+    physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
         draping.covering, draping.evaluate_cover, draping.observe_target, act=_let_go, done=_holds_nothing,
         account=draping.account_reference, stop=draping.stop_at_target,
@@ -63,43 +58,19 @@ class DrapeTask(Task):
     settling_steps = 85
     actions_per_attachment = 4
     observations = draping.observations(2, "whether each corner is held")
-    points_relative_to = draping.RELATIVE_TO
-    evaluation = draping.EVALUATION
-    ranges = draping.RANGES
-    reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
-
-    def colliders(self) -> list[Collider]:
-        return draping.colliders()
-
-    def episode_colliders(self, env: int) -> Mapping[int, Collider]:
-        return draping.episode_colliders(self.episode[env])
-
-    def remembers(self) -> Fields:
-        return draping.REMEMBERS
-
-    def check_episode(self, env: int, own: Any) -> None:
-        draping.check_target(own, self.physics)
-
-    def constants(self) -> dict[str, Any]:
-        return draping.constants(GUIDE_REACH)
-
-    @property
-    def targets(self) -> list[Target]:
-        """Those of the episodes."""
-        return [draping.recalled(own) for own in self.episode]
+    guide_reach = 0.15
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        target = draping.draw_target(rng, options.get("target", {}))
-        distance = SIDE * float(rng.uniform(0.75, 0.9))
-        sideways = SIDE * float(rng.uniform(-0.1, 0.1))
-        clearance = SIDE * float(rng.uniform(0.1, 0.25))
-        ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
-        draping.remember(self.episode[env], target, self.physics)
+        target, mesh, side = self.draw_target(env, rng, options.get("target", {})), self.physics.mesh, self.physics.side
+        distance = side * float(rng.uniform(0.75, 0.9))
+        sideways = side * float(rng.uniform(-0.1, 0.1))
+        clearance = side * float(rng.uniform(0.1, 0.25))
+        ripple = rng.normal(scale=1e-3, size=mesh.num_particles)
         # the sheet hangs in a plane across the way to the target, its held edge up
-        rest = SHEET.rest_positions
+        rest = mesh.rest_positions
         x = target.center[0] + sideways + rest[:, 0]
         y = target.center[1] - distance + ripple
-        z = clearance + SIDE / 2 + rest[:, 1]
+        z = clearance + side / 2 + rest[:, 1]
         return np.stack([x, y, z], axis=1)
 
     def expert_actions(self) -> NDArray:
@@ -107,12 +78,12 @@ class DrapeTask(Task):
 
         Without memory: where the anchors are says which of the two ways they are on.
         """
-        tops = self.episode["top"]
+        tops, side = self.episode["top"], self.physics.side
         middle = self.episode["targets"].mean(axis=1)
-        beyond = tops[:, 1] + EXPERT_BEYOND * SIDE
+        beyond = tops[:, 1] + EXPERT_BEYOND * side
         arrived = np.abs(middle[:, 1] - beyond) < 0.02
-        low = np.maximum(tops[:, 2] - EXPERT_DROP * SIDE, 0.02)
-        goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * SIDE)], axis=1)
+        low = np.maximum(tops[:, 2] - EXPERT_DROP * side, 0.02)
+        goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * side)], axis=1)
         # half of the way in each step, as far as the speed goes
         move = (goal - middle) / (2 * self.physics.time_step * self.physics.attachment_speed)
         length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)

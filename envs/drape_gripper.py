@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
-from importlib import resources
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -14,28 +12,24 @@ from numpy.typing import NDArray
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
 from clothgym.checks import shown
-from clothgym.collisions import Collider
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import PHYSICS, SHEET, SIDE, covering, observe_target
+from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
+from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import ON_FLOOR, Target
+from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
 REACH = 0.03  # of the fingers [m]
-UNEVEN = 1e-4  # a sheet begins with its particles raised by about so much [m]: nothing flat can buckle
-GUIDE_REACH = 0.4 * SIDE  # the sheet begins farther away than in ClothDrape-v0
 PICKING = 0.3  # share of the potential that is for taking hold
 PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
-# the particles that each gripper is to take: both corners of the edge at the target, or its middle
-PLACES = {1: (SHEET.corners[2] + SHEET.grid_shape[1] // 2,), 2: (SHEET.corners[2], SHEET.corners[3])}
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
 # above it before it sets out
@@ -89,7 +83,7 @@ def _observations(grippers: int) -> tuple[Observation, ...]:
     return (*draping.observations(grippers, "whether each gripper holds anything"), own)
 
 
-class DrapeGripperTask(GripperTask):
+class DrapeGripperTask(DrapingTask, GripperTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
     physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.attachment_speed, reach=REACH),) * 2)
@@ -106,42 +100,34 @@ class DrapeGripperTask(GripperTask):
     acting_steps = 100
     settling_steps = 60
     observations = _observations(2)
-    points_relative_to = draping.RELATIVE_TO
-    evaluation = draping.EVALUATION
-    ranges: ClassVar = {**draping.RANGES, "picked": (0, 1)}
+    guide_reach = 0.4  # the sheet begins farther away than in ClothDrape-v0
+    ranges: ClassVar = {**DrapingTask.ranges, "picked": (0, 1)}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
+        **DrapingTask.arguments,
         "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
         "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.70 N",
     }
 
     def __init__(self, num_envs: int, grippers: int = 2, **kwargs: Any) -> None:
-        if isinstance(grippers, bool) or not isinstance(grippers, (int, np.integer)) or grippers not in PLACES:
+        if isinstance(grippers, bool) or not isinstance(grippers, (int, np.integer)) or grippers not in (1, 2):
             raise ValueError(f"grippers={grippers!r}: must be 1 or 2")
         self.physics = replace(self.physics, grippers=self.physics.grippers[:grippers])  # type: ignore[misc]
         self.observations = _observations(int(grippers))  # type: ignore[misc]
-        self.places = np.array(PLACES[grippers])
         super().__init__(num_envs, **kwargs)
 
-    def colliders(self) -> list[Collider]:
-        return draping.colliders()
-
-    def episode_colliders(self, env: int) -> Mapping[int, Collider]:
-        return draping.episode_colliders(self.episode[env])
+    @property
+    def places(self) -> NDArray:
+        """The particles that each gripper is to take: both corners of the edge at the target, or its middle."""
+        mesh = self.physics.mesh
+        left, right = mesh.corners[2:]
+        return np.array([left, right] if len(self.physics.grippers) == 2 else [left + mesh.grid_shape[1] // 2])
 
     def remembers(self) -> Fields:
-        return [*draping.REMEMBERS, ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
-
-    def check_episode(self, env: int, own: Any) -> None:
-        draping.check_target(own, self.physics)
+        return [*super().remembers(), ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
 
     def constants(self) -> dict[str, Any]:
-        return draping.constants(GUIDE_REACH) | {"places": self.places}
-
-    @property
-    def targets(self) -> list[Target]:
-        """Those of the episodes."""
-        return [draping.recalled(own) for own in self.episode]
+        return super().constants() | {"places": self.places}
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -150,11 +136,11 @@ class DrapeGripperTask(GripperTask):
             raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        target = draping.draw_target(rng, options.get("target", {}))
-        draping.remember(self.episode[env], target, self.physics)
-        gap, sideways, yaw = SIDE * rng.uniform(0.05, 0.15), SIDE * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
-        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(_rumpled())))
-        x = _rumpled()[number].copy() if options.get("rumpled", rumpled) else SHEET.rest_positions + (0, 0, ON_FLOOR)
+        target, mesh, side = self.draw_target(env, rng, options.get("target", {})), self.physics.mesh, self.physics.side
+        gap, sideways, yaw = side * rng.uniform(0.05, 0.15), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
+        sheets = rumpled_sheets(*mesh.grid_shape, side)
+        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(sheets)))
+        x = sheets[number].copy() if options.get("rumpled", rumpled) else mesh.rest_positions + (0, 0, ON_FLOOR)
         c, s = np.cos(yaw), np.sin(yaw)
         x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
         # before the target, whose half width is at most sqrt(2) radii
@@ -163,7 +149,7 @@ class DrapeGripperTask(GripperTask):
         x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
         count = len(self.places)
         away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
-        self.gripper_starts[env] = x[self.places] + SIDE * away
+        self.gripper_starts[env] = x[self.places] + side * away
         self.episode["picked"][env] = False
         return x
 
@@ -174,21 +160,21 @@ class DrapeGripperTask(GripperTask):
 
         Without memory: where the grippers are, and what they hold, says which part of the way they are on.
         """
-        episode, grippers = self.episode, self.simulation.grippers
+        episode, grippers, places, side = self.episode, self.simulation.grippers, self.places, self.physics.side
         attachments, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
-        to_place = self.simulation.positions[:, self.places] - attachments
-        own = grippers.holder[:, self.places] >= 0
+        to_place = self.simulation.positions[:, places] - attachments
+        own = grippers.holder[:, places] >= 0
         ready = np.logical_and.reduce(own, axis=1, keepdims=True)
         begun = np.logical_and.reduce(episode["picked"], axis=1, keepdims=True)
 
         # over the target, both at the height of the lower one's way, as far apart as the corners are at rest
-        beyond = tops[..., 1] + EXPERT_BEYOND * SIDE
-        low = np.maximum(tops[..., 2] - EXPERT_DROP * SIDE, 0.02)
+        beyond = tops[..., 1] + EXPERT_BEYOND * side
+        low = np.maximum(tops[..., 2] - EXPERT_DROP * side, 0.02)
         arrived = np.abs(attachments[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
-        lift = tops[..., 2] + EXPERT_LIFT * SIDE
-        high = attachments[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * SIDE
+        lift = tops[..., 2] + EXPERT_LIFT * side
+        high = attachments[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * side
         goal = np.empty_like(attachments)
-        goal[..., 0] = tops[..., 0] + SHEET.rest_positions[self.places, 0]
+        goal[..., 0] = tops[..., 0] + self.physics.mesh.rest_positions[places, 0]
         goal[..., 1] = np.where(high | arrived, beyond, attachments[..., 1])
         goal[..., 2] = np.where(arrived, low, lift)
         carry = (goal - attachments) / 2
@@ -207,13 +193,6 @@ class DrapeGripperTask(GripperTask):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.33, 0.24), vertical_fov=36.0)
-
-
-@cache
-def _rumpled() -> NDArray:
-    """Sheets that were picked up and dropped, free of intersections, about the origin [m], (sheets, particles, 3)."""
-    with resources.as_file(resources.files("clothgym.envs").joinpath("rumpled.npz")) as path, np.load(path) as file:
-        return file["positions"] * 1e-4
 
 
 class ClothDrapeGripperEnv(ClothEnv):

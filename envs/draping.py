@@ -1,12 +1,12 @@
 """What the draping tasks share: the sheet, its target, what is observed of it, the potential and the evaluation.
 
-Their tasks call these functions, and name these kernels; the target of an episode is kept in its record, see ``REMEMBERS``.
+Their tasks are ``DrapingTask``, and name these kernels; the target of an episode is kept in its record, see ``REMEMBERS``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,15 +19,13 @@ from clothgym.envs.measures import CENTROID, SPEED2, count_layers, soft_coverage
 from clothgym.envs.physics import MEDIAN, Physics
 from clothgym.envs.reference import EVALUATED_POINTS, limits, reference_coverage
 from clothgym.envs.targets import FRICTION, ON_FLOOR, SHAPES, THICKNESS, Target, placed, unit_normals, unit_surface
+from clothgym.envs.task import Task
 from clothgym.material import Material
-from clothgym.mesh import grid
+from clothgym.mesh import ClothMesh, grid
 
-SIDE = 0.6  # L [m]
-ROWS = 17
-SHEET = grid(ROWS, ROWS, SIDE, SIDE)
 # what the ids of both tasks fix, but for what holds the sheet
 PHYSICS = Physics(
-    mesh=SHEET,
+    mesh=grid(17, 17, 0.6, 0.6),
     material=MEDIAN,
     time_step=1 / 30,
     integrator="semi_implicit_euler",
@@ -50,11 +48,6 @@ TARGET_SLOT = 1  # the target's place among ``colliders``
 REMEMBERS: Fields = [
     *[("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2), ("reference", float)],
 ]
-RANGES = {"solid": (0, len(SHAPES) - 1)}
-EVALUATION: Fields = (
-    *[("coverage", float), ("coverage_reference", float), ("spread", float), ("off_center", float), ("rms_speed", float)],
-)
-RELATIVE_TO = "the target's top"
 
 
 def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
@@ -72,36 +65,24 @@ def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
     )
 
 
+def upper_corners(mesh: ClothMesh) -> tuple[int, ...]:
+    """The particles at the ends of the edge that goes over the target first."""
+    return mesh.corners[2:]
+
+
 # --- the target of an episode -------------------------------------------------------------------------------------------------
 
 
-def colliders() -> list[Collider]:
-    """The floor, and a target in whose place each episode has its own."""
-    floor = Plane(friction=FRICTION, thickness=ON_FLOOR)
-    return [floor, Target("sphere", 0.25 * SIDE, 0.5 * SIDE, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
-
-
-def draw_target(rng: np.random.Generator, wanted: Any) -> Target:
-    """A target, of which some properties may be wanted.
+def checked_shapes(shapes: Any) -> tuple[str, ...]:
+    """Shapes of targets, one by its name or several in a sequence.
 
     Raises:
-        ValueError: ``wanted`` is no dict of a target's properties.
+        ValueError: there is none, or one that no target has.
     """
-    known = ("shape", "radius", "height", "center", "yaw")
-    if not isinstance(wanted, Mapping):
-        raise ValueError(f"reset option target={shown(wanted)}: must be a dict with any of {', '.join(known)}")
-    unknown = set(wanted) - set(known)
-    if unknown:
-        raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
-    return Target.draw(rng, SIDE, 0.25 * SIDE, wanted.get("shape")).changed(wanted)
-
-
-def remember(own: Any, target: Target, physics: Physics) -> None:
-    """Write a target into the record of the episode that it is for; physics: the task's."""
-    own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
-    own["top"] = own["origin"] = target.top
-    own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
-    own["reference"] = reference_coverage(target, physics)
+    given = (shapes,) if isinstance(shapes, str) else shapes
+    if not isinstance(given, Sequence) or not given or any(shape not in SHAPES for shape in given):
+        raise ValueError(f"shapes={shown(shapes)}: must be one or more of {', '.join(SHAPES)}")
+    return tuple(given)
 
 
 def recalled(own: Any) -> Target:
@@ -110,31 +91,80 @@ def recalled(own: Any) -> Target:
     return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
 
 
-def check_target(own: Any, physics: Physics) -> None:
-    """Refuse a record whose target cannot be one; physics: the task's.
+class DrapingTask(Task):
+    """Base of both tasks.
 
-    Raises:
-        ValueError: what is wrong with it.
+    Args:
+        shapes: from which episodes draw that of their target.
+
+    Attributes:
+        guide_reach: distance at which a guide point counts half, in sides.
     """
-    target = recalled(own)
-    turn = np.array([np.cos(target.yaw), np.sin(target.yaw)])
-    if np.abs(own["turn"] - turn).max() > 1e-9 or own["reference"] != reference_coverage(target, physics):
-        raise ValueError("the state's target has another turn or reference than its size and yaw give: give what get_state() gave")
 
-
-def episode_colliders(own: Any) -> dict[int, Collider]:
-    """The same as what is put in place of one of ``colliders``."""
-    return {TARGET_SLOT: recalled(own).collider(FRICTION, THICKNESS)}
-
-
-def constants(guide_reach: float) -> dict[str, Any]:
-    """Numbers that the kernels below read from ``rules``; guide_reach: distance at which a guide point counts half [m]."""
-    guides, evaluated, normals = (
-        np.stack([np.resize(unit(shape, count), (count, 3)) for shape in ("sphere", "box")])
-        for unit, count in ((unit_surface, GUIDE_POINTS), (unit_surface, EVALUATED_POINTS), (unit_normals, EVALUATED_POINTS))
+    guide_reach: ClassVar[float]
+    points_relative_to = "the target's top"
+    evaluation = (
+        *[("coverage", float), ("coverage_reference", float), ("spread", float), ("off_center", float), ("rms_speed", float)],
     )
-    surface = {"guides": guides, "evaluated": evaluated, "normals": normals}
-    return {"guide_reach": np.float32(guide_reach), "judged_within": limits(SIDE), **surface}
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"solid": (0, len(SHAPES) - 1)}
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
+    arguments: ClassVar[Mapping[str, str]] = {"shapes": "of the targets that episodes draw from"}
+
+    def __init__(self, num_envs: int, shapes: str | Sequence[str] = SHAPES, **kwargs: Any) -> None:
+        self.shapes = checked_shapes(shapes)
+        super().__init__(num_envs, **kwargs)
+
+    @property
+    def targets(self) -> list[Target]:
+        """Those of the episodes."""
+        return [recalled(own) for own in self.episode]
+
+    def colliders(self) -> list[Collider]:
+        """The floor, and a target in whose place each episode has its own."""
+        floor, side = Plane(friction=FRICTION, thickness=ON_FLOOR), self.physics.side
+        return [floor, Target("sphere", 0.25 * side, 0.5 * side, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
+
+    def episode_colliders(self, env: int) -> Mapping[int, Collider]:
+        return {TARGET_SLOT: recalled(self.episode[env]).collider(FRICTION, THICKNESS)}
+
+    def remembers(self) -> Fields:
+        return REMEMBERS
+
+    def check_episode(self, env: int, own: Any) -> None:
+        target = recalled(own)
+        turn = np.array([np.cos(target.yaw), np.sin(target.yaw)])
+        if np.abs(own["turn"] - turn).max() > 1e-9 or own["reference"] != reference_coverage(target, self.physics):
+            raise ValueError(
+                "the state's target has another turn or reference than its size and yaw give: give what get_state() gave"
+            )
+
+    def constants(self) -> dict[str, Any]:
+        guides, evaluated, normals = (
+            np.stack([np.resize(unit(shape, count), (count, 3)) for shape in ("sphere", "box")])
+            for unit, count in ((unit_surface, GUIDE_POINTS), (unit_surface, EVALUATED_POINTS), (unit_normals, EVALUATED_POINTS))
+        )
+        surface, side = {"guides": guides, "evaluated": evaluated, "normals": normals}, self.physics.side
+        return {"guide_reach": np.float32(self.guide_reach * side), "judged_within": limits(side), **surface}
+
+    def draw_target(self, env: int, rng: np.random.Generator, wanted: Any) -> Target:
+        """Draw the target of an environment's episode, of which some properties may be wanted, and write it into its record.
+
+        Raises:
+            ValueError: ``wanted`` is no dict of a target's properties.
+        """
+        known = ("shape", "radius", "height", "center", "yaw")
+        if not isinstance(wanted, Mapping):
+            raise ValueError(f"reset option target={shown(wanted)}: must be a dict with any of {', '.join(known)}")
+        unknown = set(wanted) - set(known)
+        if unknown:
+            raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'target' (there are: {', '.join(known)})")
+        side, own = self.physics.side, self.episode[env]
+        target = Target.draw(rng, side, 0.25 * side, wanted.get("shape"), self.shapes).changed(wanted)
+        own["solid"], own["radius"], own["yaw"] = SHAPES.index(target.shape), target.radius, target.yaw
+        own["top"] = own["origin"] = target.top
+        own["turn"] = np.cos(target.yaw), np.sin(target.yaw)
+        own["reference"] = reference_coverage(target, self.physics)
+        return target
 
 
 # --- kernels about one environment, see ``stepping`` --------------------------------------------------------------------------

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 # default and meaning of the keywords that all environments take; $name: the task's own
 COMMON: dict[str, tuple[str, str]] = {
+    "rows": ("$rows", "particles along a side of the sheet; of another number with automatic substeps"),
+    "side": ("$side", "L, the length of a side [m], likewise"),
     "fabric": (
         "``None``",
         "the task's own; or a preset's name (``python -m clothgym list``), whose measured properties it takes, or a ``Material``; "
@@ -136,6 +138,8 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of keywords: the task's own, then those of all tasks."""
     physics, rows = task_class.physics, ["| Argument | Default | Meaning |", "| --- | --- | --- |"]
     own = {
+        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "",
+        "$side": f"{physics.side:g}",
         "$integrator": f'"{physics.integrator}"',
         "$substeps": str(physics.substeps),
         "$air_density": f"{physics.air_density:g}",

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.attachments import Gripper
-from clothgym.checks import finite, number, one_of, shown
+from clothgym.checks import count, finite, number, one_of, positive, shown
 from clothgym.guards import refusal
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
-from clothgym.mesh import ClothMesh
+from clothgym.mesh import ClothMesh, grid
 from clothgym.parameters import AIR_DENSITY, PROPERTIES
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 PHYSICS = ("true", "fast")
+Held = tuple[int | tuple[int, ...], ...]  # particles that anchors hold, as ``Simulation`` takes them
+FEWEST_ROWS, SIDES = 5, (0.1, 1.0)  # of a sheet whose resolution or side is chosen: in the arenas of the tasks [m]
 # the short cuts of most benchmarks
 SHORT_CUTS: dict[str, Any] = {"contact": "particles", "self_collision": False, "bending": "springs", "solid_hands": False}
 MEDIAN = Material.preset("median")
@@ -35,9 +37,9 @@ class Physics:
     Attributes:
         mesh, material: the sheet and its fabric.
         time_step: control step [s].
-        integrator, substeps: how it is advanced.
+        integrator, substeps: how it is advanced; substeps as ``Simulation`` takes them.
         attachment_speed: speed limit of anchors and grippers [m/s].
-        anchors, grippers: see ``Simulation``.
+        anchors, grippers: see ``Simulation``; anchors may be a function of the mesh, so that its resolution can be chosen.
         air_density: [kg/m^3].
         wind: what the air does, unless the environment's keyword says otherwise.
         contact, self_collision, bending: as ``Simulation`` takes them.
@@ -49,9 +51,9 @@ class Physics:
     material: Material
     time_step: float
     integrator: str
-    substeps: int
+    substeps: int | Literal["auto"]
     attachment_speed: float
-    anchors: tuple[int | tuple[int, ...], ...] = ()
+    anchors: Held | Callable[[ClothMesh], Held] = ()
     grippers: tuple[Gripper, ...] = ()
     air_density: float = AIR_DENSITY
     wind: Wind | None = None
@@ -73,6 +75,38 @@ class Physics:
         """
         one_of("physics", name, *PHYSICS)
         return self if name == "true" else replace(self, **SHORT_CUTS, **self.fast)
+
+    def with_sheet(self, rows: int | None, side: float | None) -> Physics:
+        """This with a grid of so many rows, whose longer side is so long [m]; None: its own.  Substeps become automatic.
+
+        Raises:
+            ValueError: no such sheet, or the mesh is no grid, or its anchors are given as particles of this mesh alone.
+        """
+        if rows in (None, *(self.mesh.shape or ())[:1]) and side in (None, self.side):
+            return self
+        if self.mesh.shape is None or (self.anchors and not callable(self.anchors)):
+            raise ValueError(
+                f"rows={shown(rows)}, side={shown(side)}: this task has one mesh; its mesh must be a grid, and Physics.anchors a "
+                "function of the mesh"
+            )
+        (own_rows, columns), size = self.mesh.shape, self.mesh.size
+        number_of_rows = own_rows if rows is None else count("rows", rows, least=FEWEST_ROWS)
+        longer = self.side if side is None else positive("side", side)
+        if not SIDES[0] <= longer <= SIDES[1]:
+            raise ValueError(f"side={shown(side)}: must be from {SIDES[0]} to {SIDES[1]} m, for which the tasks have room")
+        across = round((columns - 1) * (number_of_rows - 1) / (own_rows - 1)) + 1
+        width, height = (length * longer / self.side for length in size)
+        return replace(self, mesh=grid(number_of_rows, across, width, height), substeps="auto")
+
+    @property
+    def side(self) -> float:
+        """The sheet's longer side [m]."""
+        return max(self.mesh.size)
+
+    @property
+    def held(self) -> Held:
+        """Particles of this mesh that anchors hold."""
+        return self.anchors(self.mesh) if callable(self.anchors) else self.anchors
 
 
 def chosen_fabric(fabric: Any, own: Material) -> Material:
@@ -189,7 +223,7 @@ def settled(physics: Physics, start: NDArray, seconds: float) -> NDArray:
     """The sheet of an id at rest under its anchors [m], (particles, 3): a strongly damped simulation in still air."""
     cloth = Simulation(
         physics.mesh, physics.material, integrator=physics.integrator, time_step=physics.time_step, substeps=physics.substeps,
-        anchors=physics.anchors, air_density=0, bending=physics.bending, threads=1,
+        anchors=physics.held, air_density=0, bending=physics.bending, threads=1,
         self_collision=physics.self_collision,
     )  # fmt: skip
     cloth.set_parameters(air_drag=1.0)

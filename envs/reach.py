@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import LARGEST, vector
+from clothgym.checks import vector
 from clothgym.collisions import Collider, Sphere
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
@@ -21,16 +21,12 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
-from clothgym.mesh import grid
+from clothgym.mesh import ClothMesh, grid
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
-SIDE = 0.6  # L [m]
-SHEET = grid(9, 9, SIDE, SIDE)
-DRIVEN, FREE = SHEET.corners[2], SHEET.corners[1]  # opposite corners: the sheet hangs from the one, the other is lowest
-PINCH = (DRIVEN, DRIVEN + 1, DRIVEN - SHEET.grid_shape[1])  # what is held there: a sheet that hangs from a point spins
-
+PINCHED = 1 / 8  # of a side: the corner's triangle that is held there, since a sheet that hangs from a point spins
 NEAR_ENOUGH, SLOW_ENOUGH = 0.05, 0.1  # in sides, and sides a second
 SPEED_SCALE = 0.2  # sides a second: performance is halved at this speed
 NEAREST = 0.2  # in sides: the way to a goal that is nearer than this counts as so long
@@ -40,6 +36,18 @@ GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that room [m]
 GOAL = (90, 170, 110)  # color of the goal's marker
 
 EXPERT_GAIN = 1.5  # how fast the scripted expert closes on the place above the goal [1/s]
+
+
+def driven_and_free(mesh: ClothMesh) -> tuple[int, int]:
+    """Opposite corners: the sheet hangs from the one, the other is lowest."""
+    return mesh.corners[2], mesh.corners[1]
+
+
+def pinch(mesh: ClothMesh) -> tuple[tuple[int, ...], ...]:
+    """The one anchor: the particles at the driven corner, itself first."""
+    (driven, _), (rows, columns) = driven_and_free(mesh), mesh.grid_shape
+    reach = max(round(PINCHED * (rows - 1)), 1)
+    return (tuple(driven + along - down * columns for down in range(reach + 1) for along in range(reach + 1 - down)),)
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -85,13 +93,13 @@ class ReachTask(Task):
     """The task of ``ClothReach-v0``, see ``ClothReachEnv``."""
 
     physics = Physics(
-        mesh=SHEET,
+        mesh=grid(9, 9, 0.6, 0.6),
         material=MEDIAN,
         time_step=1 / 15,
         integrator="semi_implicit_euler",
         substeps=50,
         attachment_speed=0.5,
-        anchors=(PINCH,),
+        anchors=pinch,
         fast={"material": Material.preset("penava_cotton", air_drag=0.72), "air_density": 0.0, "substeps": 50},
     )
     kernels = Kernels(_potential, _evaluate, _observe)
@@ -109,7 +117,6 @@ class ReachTask(Task):
     points_relative_to = "the goal"
     evaluation = (("goal_distance", float), ("corner_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
-    ranges: ClassVar = {"distance": (NEAREST * SIDE, LARGEST)}
 
     def colliders(self) -> list[Collider]:
         return []  # the floor is out of reach
@@ -121,19 +128,28 @@ class ReachTask(Task):
         return [("goal", float, 3), ("distance", float)]
 
     def constants(self) -> dict[str, Any]:
-        return {"free": FREE, "hangs": self._hanging[FREE]}
+        return {"free": self._free, "hangs": self._hangs}
+
+    @property
+    def _free(self) -> int:
+        return driven_and_free(self.physics.mesh)[1]
 
     @property
     def _hanging(self) -> NDArray:
         """See ``hanging``."""
-        return hanging(self.physics_name)
+        return hanging(self.physics_name, *self.sheet)
+
+    @property
+    def _hangs(self) -> NDArray:
+        """Where the free corner comes to rest below the driven one [m], (3,)."""
+        return self._hanging[self._free]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         if "goal" in options:
             goal = vector("reset option goal", options["goal"])
-            low, high = LOW + self._hanging[FREE], HIGH + self._hanging[FREE]
+            low, high = LOW + self._hangs, HIGH + self._hangs
             if np.any((goal < low) | (goal > high)):
                 raise ValueError(f"reset option goal={options['goal']!r}: the free corner can rest from {low} to {high} only")
 
@@ -141,12 +157,12 @@ class ReachTask(Task):
         middle = (LOW + HIGH) / 2
         start = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
         rest = middle + GOALS_WITHIN * rng.uniform(-1, 1, 3)
-        hangs = self._hanging
-        goal = np.asarray(options.get("goal", rest + hangs[FREE]), np.float64)
-        x = start + hangs + rng.normal(scale=1e-4, size=hangs.shape)
+        hanging = self._hanging
+        goal = np.asarray(options.get("goal", rest + self._hangs), np.float64)
+        x = start + hanging + rng.normal(scale=1e-4, size=hanging.shape)
         own = self.episode[env]
         own["goal"] = own["origin"] = goal
-        own["distance"] = max(length(x[FREE] - goal), NEAREST * SIDE)
+        own["distance"] = max(length(x[self._free] - goal), NEAREST * self.physics.side)
         return x
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
@@ -157,10 +173,10 @@ class ReachTask(Task):
 
     def _way(self) -> NDArray:
         """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
-        return self.episode["goal"] - self._hanging[FREE] - self.simulation.attachment_positions[:, 0]
+        return self.episode["goal"] - self._hangs - self.simulation.attachment_positions[:, 0]
 
     def markers(self, env: int) -> list[Any]:
-        goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * SIDE)
+        goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * self.physics.side)
         return [*super().markers(env), (goal, GOAL)]
 
     def camera(self) -> Camera:
@@ -170,13 +186,14 @@ class ReachTask(Task):
 
 
 @cache
-def hanging(physics: str) -> NDArray:
-    """The sheet at rest under its driven corner, relative to it [m], (particles, 3); physics: by name."""
-    rest = SHEET.rest_positions
+def hanging(physics: str, rows: int | None = None, side: float | None = None) -> NDArray:
+    """The sheet at rest under its driven corner, relative to it [m], (particles, 3); physics: by name, see ``Physics``."""
+    chosen = ReachTask.physics.chosen(physics).with_sheet(rows, side)
+    rest = chosen.mesh.rest_positions
     # the driven corner up, both wings turned to one side: so they come to hang, whatever they began with
     along, across = (rest[:, 0] - rest[:, 1]) / np.sqrt(2), (rest[:, 0] + rest[:, 1]) / np.sqrt(2)
-    x = settled(ReachTask.physics.chosen(physics), np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
-    return x - x[DRIVEN]
+    x = settled(chosen, np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
+    return x - x[driven_and_free(chosen.mesh)[0]]
 
 
 class ClothReachEnv(ClothEnv):

@@ -63,7 +63,7 @@ def layers_over(target: Target, x: NDArray, triangles: NDArray, side: float) -> 
 def cloth_of(physics: Physics) -> dict[str, float]:
     """What the reference depends on: the sheet's side, what is measured of its fabric, and how targets touch it."""
     own = {name: getattr(physics.material, name) for name in MEASURED}
-    return {"side": max(physics.mesh.size), **own, "friction": FRICTION, "thickness": THICKNESS}
+    return {"side": physics.side, **own, "friction": FRICTION, "thickness": THICKNESS}
 
 
 def grid_of(shape: str, counts: Sequence[int]) -> tuple[list[float], list[float]]:
@@ -143,7 +143,7 @@ def reference_coverage(target: Target, physics: Physics) -> float:
     Bilinear in the table over width and yaw or height; beyond the table its edge holds.
     """
     table = _table(json.dumps(cloth_of(physics), sort_keys=True))[target.shape]
-    side, across = max(physics.mesh.size), ACROSS[target.shape]
+    side, across = physics.side, ACROSS[target.shape]
     other = {"none": 0.0, "yaws": abs(target.yaw), "heights": target.height / side}[across]
     by_width = [float(np.interp(other, table[across], row)) for row in table["coverage"]]
     return float(np.interp(target.radius / side, table["widths"], by_width))

@@ -23,26 +23,15 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
-from clothgym.mesh import grid
+from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY
 from clothgym.wind import Wind
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
-SIDE = 0.3  # L [m]
-ROWS = 13
-SHEET = grid(ROWS, ROWS, SIDE, SIDE)
 FABRIC = Material.preset("knit", damping_time=1e-3)
-
-
-def _clip(columns: range) -> tuple[int, ...]:
-    """A clip at a corner: 3 x 2 particles of the upper edge, the corner first."""
-    return tuple(row * ROWS + column for row in (ROWS - 1, ROWS - 2) for column in columns)
-
-
-CLIPS = (_clip(range(3)), _clip(range(ROWS - 1, ROWS - 4, -1)))
-CLIPPED = np.array(CLIPS).ravel()
+WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
 
 POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
 POST_TOP = POST_HEIGHT - POST_RADIUS  # of the post as it stands, see ``_post`` [m]
@@ -50,7 +39,7 @@ HAND = 0.005  # distance from the post at which it stops a clip [m]
 FRICTION = 0.3
 CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first way-point [m]
 WAYPOINTS = 3  # beside the post, beyond it, and the goal
-PASSED, ARRIVED = 0.1, 0.15 * SIDE  # mean distance of the clips from a way-point; of the farther clip from the goal [m]
+PASSED, ARRIVED = 0.1, 0.15  # mean distance of the clips from a way-point [m]; of the farther clip from the goal [sides]
 LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # room of the clips [m]
 MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
@@ -58,6 +47,17 @@ MOST_PULL = float(np.finfo(float).max)  # [N]: of a sheet that is about to diver
 FAR = 10.0  # bound of observed distances, in sides
 
 WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colors of the markers
+
+
+def clips(mesh: ClothMesh) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The anchors, one at each end of the upper edge, its corner first."""
+    rows, columns = mesh.grid_shape
+    wide, deep = (round(share * (rows - 1)) + 1 for share in (WIDE, DEEP))
+    down = range(rows - 1, rows - 1 - deep, -1)
+    return (
+        tuple(row * columns + column for row in down for column in range(wide)),
+        tuple(row * columns + column for row in down for column in range(columns - 1, columns - 1 - wide, -1)),
+    )
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -170,13 +170,13 @@ class StrainTask(Task):
     """The task of ``ClothStrain-v0``, see ``ClothStrainEnv``."""
 
     physics = Physics(
-        mesh=SHEET,
+        mesh=grid(13, 13, 0.3, 0.3),
         material=FABRIC,
         time_step=1 / 30,
         integrator="semi_implicit_euler",
         substeps=36,
         attachment_speed=1.0,
-        anchors=CLIPS,
+        anchors=clips,
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
         fast={"substeps": 35},
     )
@@ -260,8 +260,8 @@ class StrainTask(Task):
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
 
     def constants(self) -> dict[str, Any]:
-        weight = self.physics.material.density * SIDE**2 * GRAVITY  # [N]
-        return {"threshold": self.threshold, "cost_penalty": 0.0, "weight": weight, "arrived": ARRIVED}
+        weight = self.physics.material.density * self.physics.side**2 * GRAVITY  # [N]
+        return {"threshold": self.threshold, "cost_penalty": 0.0, "weight": weight, "arrived": ARRIVED * self.physics.side}
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
@@ -278,16 +278,16 @@ class StrainTask(Task):
         )
         yaws = np.array([0.0, 0.0, *rng.uniform(-MOST_YAW, MOST_YAW, 2)])
         # the held edge lies across the way; between the corners it is as long as at rest
-        half = SIDE / 2 * np.array([-np.sin(yaws), np.cos(yaws), np.zeros(4)]).T
-        clips = np.array([middles + half, middles - half]).swapaxes(0, 1)
+        half = self.physics.side / 2 * np.array([-np.sin(yaws), np.cos(yaws), np.zeros(4)]).T
+        places = np.array([middles + half, middles - half]).swapaxes(0, 1)
         own = self.episode[env]
         own["post"] = post
-        own["places"], own["next"], own["episode_cost"] = clips[1:], 0, 0
-        legs = length(clips[1:] - clips[:-1]).mean(axis=1)
+        own["places"], own["next"], own["episode_cost"] = places[1:], 0, 0
+        legs = length(places[1:] - places[:-1]).mean(axis=1)
         own["after"], own["way"] = legs.sum() - legs.cumsum(), legs.sum()
-        ripple = rng.normal(scale=1e-3, size=SHEET.num_particles)
-        ripple[CLIPPED] = 0
-        x = middles[0] + hanging(self.physics_name)
+        ripple = rng.normal(scale=1e-3, size=self.physics.mesh.num_particles)
+        ripple[np.ravel(self.physics.held)] = 0
+        x = middles[0] + hanging(self.physics_name, *self.sheet)
         x[:, 0] += ripple
         return x
 
@@ -303,9 +303,11 @@ class StrainTask(Task):
 
     def expert_actions(self) -> NDArray:
         """As a rigid pair, gently, see ``carriers.careful``."""
-        velocity = self.simulation.velocities[:, [clip[0] for clip in CLIPS]].astype(np.float64)
+        velocity = self.simulation.velocities[:, [clip[0] for clip in clips(self.physics.mesh)]].astype(np.float64)
         last = self.episode["next"] == WAYPOINTS - 1
-        return self._as_actions(carriers.careful(*self._clips_and_places(), velocity, last, SIDE, self.physics.time_step))
+        return self._as_actions(
+            carriers.careful(*self._clips_and_places(), velocity, last, self.physics.side, self.physics.time_step)
+        )
 
     def careless_actions(self) -> NDArray:
         """Each clip straight to its place, as fast as it can."""
@@ -338,11 +340,12 @@ def _post(x: float, y: float) -> Capsule:
 
 
 @cache
-def hanging(physics: str) -> NDArray:
-    """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3); physics: by name."""
-    rest = SHEET.rest_positions
-    start = np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - SIDE / 2], axis=1)
-    return settled(StrainTask.physics.chosen(physics), start, seconds=8)
+def hanging(physics: str, rows: int | None = None, side: float | None = None) -> NDArray:
+    """The sheet at rest under its clips, relative to the middle between the corners [m], (particles, 3); see ``Physics``."""
+    chosen = StrainTask.physics.chosen(physics).with_sheet(rows, side)
+    rest = chosen.mesh.rest_positions
+    start = np.stack([0 * rest[:, 0], -rest[:, 0], rest[:, 1] - chosen.side / 2], axis=1)
+    return settled(chosen, start, seconds=8)
 
 
 class ClothStrainEnv(ClothEnv):

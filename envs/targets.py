@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -66,9 +66,11 @@ class Target:
             raise ValueError(f"target height={self.height!r}: must be at least the radius {self.radius!r} of a post")
 
     @staticmethod
-    def draw(rng: np.random.Generator, side: float, spread: float, shape: str | None = None) -> Target:
-        """A target for a sheet of that side [m], its axis within ``spread`` [m] of the origin."""
-        shape = shape if shape is not None else SHAPES[int(rng.integers(len(SHAPES)))]
+    def draw(
+        rng: np.random.Generator, side: float, spread: float, shape: str | None = None, shapes: Sequence[str] = SHAPES
+    ) -> Target:
+        """A target for a sheet of that side [m], its axis within ``spread`` [m] of the origin; shapes: to draw one from."""
+        shape = shape if shape is not None else shapes[int(rng.integers(len(shapes)))]
         one_of("target shape", shape, *SHAPES)
         widths, heights = SIZES[shape]
         radius = side * float(rng.uniform(*widths))

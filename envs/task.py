@@ -39,6 +39,7 @@ class Task(TaskDefinition):
 
     Args:
         num_envs: environments in the batch.
+        rows, side: particles along a side of the sheet, and its length [m]; other than the task's own with automatic substeps.
         fabric: another fabric than the task's own, a ``Material`` or a preset's name; substeps are then chosen automatically.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
@@ -52,6 +53,7 @@ class Task(TaskDefinition):
 
     Attributes:
         simulation: the batch of sheets.
+        sheet: rows and side as they were asked for.
         episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
         observation_slices: where each observation lies in ``observation[env]``, by its name.
@@ -67,6 +69,8 @@ class Task(TaskDefinition):
     def __init__(
         self,
         num_envs: int,
+        rows: int | None = None,
+        side: float | None = None,
         fabric: str | Material | None = None,
         integrator: str | Mapping[str, Any] | None = None,
         substeps: int | str | None = None,
@@ -89,7 +93,8 @@ class Task(TaskDefinition):
         self._check_definition()
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
         own, self.physics_name = self.physics.chosen(physics), physics
-        fixed = self.physics = replace(own, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
+        sized, self.sheet = own.with_sheet(rows, side), (rows, side)
+        fixed = self.physics = replace(sized, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
         self.randomize = checked_ranges({} if randomize is None else randomize)
         self.wind = fixed.wind if wind is None else checked_wind(wind)
         if air_density is None:
@@ -110,7 +115,7 @@ class Task(TaskDefinition):
             colliders=self.colliders(),
             contact=fixed.contact if contact is None else contact,
             air_density=not_negative("air_density", air_density),
-            anchors=fixed.anchors,  # type: ignore[arg-type]
+            anchors=fixed.held,
             anchor_speed=2 * fixed.attachment_speed,
             grippers=fixed.grippers,
             bending=fixed.bending if bending is None else bending,
@@ -121,7 +126,7 @@ class Task(TaskDefinition):
         )
         self.num_envs = num_envs
         self.threads = self.simulation.threads
-        self.num_attachments = len(fixed.anchors) + len(fixed.grippers)
+        self.num_attachments = len(fixed.held) + len(fixed.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)
         self._prepare_observation()
         self._prepare_records()
@@ -180,9 +185,9 @@ class Task(TaskDefinition):
         }  # fmt: skip
         # what all environments share
         self.rules = record_of(
-            low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / max(physics.mesh.size)),
+            low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / physics.side),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
-            side=max(physics.mesh.size), solid_hands=physics.solid_hands, **self.constants(),
+            side=physics.side, solid_hands=physics.solid_hands, **self.constants(),
         )  # fmt: skip
         numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]

@@ -6,16 +6,17 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from clothgym import Material
+from clothgym import Material, grid
 from clothgym._jit.cache import CacheFolder
 from clothgym.envs import reference
-from clothgym.envs.drape import SHEET, SIDE
 from clothgym.envs.draping import PHYSICS
 from clothgym.envs.measures import count_layers
 from clothgym.envs.reference import layers_over, reference_coverage
 from clothgym.envs.targets import Target
 
 DRAPE = "clothgym:ClothDrape-v0"
+SIDE = 0.6
+SHEET = grid(17, 17, SIDE, SIDE)
 
 
 BOX = Target("box", 0.12, 0.24, (0.0, 0.0))

@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 
 from clothgym.envs.episode import OUT_OF_BOUNDS
-from clothgym.envs.reach import DRIVEN, FREE, HIGH, LOW, PINCH, SIDE, hanging
+from clothgym.envs.reach import HIGH, LOW, hanging
 
 REACH = "clothgym:ClothReach-v0"
 STEPS = 40
+SIDE, DRIVEN, FREE, PINCH = 0.6, 72, 8, (72, 73, 63)  # of 9 x 9 particles, row by row
 STEP, SPEED = 1 / 15, 0.5
 HANGS = hanging("true")
 
