@@ -21,11 +21,11 @@ lint: $(VENV)/ready
 	$(BIN)/mypy
 
 check: lint
-	$(BIN)/python -m pytest -q -n 2 $(QUICK:%=tests/test_%.py)
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(QUICK:%=tests/test_%.py)
 	$(BIN)/python -m pytest -q -k "refused or wrong" tests/test_cli.py tests/test_training.py
 
 test: lint
-	$(BIN)/python -m pytest -q -n 2 --durations=10
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
 
 bits: $(VENV)/ready
 	$(BIN)/python benchmarks/bits.py --json $(VENV)/bits.json

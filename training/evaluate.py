@@ -132,7 +132,9 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
     """The scores as text, one policy a line."""
     costly = any("cost" in row for row in scores.values())
     more = f" {'cost':>15} {'safe':>6}" if costly else ""
-    lines = [f"{'policy':<28} {'episodes':>8} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}{more}"]
+    lines = [
+        f"{'policy':<28} {'episodes':>8} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}{more}"
+    ]
     for name, row in scores.items():
         low, high = row["success_rate_ci95"]
         spread = [(row[f"{key}_ci95"][1] - row[f"{key}_ci95"][0]) / 2 for key in ("normalized_performance", "return")]
