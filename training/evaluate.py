@@ -132,15 +132,15 @@ def table(scores: dict[str, dict[str, Any]]) -> str:
     """The scores as text, one policy a line."""
     costly = any("cost" in row for row in scores.values())
     more = f" {'cost':>15} {'safe':>6}" if costly else ""
-    lines = [
-        f"{'policy':<28} {'episodes':>8} {'success':>22} {'performance':>16} {'return':>16} {'torn':>6} {'diverged':>9} {'steps':>6}{more}"
-    ]
+    rates, counts = f"{'success':>22} {'performance':>16} {'return':>16}", f"{'torn':>6} {'diverged':>9} {'steps':>6}"
+    lines = [f"{'policy':<28} {'episodes':>8} {rates} {counts}{more}"]
     for name, row in scores.items():
         low, high = row["success_rate_ci95"]
         spread = [(row[f"{key}_ci95"][1] - row[f"{key}_ci95"][0]) / 2 for key in ("normalized_performance", "return")]
         lines.append(
-            f"{name:<28} {row['episodes']:8d} {row['success_rate']:6.3f} [{low:.3f}, {high:.3f}] {row['normalized_performance']:8.3f} ± {spread[0]:.3f} "
-            f"{row['return']:8.3f} ± {spread[1]:.3f} {row['torn']:6d} {row['diverged']:9d} {row['mean_length']:6.1f}"
+            f"{name:<28} {row['episodes']:8d} {row['success_rate']:6.3f} [{low:.3f}, {high:.3f}] "
+            f"{row['normalized_performance']:8.3f} ± {spread[0]:.3f} {row['return']:8.3f} ± {spread[1]:.3f} "
+            f"{row['torn']:6d} {row['diverged']:9d} {row['mean_length']:6.1f}"
         )
         if costly:
             half = (row["cost_ci95"][1] - row["cost_ci95"][0]) / 2
