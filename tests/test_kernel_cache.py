@@ -4,6 +4,7 @@ import hashlib
 import hmac
 import os
 import pickle
+import shutil
 import stat
 import sys
 
@@ -29,16 +30,25 @@ print(shifted(3.0), sum((shifted.stats.cache_misses + double.stats.cache_misses)
 """
 
 
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """A module with two kernels, and a cache that has both.  It prints 2 * 3 + 1, and how many kernels it has compiled."""
+    folder = tmp_path_factory.mktemp("mine")
+    (folder / "mine.py").write_text(MINE)
+    path, root = f"{folder}:{ROOT}", folder / "cache"
+    assert run("import mine", PYTHONPATH=path, CLOTHGYM_CACHE_DIR=str(root))[0] == "7.0 2"
+    return path, root
+
+
 @pytest.fixture
-def mine(tmp_path):
-    """Run a module with two kernels; what it prints is 2 * 3 + 1, and how many kernels it has compiled."""
-    (tmp_path / "mine.py").write_text(MINE)
-    root = tmp_path / "cache"
+def mine(filled, tmp_path):
+    """A copy of that cache, and how to run the module with it."""
+    path, root = filled[0], tmp_path / "cache"
+    shutil.copytree(filled[1], root)
 
     def start(**environment):
-        return run("import mine", PYTHONPATH=f"{tmp_path}:{ROOT}", CLOTHGYM_CACHE_DIR=str(root), **environment)
+        return run("import mine", PYTHONPATH=path, CLOTHGYM_CACHE_DIR=str(root), **environment)
 
-    assert start()[0] == "7.0 2"
     return root, start
 
 
