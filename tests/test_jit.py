@@ -119,7 +119,8 @@ SMOKE = """
 from clothgym import Simulation, grid
 from clothgym.triangles import disc
 for mesh in (grid(4, 4, 0.3, 0.3), disc(0.2, 2)):
-    simulation = Simulation(mesh, num_envs=2, anchors=[0], contact="particles")
+    simulation = Simulation(mesh, num_envs=2, contact="particles")
+    simulation.reset(positions=1.1 * mesh.rest_positions)
     simulation.step(5)
     print(simulation.positions.tobytes().hex())
 """

@@ -76,19 +76,33 @@ def test_the_folder_envs_refuses_its_bare_name():
 
 TWO_THREADS = """
 import threading
-from clothgym import Simulation, grid, _jit
-def run(name):
-    Simulation(grid(3, 3, 0.1, 0.1), integrator=name, anchors=[0], contact="particles").step(2)
-threads = [threading.Thread(target=run, args=(name,)) for name in ("semi_implicit_euler", "xpbd")]
-[t.start() for t in threads]
-[t.join() for t in threads]
-print(len(_jit.cache_folder().held))
+from clothgym import _jit
+@_jit.apart
+def shared(x):
+    return 2.0 * x
+@_jit.kernel
+def left(x):
+    return shared(x) + 1.0
+@_jit.kernel
+def right(x):
+    return shared(x) + 2.0
+def go():
+    said = []
+    threads = [threading.Thread(target=lambda run=run: said.append(run(3.0))) for run in (left, right)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    print(len(_jit.cache_folder().held), *sorted(said))
 """
 
 
 def test_two_threads_that_compile_at_once_leave_the_lock_free(tmp_path):
-    out, err = start(TWO_THREADS, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
-    assert out.strip() == "0", err
+    (tmp_path / "two.py").write_text(TWO_THREADS)
+    cache = {
+        "CLOTHGYM_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": f"{tmp_path}:{os.path.dirname(os.path.dirname(__file__))}",
+    }
+    out, err = start("import two; two.go()", **cache).communicate(timeout=300)
+    assert out.strip() == "0 7.0 8.0", err
 
 
 @pytest.mark.parametrize("files", ["*.nbc", "*.nbi"])
