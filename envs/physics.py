@@ -22,7 +22,7 @@ from clothgym.wind import Wind
 
 PHYSICS = ("true", "fast")
 Held = tuple[int | tuple[int, ...], ...]  # particles that anchors hold, as ``Simulation`` takes them
-FEWEST_ROWS, SIDES = 5, (0.1, 1.0)  # of a sheet whose resolution or side is chosen: in the arenas of the tasks [m]
+ROWS, SIDES = (5, 49), (0.1, 1.0)  # that can be chosen: finer sheets take minutes to come to rest; in the tasks' arenas [m]
 # the short cuts of most benchmarks
 SHORT_CUTS: dict[str, Any] = {"contact": "particles", "self_collision": False, "bending": "springs", "solid_hands": False}
 MEDIAN = Material.preset("median")
@@ -90,7 +90,7 @@ class Physics:
                 "function of the mesh"
             )
         (own_rows, columns), size = self.mesh.shape, self.mesh.size
-        number_of_rows = own_rows if rows is None else count("rows", rows, least=FEWEST_ROWS)
+        number_of_rows = own_rows if rows is None else count("rows", rows, least=ROWS[0], most=ROWS[1])
         longer = self.side if side is None else positive("side", side)
         if not SIDES[0] <= longer <= SIDES[1]:
             raise ValueError(f"side={shown(side)}: must be from {SIDES[0]} to {SIDES[1]} m, for which the tasks have room")

@@ -72,6 +72,7 @@ def test_its_own_resolution_and_side_change_no_bit():
     ("kwargs", "what"),
     [
         ({"rows": 4}, "rows=4"),
+        ({"rows": 50}, "rows=50"),
         ({"rows": 17.5}, "rows=17.5"),
         ({"rows": True}, "rows=True"),
         ({"side": 0.0}, "side=0.0"),

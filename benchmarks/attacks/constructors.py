@@ -22,6 +22,7 @@ SURFACE = {"friction": "0.3", "thickness": "0.001", "velocity": "(0, 0, 1)"}
 TURN = {"center": "(0, 0, 0)", "rotation": "(1, 0, 0, 0)"}
 BODY = "attacks.constructors.body()"
 SHARED = {
+    "rows": "7", "side": "0.3",
     "fabric": "'silk'", "integrator": "'semi_implicit_euler'", "substeps": "50", "bending": "'hinge'", "strain_limit": "0.1",
     "self_collision": "'fast'", "contact": "'particles'", "air_density": "1.2", "obs_mode": "'particles'",
     "reward_mode": "'sparse'",
@@ -79,7 +80,8 @@ SOUND: tuple[tuple[str, dict[str, str]], ...] = (
     ("attacks.constructors.projected_area", {"*positions": f"{MESH}.rest_positions", "*triangles": f"{MESH}.triangles"}),
     *((f"clothgym.envs.{name}Env", SHARED) for name, _ in ENVIRONMENTS.values()),
     *((f"clothgym.envs.{name}VectorEnv", {**VECTOR, **SHARED}) for name, _ in ENVIRONMENTS.values()),
-    ("clothgym.envs.ClothDrapeGripperEnv", {"grippers": "1", "slip_force": "0.5", **SHARED}),
+    ("clothgym.envs.ClothDrapeEnv", {"shapes": "('box', 'post')", **SHARED}),
+    ("clothgym.envs.ClothDrapeGripperEnv", {"grippers": "1", "shapes": "'sphere'", "slip_force": "0.5", **SHARED}),
     ("clothgym.envs.ClothStrainEnv", {"threshold": "0.1", "cost_penalty": "0.5", **SHARED}),
 )  # fmt: skip
 
