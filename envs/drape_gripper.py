@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
-from clothgym.checks import shown
+from clothgym.checks import LARGEST, shown
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target
+from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target, stop_at_target
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
@@ -46,6 +46,25 @@ def _take(own, rules, sheet, move, free):
     for k in range(rules.places.shape[0]):
         if sheet.holder[rules.places[k]] >= 0:
             own.picked[k] = 1
+
+
+@inlined
+def _measure_grips(own, rules, sheet):
+    """How far each tip must stay above the floor: what a gripper holds, it holds below; fingers that close may be about to."""
+    for k in range(own.under.shape[0]):
+        own.under[k] = sheet.attachments[k, 2] if sheet.holds[k] == 0 and 0 < sheet.openings[k] < 1 else 0.0
+    for p in range(sheet.holder.shape[0]):
+        k = sheet.holder[p]
+        if k >= 0:
+            own.under[k] = max(own.under[k], sheet.attachments[k, 2] - sheet.x[2, p])
+
+
+@inlined
+def _stop_at_solids(own, rules, k):
+    """The target stops a tip, and the floor what it holds."""
+    stop_at_target(own, rules, k)
+    if rules.solid_hands:
+        own.targets[k, 2] = max(own.targets[k, 2], own.under[k])
 
 
 @inlined
@@ -93,15 +112,16 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         draping.evaluate_cover,
         _observe,
         act=_take,
+        measure=_measure_grips,
         account=draping.account_reference,
         fingers=close_or_open,
-        stop=draping.stop_at_target,
+        stop=_stop_at_solids,
     )
     acting_steps = 100
     settling_steps = 60
     observations = _observations(2)
     guide_reach = 0.4  # the sheet begins farther away than in ClothDrape-v0
-    ranges: ClassVar = {**DrapingTask.ranges, "picked": (0, 1)}
+    ranges: ClassVar = {**DrapingTask.ranges, "picked": (0, 1), "under": (0.0, LARGEST)}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
         **DrapingTask.arguments,
@@ -124,7 +144,8 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         return np.array([left, right] if len(self.physics.grippers) == 2 else [left + mesh.grid_shape[1] // 2])
 
     def remembers(self) -> Fields:
-        return [*super().remembers(), ("picked", np.uint8, len(self.places))]  # whether each place has ever been held
+        # whether each place has ever been held, and how far each tip must stay above the floor [m]
+        return [*super().remembers(), ("picked", np.uint8, len(self.places)), ("under", float, len(self.places))]
 
     def constants(self) -> dict[str, Any]:
         return super().constants() | {"places": self.places}
@@ -205,9 +226,9 @@ class ClothDrapeGripperEnv(ClothEnv):
     The sheet and the targets are those of ``ClothDrape-v0``, and so is the evaluation.  But the sheet lies on the floor, flat or
     rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
     when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
-    hold as often as it likes.  The fingers do not push the cloth; the target stops a gripper's tip.  After 100 steps they open,
-    and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until
-    then is as good as to let go.
+    hold as often as it likes.  The fingers do not push the cloth; the target stops a gripper's tip, the floor what it holds, and
+    while they close it does not sink.  After 100 steps they open, and the sheet settles for 60 steps, in which actions are
+    ignored; then it is evaluated.  To hold it in the right place until then is as good as to let go.
 
     The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
 

@@ -402,3 +402,19 @@ def test_a_rumpled_sheet_stays_as_it_lies():
         *_, info = env.step(np.zeros((16, 8)))
     moved = np.linalg.norm(positions(env) - before, axis=2)
     assert not any(info["failure"]) and moved.mean() < 8e-3 and info["strain_max"].max() < 0.1
+
+
+@pytest.mark.parametrize("grasped_at", [0.02, 0.028])
+def test_no_gripper_presses_cloth_through_the_floor(grasped_at):
+    """They sink as fast as they can, close at a height at which the corner is just in reach, and go on down."""
+    env = gym.make(GRIPPER).unwrapped
+    env.reset(seed=0, options={"rumpled": False})
+    task, held = env.task, False
+    for _ in range(60):
+        action = task.expert_actions()[0].reshape(2, 4)
+        tips = task.simulation.attachment_positions[0, :, 2]
+        action[:, 2], action[:, 3] = np.where(tips > 0.08, -1.0, -0.3), np.where(tips < grasped_at + 0.01, CLOSED, OPEN)
+        env.step(action.ravel())
+        held |= bool(task.simulation.grippers.held.all())
+        assert task.simulation.positions[0, :, 2].min() > -0.002
+    assert held
