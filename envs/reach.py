@@ -118,6 +118,10 @@ class ReachTask(Task):
     evaluation = (("goal_distance", float), ("corner_speed", float))
     reset_options: ClassVar[tuple[str, ...]] = ("material", "goal")
 
+    @property
+    def ranges(self) -> Mapping[str, tuple[float, float]]:  # type: ignore[override]
+        return {"distance": (NEAREST * self.physics.side, LARGEST)}
+
     def colliders(self) -> list[Collider]:
         return []  # the floor is out of reach
 
@@ -204,7 +208,7 @@ class ClothReachEnv(ClothEnv):
 
     A square sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner, where three particles are pinched.  The agent
     moves that corner; the opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner,
-    and at rest, when 40 steps are over.  The task is for teaching and for tests: any learner solves it in a minute.
+    and at rest, when 40 steps are over.  The task is for teaching and for tests: any learner solves it in minutes.
 
     The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), strict self-collision, quadratic
     bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; 15 Hz control, ``semi_implicit_euler`` with 50
