@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import vector
+from clothgym.checks import LARGEST, vector
 from clothgym.collisions import Collider, Sphere
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
