@@ -50,9 +50,11 @@ def _take(own, rules, sheet, move, free):
 
 @inlined
 def _measure_grips(own, rules, sheet):
-    """How far each tip must stay above the floor: what a gripper holds, it holds below; fingers that close may be about to."""
+    """How far each tip must stay above the floor: what a gripper holds, it holds below."""
+    # fingers on their way may take hold within the next step: the tip stays as high as it is
     for k in range(own.under.shape[0]):
         own.under[k] = sheet.attachments[k, 2] if sheet.holds[k] == 0 and 0 < sheet.openings[k] < 1 else 0.0
+    # the lowest particle that each holds
     for p in range(sheet.holder.shape[0]):
         k = sheet.holder[p]
         if k >= 0:
@@ -227,7 +229,7 @@ class ClothDrapeGripperEnv(ClothEnv):
     rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
     when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
     hold as often as it likes.  The fingers do not push the cloth; the target stops a gripper's tip, the floor what it holds, and
-    while they close it does not sink.  After 100 steps they open, and the sheet settles for 60 steps, in which actions are
+    while they move it does not sink.  After 100 steps they open, and the sheet settles for 60 steps, in which actions are
     ignored; then it is evaluated.  To hold it in the right place until then is as good as to let go.
 
     The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.

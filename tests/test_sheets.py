@@ -39,7 +39,7 @@ def test_clips_are_as_wide_at_every_resolution_and_bear_the_sheet_s_weight(rows)
     for clip in env.task.physics.held:
         x = env.task.physics.mesh.rest_positions[list(clip)]
         assert np.ptp(x[:, 0]) == pytest.approx(0.05) and np.ptp(x[:, 1]) == pytest.approx(0.025)
-    # a knit of 178 g/m2; the clipped cloth hangs on no yarn.  Each clip holds 1.25 or 2 cells of the border's half and full widths
+    # a knit of 178 g/m2; the clipped cloth itself, 4 to 5 % of the sheet, hangs on no yarn
     *_, info = env.step(np.zeros(6))
     weight = 0.178 * 0.3**2 * 9.81
     assert 0.93 * weight < info["tension_left"] + info["tension_right"] < 1.02 * weight
