@@ -12,7 +12,7 @@ from numba.core.errors import TypingError
 
 from clothgym import bending
 from clothgym._jit import inlined, kernel, placeholder, specialize
-from clothgym._jit.cache import WITHOUT_KERNELS, source_digest
+from clothgym._jit.cache import ABOVE_CORE, WITHOUT_KERNELS, cache_folder, source_digest
 from clothgym.bending import add_bend_forces
 from clothgym.integrators import INTEGRATORS
 
@@ -41,17 +41,36 @@ def test_an_edit_of_any_module_with_kernels_names_another_folder(linked, tmp_pat
     """numba alone would run the old code."""
     copy_package(tmp_path, linked)
 
-    def name():
-        code = "from clothgym._jit import cache_folder; print(cache_folder().path.name)"
-        return run(code, PYTHONPATH=str(tmp_path), CLOTHGYM_CACHE_DIR=str(tmp_path / "cache"))[0]
+    def names():
+        code = "from clothgym._jit import cache_folder as f; print(f().path.name, f().core.name)"
+        return run(code, PYTHONPATH=str(tmp_path), CLOTHGYM_CACHE_DIR=str(tmp_path / "cache"))[0].split()
 
-    names = [name()]
-    for edited in ("forces.py", "collisions/solids/contact_law.py", "envs/measures.py"):
+    found = [names()]
+    for edited in ("forces.py", "collisions/solids/contact_law.py", "envs/measures.py", "render/raster.py"):
         path = tmp_path / "clothgym" / edited
         path.write_text(path.read_text() + "\nMORE = 1\n")
-        names.append(name())
+        found.append(names())
     (tmp_path / "clothgym" / "cli.py").write_text("")
-    assert len(set(names)) == 4 and name() == names[-1]
+    every, core = zip(*found)
+    assert len(set(every)) == 5 and names() == found[-1]
+    # tasks and pictures lie above the core, whose kernels hold nothing of them
+    assert len(set(core[:3])) == 3 and set(core[2:]) == {core[2]} and not set(core) & set(every)
+
+
+@pytest.mark.parametrize(
+    "module, of_the_core",
+    [("clothgym.forces", True), ("clothgym.integrators.verlet", True), ("clothgym.envs.stepping", False), ("mine", False)],
+)
+def test_kernels_above_the_core_are_kept_apart(module, of_the_core):
+    folder = cache_folder()
+    assert folder.folder_of(module) == (folder.core if of_the_core else folder.path)
+
+
+def test_the_core_imports_nothing_that_its_folder_s_name_leaves_out():
+    for path in (ROOT / "clothgym").rglob("*.py"):
+        if path.relative_to(ROOT / "clothgym").parts[0].removesuffix(".py") not in {*ABOVE_CORE, "__init__", "registration"}:
+            above = {name for name in ABOVE_CORE if f"clothgym.{name} import" in path.read_text()}
+            assert not above, path
 
 
 def test_two_sources_of_one_name_are_told_apart(tmp_path):

@@ -1,7 +1,8 @@
 """The folder of compiled kernels: its name, the locks that guard it, and whom it trusts.
 
 * Its name is a digest of all sources that a kernel may hold something of: numba's own cache does not notice an edit in a callee
-  that lies in another file; this name does.
+  that lies in another file; this name does.  Kernels of the core have a folder of their own, named by the core's sources alone:
+  imports only go down, so who edits a task need not compile the main loop again.
 * A file lock for each kernel while it is compiled: processes that start together on a cold cache compile each one once, and
   different ones at the same time.
 * What lies in it is unpickled and run.  So it must be the user's own and closed to others, and each entry begins with a checksum
@@ -19,7 +20,7 @@ import os
 import stat
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ import numba
 
 # modules and folders without kernels, from which none below them takes a constant: who edits them need not compile
 WITHOUT_KERNELS = {"__main__", "adapters", "cli", "playground"}
+# modules and folders above the core, which imports none of them
+ABOVE_CORE = {*WITHOUT_KERNELS, "envs", "lab", "render", "starts"}
 CHECKSUM = 32  # bytes of a checksum, and of its key
 NOWHERE = Path(os.devnull) / "none"
 
@@ -41,24 +44,24 @@ def package_folders() -> dict[str, Path]:
     return folders
 
 
-def kernel_sources(folders: Mapping[str, Path]) -> dict[str, bytes]:
+def kernel_sources(folders: Mapping[str, Path], without: Set[str] = WITHOUT_KERNELS) -> dict[str, bytes]:
     """Texts of all modules that kernels may hold something of, be it a constant.
 
-    folders: by the name of the package that lies in each.
+    folders: by the name of the package that lies in each.  without: modules and folders in them that are left out.
     """
     sources = {}
     for package, folder in folders.items():
         for path in folder.rglob("*.py"):
             inside = path.relative_to(folder)
-            if inside.parts[0].removesuffix(".py") not in WITHOUT_KERNELS:
+            if inside.parts[0].removesuffix(".py") not in without:
                 sources[f"{package.replace('.', '/')}/{inside.as_posix()}"] = path.read_bytes()
     return sources
 
 
-def source_digest(folders: Mapping[str, Path]) -> str:
+def source_digest(folders: Mapping[str, Path], without: Set[str] = WITHOUT_KERNELS) -> str:
     """Digest of these sources, each with its name, of numba's version and of Python's."""
     digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
-    for name, text in sorted(kernel_sources(folders).items()):
+    for name, text in sorted(kernel_sources(folders, without).items()):
         digest.update(f"{name} {len(text)}\n".encode() + text)
     return digest.hexdigest()[:16]
 
@@ -81,7 +84,7 @@ def _default_root() -> Path:
 class CacheFolder:
     """The folder of compiled kernels, found once, with the locks that guard it and the key of its checksums.
 
-    path: where kernels are, or a place that cannot be.  writable: whether new ones are kept there.
+    path: where kernels are, or a place that cannot be; core: where those of the core are.  writable: whether new ones are kept.
     """
 
     def __init__(self) -> None:
@@ -90,18 +93,21 @@ class CacheFolder:
         self.held: dict[str, int] = {}
         self._announced = False
         self.writable = True
-        self.path = NOWHERE
+        self.path = self.core = NOWHERE
         self._key = b""
         root = NOWHERE
         try:
             root = _default_root()
-            path = root / source_digest(package_folders())
-            for folder in (root, path):
+            folders = package_folders()
+            path = root / source_digest(folders)
+            core = root / source_digest({"clothgym": folders["clothgym"]}, ABOVE_CORE)
+            for folder in (root, path, core):
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 _refuse_others(folder, stat.S_IWGRP | stat.S_IWOTH, "chmod go-w")
             self._key = _key_of(root / "key")
-            self.path = path
-            os.close(os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o600))
+            self.path, self.core = path, core
+            for folder in (path, core):
+                os.close(os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600))
         except (OSError, RuntimeError) as error:  # RuntimeError: no home folder
             self.give_up(error, root)
 
@@ -152,10 +158,15 @@ class CacheFolder:
         code.update(content)
         return code.digest()
 
-    def acquire(self, name: str) -> None:
-        """Wait until no other process compiles the kernel of that name."""
+    def folder_of(self, module: str) -> Path:
+        """Where the kernels of a module are."""
+        package, _, inside = module.partition(".")
+        return self.core if package == "clothgym" and inside.partition(".")[0] not in ABOVE_CORE else self.path
+
+    def acquire(self, name: str, folder: Path) -> None:
+        """Wait until no other process compiles the kernel of that name into that folder."""
         try:
-            file = os.open(self.path / f"{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+            file = os.open(folder / f"{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
             _lock_file(file)
             self.held[name] = file
         except OSError as error:  # the folder has vanished, or its file system has no locks
@@ -170,7 +181,7 @@ class CacheFolder:
     def announce(self) -> None:
         if not self._announced:
             self._announced = True
-            where = f", kept in {self.path}" if self.writable else ""
+            where = f", kept in {self.path.parent}" if self.writable else ""
             print(
                 f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True
             )

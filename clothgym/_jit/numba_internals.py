@@ -89,11 +89,11 @@ class _Locator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  #
     """Tells numba's cache to use our folder; the stamp is the kernel's own file, the folder's name covers its callees."""
 
     def __init__(self, py_func: FunctionType, py_file: str) -> None:
-        self._py_file = py_file
+        self._py_file, self._module = py_file, py_func.__module__
         self._lineno = py_func.__code__.co_firstlineno
 
     def get_cache_path(self) -> str:
-        return str(cache_folder().path)
+        return str(cache_folder().folder_of(self._module))
 
     def ensure_cache_path(self) -> None:
         pass
@@ -188,7 +188,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         folder = cache_folder()
         found = self._load(sig, target_context)
         if found is None and folder.writable and self.lock_name not in folder.held:
-            folder.acquire(self.lock_name)
+            folder.acquire(self.lock_name, Path(self._cache_path))
             found = self._load(sig, target_context)
         if found is None:
             target_context.refresh()
@@ -196,7 +196,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
         return found
 
     def _load(self, sig: Any, target_context: Any) -> Any:
-        if not cache_folder().path.is_dir():
+        if not Path(self._cache_path).is_dir():
             return None
         if numba.version_info.short in LOADS_WITHOUT_TABLES:
             rtsys.initialize(target_context)

@@ -54,8 +54,9 @@ def _plainly(function: FunctionType, apart: bool, flags: Flags) -> Any:
         return numba.njit(**OPTIONS)(function)
     try:
         # nothing in it has a checksum: it is closed to others
-        (folder.path / "plain").mkdir(mode=0o700, exist_ok=True)
-        numba.config.CACHE_DIR = str(folder.path / "plain" / name_of(function))  # type: ignore[attr-defined]
+        plain = folder.folder_of(function.__module__) / "plain"
+        plain.mkdir(mode=0o700, exist_ok=True)
+        numba.config.CACHE_DIR = str(plain / name_of(function))  # type: ignore[attr-defined]
         return numba.njit(cache=True, **OPTIONS)(function)
     except (OSError, RuntimeError):  # no place to cache it, or it has been typed in, and lies in no file
         return numba.njit(**OPTIONS)(function)
