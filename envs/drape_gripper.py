@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
-from clothgym.checks import LARGEST, shown
+from clothgym.checks import shown
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target, stop_at_target
 from clothgym.envs.episode import Fields, length
-from clothgym.envs.gripper_task import GripperTask, close_or_open
+from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.measures import distance
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.single import ClothEnv
@@ -49,24 +49,10 @@ def _take(own, rules, sheet, move, free):
 
 
 @inlined
-def _measure_grips(own, rules, sheet):
-    """How far each tip must stay above the floor: what a gripper holds, it holds below."""
-    # fingers on their way may take hold within the next step: the tip stays as high as it is
-    for k in range(own.under.shape[0]):
-        own.under[k] = sheet.attachments[k, 2] if sheet.holds[k] == 0 and 0 < sheet.openings[k] < 1 else 0.0
-    # the lowest particle that each holds
-    for p in range(sheet.holder.shape[0]):
-        k = sheet.holder[p]
-        if k >= 0:
-            own.under[k] = max(own.under[k], sheet.attachments[k, 2] - sheet.x[2, p])
-
-
-@inlined
 def _stop_at_solids(own, rules, k):
     """The target stops a tip, and the floor what it holds."""
     stop_at_target(own, rules, k)
-    if rules.solid_hands:
-        own.targets[k, 2] = max(own.targets[k, 2], own.under[k])
+    stop_at_floor(own, rules, k)
 
 
 @inlined
@@ -114,7 +100,7 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         draping.evaluate_cover,
         _observe,
         act=_take,
-        measure=_measure_grips,
+        measure=measure_grips,
         account=draping.account_reference,
         fingers=close_or_open,
         stop=_stop_at_solids,
@@ -123,7 +109,7 @@ class DrapeGripperTask(DrapingTask, GripperTask):
     settling_steps = 60
     observations = _observations(2)
     guide_reach = 0.4  # the sheet begins farther away than in ClothDrape-v0
-    ranges: ClassVar = {**DrapingTask.ranges, "picked": (0, 1), "under": (0.0, LARGEST)}
+    ranges: ClassVar = {**DrapingTask.ranges, **GripperTask.ranges, "picked": (0, 1)}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
         **DrapingTask.arguments,
@@ -146,8 +132,8 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         return np.array([left, right] if len(self.physics.grippers) == 2 else [left + mesh.grid_shape[1] // 2])
 
     def remembers(self) -> Fields:
-        # whether each place has ever been held, and how far each tip must stay above the floor [m]
-        return [*super().remembers(), ("picked", np.uint8, len(self.places)), ("under", float, len(self.places))]
+        # whether each place has ever been held
+        return [*super().remembers(), ("picked", np.uint8, len(self.places))]
 
     def constants(self) -> dict[str, Any]:
         return super().constants() | {"places": self.places}

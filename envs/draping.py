@@ -128,7 +128,7 @@ class DrapingTask(Task):
         return {TARGET_SLOT: recalled(self.episode[env]).collider(FRICTION, THICKNESS)}
 
     def remembers(self) -> Fields:
-        return REMEMBERS
+        return [*super().remembers(), *REMEMBERS]
 
     def check_episode(self, env: int, own: Any) -> None:
         target = recalled(own)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -9,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
+from clothgym.checks import LARGEST
 from clothgym.collisions import Box
+from clothgym.envs.episode import Fields
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.task import Task
 
@@ -25,6 +28,26 @@ def close_or_open(move, wanted, acting):
     return 0.0 if move[3] < CLOSES else wanted
 
 
+@inlined
+def measure_grips(own, rules, sheet):
+    """How far each tip must stay above the floor: what a gripper holds, it holds below."""
+    # fingers on their way may take hold within the next step: the tip stays as high as it is
+    for k in range(own.under.shape[0]):
+        own.under[k] = sheet.attachments[k, 2] if sheet.holds[k] == 0 and 0 < sheet.openings[k] < 1 else 0.0
+    # the lowest particle that each holds
+    for p in range(sheet.holder.shape[0]):
+        k = sheet.holder[p]
+        if k >= 0:
+            own.under[k] = max(own.under[k], sheet.attachments[k, 2] - sheet.x[2, p])
+
+
+@inlined
+def stop_at_floor(own, rules, k):
+    """The floor stops what a gripper holds."""
+    if rules.solid_hands:
+        own.targets[k, 2] = max(own.targets[k, 2], own.under[k])
+
+
 class GripperTask(Task):
     """Base of the tasks that use grippers, which are those of ``physics``; an action is a velocity and what fingers do, for each.
 
@@ -36,7 +59,8 @@ class GripperTask(Task):
     """
 
     actions_per_attachment = 4
-    kernels = IN_NUMPY._replace(fingers=close_or_open)
+    kernels = IN_NUMPY._replace(fingers=close_or_open, measure=measure_grips, stop=stop_at_floor)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"under": (0.0, LARGEST)}
     arguments: ClassVar = {"slip_force": "pull at which the cloth slips out of a gripper [N]"}
 
     def __init__(self, num_envs: int, slip_force: float | None = None, **kwargs: Any) -> None:
@@ -45,6 +69,10 @@ class GripperTask(Task):
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
         self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
+
+    def remembers(self) -> Fields:
+        # how far each tip must stay above the floor [m]
+        return [*super().remembers(), ("under", float, len(self.physics.grippers))]
 
     def _drawn(self) -> list[NDArray]:
         return [*super()._drawn(), self.gripper_starts]
