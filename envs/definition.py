@@ -205,3 +205,12 @@ def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, 
         Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
         Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),
     ]
+
+
+def check_definition(task: TaskDefinition, in_numpy: bool) -> None:
+    """Refuse a task that cannot be evaluated or has nothing to observe."""
+    missing = [name for name in ("performance", "success") if getattr(type(task), name) is getattr(TaskDefinition, name)]
+    if in_numpy and missing:
+        raise TypeError(f"{type(task).__name__} does not define {' and '.join(missing)}(): a task without kernels needs both")
+    if not task.observations:
+        raise TypeError(f"{type(task).__name__}.observations is empty: declare at least one Observation")

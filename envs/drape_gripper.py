@@ -113,6 +113,7 @@ class DrapeGripperTask(DrapingTask, GripperTask):
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
         **DrapingTask.arguments,
+        **GripperTask.arguments,
         "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
         "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.70 N",
     }

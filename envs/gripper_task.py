@@ -6,17 +6,20 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import LARGEST
+from clothgym.checks import LARGEST, one_of
 from clothgym.collisions import Box
+from clothgym.envs import pick_place
 from clothgym.envs.episode import Fields
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.task import Task
 
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
+ACTION_MODES = ("velocity", "pick_place")
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
 
 
@@ -53,22 +56,55 @@ class GripperTask(Task):
 
     Args:
         slip_force: pull at which the cloth slips out of a gripper [N]; None for the grippers' own.
+        action_mode: "velocity", or "pick_place", see the module of that name.
 
     Attributes:
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
+        picks: actions of an episode with "pick_place", after which the sheet settles in one more step.
+        workspace: half of the square in which these pick and place, in sides.
     """
 
     actions_per_attachment = 4
     kernels = IN_NUMPY._replace(fingers=close_or_open, measure=measure_grips, stop=stop_at_floor)
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"under": (0.0, LARGEST)}
-    arguments: ClassVar = {"slip_force": "pull at which the cloth slips out of a gripper [N]"}
+    picks: ClassVar[int] = 4
+    workspace: ClassVar[float] = 1.25
+    arguments: ClassVar = {
+        "slip_force": "pull at which the cloth slips out of a gripper [N]",
+        "action_mode": '"velocity", or "pick_place": an action is 60 control steps, and 5 numbers in [-1, 1] for each gripper: '
+        "where it picks, x and y, where it places, x and y, in a square about the origin, and how high it lifts, from 0 to 1 side",
+    }
 
-    def __init__(self, num_envs: int, slip_force: float | None = None, **kwargs: Any) -> None:
+    def __init__(self, num_envs: int, slip_force: float | None = None, action_mode: str = "velocity", **kwargs: Any) -> None:
+        one_of("action_mode", action_mode, *ACTION_MODES)
+        self.action_mode = action_mode
         if slip_force is not None:
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
+        if action_mode == "pick_place":
+            self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
+        if action_mode == "pick_place":
+            size = pick_place.NUMBERS * self.num_attachments
+            self.single_action_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)
+            # tips move as fast as the grippers can
+            self.rules["reach"] = self.physics.time_step * min(gripper.speed for gripper in self.physics.grippers)
         self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
+
+    def advance(self, actions: Any) -> None:
+        if self.action_mode == "velocity":
+            super().advance(actions)
+            return
+        self.check_ready()
+        actions = self._checked(actions)
+        if not np.isfinite(actions).all():
+            env, component = np.argwhere(~np.isfinite(actions))[0].tolist()
+            raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
+        pick_place.perform(self, actions)
+
+    def steps_taken(self) -> NDArray:
+        step = self.episode["step"]
+        return step if self.action_mode == "velocity" else -(-step // pick_place.STEPS)
 
     def remembers(self) -> Fields:
         # how far each tip must stay above the floor [m]

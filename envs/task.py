@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
 from clothgym.checks import not_negative, numbers, one_of, shown
-from clothgym.envs.definition import TaskDefinition, points_observed
+from clothgym.envs.definition import TaskDefinition, check_definition, points_observed
 from clothgym.envs.episode import TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
@@ -59,7 +59,7 @@ class Task(TaskDefinition):
         observation_slices: where each observation lies in ``observation[env]``, by its name.
         rules: one record of numbers that all environments share.
         outcome, info, terms: records of what the last step has brought, or the reset since then, (num_envs,).
-        turn: one thread at a time is in the task's methods; ``turn.unfinished`` are the environments that need a reset.
+        turn: one thread at a time is in the task; ``turn.unfinished`` are the environments that need a reset.
 
     Raises:
         ValueError: an unknown mode, property, fabric or integrator, or an invalid range; the message says what would do.
@@ -90,7 +90,7 @@ class Task(TaskDefinition):
         one_of("reward_mode", reward_mode, *REWARD_MODES)
         self.obs_mode, self.reward_mode = obs_mode, reward_mode
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
-        self._check_definition()
+        check_definition(self, self._in_numpy)
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
         own, self.physics_name = self.physics.chosen(physics), physics
         sized, self.sheet = own.with_sheet(rows, side), (rows, side)
@@ -134,14 +134,6 @@ class Task(TaskDefinition):
         self._seeded = np.zeros(num_envs, bool)
         self.turn = Turn("environment", error=gym.error.ResetNeeded)
 
-    def _check_definition(self) -> None:
-        """Refuse a task that cannot be evaluated or has nothing to observe."""
-        missing = [name for name in ("performance", "success") if getattr(type(self), name) is getattr(TaskDefinition, name)]
-        if self._in_numpy and missing:
-            raise TypeError(f"{type(self).__name__} does not define {' and '.join(missing)}(): a task without kernels needs both")
-        if not self.observations:
-            raise TypeError(f"{type(self).__name__}.observations is empty: declare at least one Observation")
-
     def _prepare_observation(self) -> None:
         """Space, memory and look-up of what is observed: the sheet's points, and what the task declares."""
         self.particles = self.observed_particles() if self.obs_mode == "keypoints" else np.arange(self.physics.mesh.num_particles)
@@ -163,13 +155,8 @@ class Task(TaskDefinition):
         physics, count = self.physics, self.num_envs
         attachment, (low, high) = (self.num_attachments, 3), self.arena()
         # what an episode remembers
-        memory: list[tuple[Any, ...]] = [
-            ("step", np.int64),
-            ("settling_since", np.int64),
-            ("over", bool),
-            ("targets", float, attachment),
-        ]
-        memory += [("potential", float)]
+        memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool)]
+        memory += [("targets", float, attachment), ("potential", float)]
         memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES)), *self.remembers()]
         if self._in_numpy:
             memory += [("performance", float), ("success", bool), ("done", bool)]
@@ -328,11 +315,19 @@ class Task(TaskDefinition):
 
     def advance(self, actions: Any) -> None:
         """The same as a part of a longer step: whoever calls it sets ``turn.unfinished`` to nothing at the end."""
+        self.check_ready()
+        self.move(self._checked(actions))
+
+    def check_ready(self) -> None:
+        """Refuse a step of a batch that has not been reset, or was interrupted."""
         if not self._seeded.all():
             raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
         self.turn.check_whole()
         self.simulation.turn.check_whole()
-        actions, simulation = self._checked(actions), self.simulation
+
+    def move(self, actions: NDArray) -> None:
+        """One control step; actions: velocities of the attachments and what comes after them, (num_envs, numbers), float64."""
+        simulation = self.simulation
         self.turn.unfinished = range(self.num_envs)
         wrong = self._apply_actions(actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
         if wrong >= 0:
@@ -347,6 +342,10 @@ class Task(TaskDefinition):
         # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
             simulation.release(*np.nonzero(self.outcome["free"]))
+
+    def steps_taken(self) -> NDArray:
+        """Calls of ``step`` since each episode's start, (num_envs,)."""
+        return self.episode["step"]
 
     def _checked(self, actions: Any) -> NDArray:
         """Actions as an array of the right shape, float64."""

@@ -110,9 +110,8 @@ class ClothVectorEnv(VectorEnv):
         """
         if self.max_episode_steps is None:
             return np.zeros(self.num_envs, bool)
-        episode = self.task.episode
-        truncated = ~over & (episode["step"] >= self.max_episode_steps)
-        episode["over"] |= truncated
+        truncated = ~over & (self.task.steps_taken() >= self.max_episode_steps)
+        self.task.episode["over"] |= truncated
         return truncated
 
     def _reset_ended(self, ended: NDArray) -> dict[str, Any]:

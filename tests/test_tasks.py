@@ -262,7 +262,7 @@ def test_a_wrong_keyword_gets_the_list_of_right_ones(env_id):
 
 
 def test_a_task_s_own_keywords_are_among_the_right_ones():
-    with pytest.raises(TypeError, match="there are: grippers, shapes, slip_force, rows, side, fabric"):
+    with pytest.raises(TypeError, match="there are: grippers, shapes, slip_force, action_mode, rows, side, fabric"):
         gym.make("clothgym:ClothDrapeGripper-v0", gripers=1)
     with pytest.raises(TypeError, match="there are: threshold, cost_penalty, strain_limit, integrator, rows, side, fabric"):
         gym.make_vec("clothgym:ClothStrain-v0", num_envs=2, treshold=1)

@@ -1,0 +1,114 @@
+"""``action_mode="pick_place"``: an action says where each gripper picks, where it places, and how high it lifts on the way.
+
+One such action is ``STEPS`` control steps in every environment, however long its way is: the motion is spread evenly over them.
+So a batch stays in step, and no environment waits for another.  When the time is up the sheet settles in steps of its own, whose
+actions are ignored.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.episode import length
+
+NUMBERS = 5  # of an action for each gripper: pick x, y; place x, y; lift
+STEPS = 60  # control steps of an action
+FINGERS, RESTING = 4, 8  # of these the fingers take to close, and to open; and that the sheet rests at the end
+MOVING = STEPS - 2 * FINGERS - RESTING
+RETREAT, LEAVING = 0.15, 4  # how far the grippers rise at the end, in sides, and in how many steps
+BESIDE = 0.03  # cloth within this distance of the place, seen from above, is picked at its top [m]
+LOWEST = 0.012  # height of a tip that picks [m]
+
+
+class Path(NamedTuple):
+    """Ways of the grippers, each (num_envs, grippers, ...).
+
+    start, pick, place: [m], (..., 3).  lift: of the arc from pick to place [m].  approach: control steps until the fingers close.
+    """
+
+    start: NDArray
+    pick: NDArray
+    place: NDArray
+    lift: NDArray
+    approach: NDArray
+
+
+def path_of(actions: NDArray, tips: NDArray, cloth: NDArray, half: float, side: float) -> Path:
+    """What an action asks for.
+
+    actions: within [-1, 1], (num_envs, grippers, NUMBERS).  tips: of the grippers [m], (num_envs, grippers, 3).
+    cloth: its particles [m], (num_envs, particles, 3).  half: of the square about the origin in which they pick and place [m].
+    """
+    low = np.full((*tips.shape[:2], 1), LOWEST)
+    pick, place = (np.concatenate([half * actions[..., i : i + 2], low], axis=2) for i in (0, 2))
+    lift = (actions[..., 4] + 1) / 2 * side
+    # a tip goes to the top of what lies there, and comes down to the floor at the place
+    across = cloth[:, None, :, :2] - pick[:, :, None, :2]
+    near = across[..., 0] ** 2 + across[..., 1] ** 2 <= BESIDE**2
+    tops = np.where(near, cloth[:, None, :, 2], 0).max(axis=2)
+    pick[..., 2] = np.maximum(tops, LOWEST)
+    # the way to the place, an arc, has as much of the time as of the length; both ways have some of it
+    to_pick, to_place = length(pick - tips), length(place - pick) + 2 * lift
+    share = to_pick / np.maximum(to_pick + to_place, 1e-9)
+    approach = np.clip(np.rint(share * (MOVING - LEAVING)), 4, MOVING - LEAVING - 4).astype(np.int64)
+    return Path(tips, pick, place, lift, approach)
+
+
+def wanted_at(path: Path, step: int, side: float) -> tuple[NDArray, NDArray]:
+    """Where the tips are to be after control step ``step`` of an action [m], (num_envs, grippers, 3), and whether fingers open,
+    (num_envs, grippers)."""
+    done = step + 1
+    carrying = MOVING - LEAVING - path.approach
+    # to the pick; then, when the fingers have closed, along the arc; then, when they have opened, up
+    first = np.minimum(done / path.approach, 1.0)
+    second = _eased(np.clip((done - path.approach - FINGERS) / carrying, 0, 1))
+    third = np.clip((done - (MOVING - LEAVING) - 2 * FINGERS) / LEAVING, 0, 1)
+    tips = np.where((first < 1)[..., None], path.start + first[..., None] * (path.pick - path.start), path.pick)
+    tips += second[..., None] * (path.place - path.pick)
+    tips[..., 2] += 4 * path.lift * second * (1 - second) + third * RETREAT * side
+    opened = (done <= path.approach) | (done > MOVING - LEAVING + FINGERS)
+    return tips, opened
+
+
+def _eased(share: NDArray) -> NDArray:
+    """From 0 to 1 with no speed at either end: a polynomial, for its bits do not depend on a library."""
+    return share * share * (3 - 2 * share)
+
+
+def perform(task: Any, actions: NDArray) -> None:
+    """One action of a batch: ``STEPS`` control steps, whose rewards are added; what ended on the way keeps the info of its end.
+
+    task: a ``GripperTask``.  actions: (num_envs, numbers), finite.
+    """
+    grippers, side = task.num_attachments, task.physics.side
+    limited = np.clip(actions.reshape(task.num_envs, grippers, NUMBERS), -1, 1)
+    tips, cloth = task.simulation.grippers.positions.astype(np.float64), task.simulation.positions.astype(np.float64)
+    path = path_of(limited, tips, cloth, task.workspace * side, side)
+    reach = float(task.rules["reach"][0])
+    outcome, terms, info = task.outcome.copy(), task.terms.copy(), task.info.copy()
+    begun = ~task.episode["over"]
+    for name in ("reward", "terminated", "failure"):
+        outcome[name] = 0
+    terms[...] = np.zeros((), terms.dtype)
+    velocities = np.zeros((task.num_envs, grippers, 4))
+    for step in range(STEPS):
+        wanted, opened = wanted_at(path, step, side)
+        velocities[..., :3] = (wanted - task.episode["targets"]) / reach
+        velocities[..., 3] = np.where(opened, 1.0, -1.0)
+        running = ~task.episode["over"]
+        task.move(velocities.reshape(task.num_envs, -1))
+        for name in ("reward", "terminated", "failure"):
+            outcome[name][running] += task.outcome[name][running]
+        for name in terms.dtype.names or ():
+            terms[name][running] += task.terms[name][running]
+        info[running] = task.info[running]
+        if task.episode["over"].all():
+            break
+    # environments that were over before it show what a step of theirs shows
+    info[~begun] = task.info[~begun]
+    for name in ("reward", "terminated", "failure"):
+        task.outcome[name] = outcome[name]
+    task.terms, task.info = terms, info
