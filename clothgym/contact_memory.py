@@ -100,6 +100,16 @@ def begin(memory: Any, block: NDArray, lane: NDArray, x: NDArray) -> None:
             array[block, lane] = kept.start
 
 
+def forget_impulses(memory: Any, block: int, lane: int, freed: NDArray) -> None:
+    """Let the contacts of a lane begin without impulses, if any that has one joins a particle that is ``freed``, (particles,)."""
+    count = memory.contacts[block, lane]
+    particles, impulses = memory.particles[block, lane, :count], memory.impulses[block, lane, :count]
+    if np.any(freed[particles].any(axis=1) & (impulses != 0).any(axis=1)):
+        impulses[:] = 0
+        memory.pressed[block, :, :, lane] = 0
+        memory.waited[block, lane] = memory.span[block, lane] = 0
+
+
 def blank(num_envs: int, particles: int) -> dict[str, NDArray]:
     """What a state holds of a batch whose queries are all due; without particles where there is no self-collision."""
     return {name: np.full(_public_shape(kept, num_envs, particles, 0), kept.start, kept.dtype) for name, kept in SAVED.items()}

@@ -28,9 +28,13 @@ ENVIRONMENTS = {
         "ClothStrain",
         "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
     ),
+    "ClothFold-v0": (
+        "ClothFold",
+        "Fold a sheet that lies on the floor in half, along its diagonal, or twice.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
-LONGEST = {"ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150}
+LONGEST = {"ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFold-v0": 210}
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, checks, guards, integrators
-from clothgym.attachments import FREE, Attachments, Gripper, Grippers
+from clothgym.attachments import Attachments, Gripper, Grippers
 from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
@@ -191,14 +191,14 @@ class Simulation(Observed):
         outcome = Outcome(self._limited, self._diverged)
 
         def work(first: int, last: int) -> None:
-            held, blocks = None, slice(first, last)
+            blocks = slice(first, last)
             if self._contact.strict:
                 memory = self._contact.sheet.memory
                 self._attachments.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
-                held = self._attachments.holder[blocks].copy() if len(self.grippers) and memory.behind[blocks].any() else None
+            held = self._attachments.holder[blocks].copy() if len(self.grippers) else None
             self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
             if held is not None:
-                self._contact.forgive(self._attachments.holder[blocks] != held, blocks)
+                self._contact.let_go(held, self._attachments.holder[blocks], blocks)
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
         for _ in range(n):
@@ -207,8 +207,9 @@ class Simulation(Observed):
             if self.colliders:
                 self._solids.end_step()
             if self._attachments.can_slip:
+                held = self._attachments.holder.copy()
                 self._attachments.slip(self._pulls(), self._w, self._free_w)
-                self._forgive_lag()
+                self._contact.let_go(held, self._attachments.holder)
             self._steps += 1
             self.turn.unfinished = ()
             self._contact.warn(self._steps)
@@ -258,8 +259,9 @@ class Simulation(Observed):
     def release(self, envs: ArrayLike | None = None, anchors: ArrayLike | None = None) -> None:
         """Let go: pairs of environment and anchor (its place in ``anchors``), or all anchors, or all environments."""
         block, lane, which = self._pairs(envs, anchors)
+        held = self._attachments.holder.copy()
         self._attachments.let_go(block, which, lane)
-        self._forgive_lag()
+        self._contact.let_go(held, self._attachments.holder)
         self._apply_masses(block, lane)
 
     @exclusive
@@ -268,11 +270,6 @@ class Simulation(Observed):
         block, lane, which = self._pairs(envs, anchors)
         self._attachments.hold(block, which, lane, self._x)
         self._apply_masses(block, lane)
-
-    def _forgive_lag(self) -> None:
-        """What has been let go no longer lags behind an attachment."""
-        if self._contact.strict and self._contact.sheet.memory.behind.any():
-            self._contact.forgive(self._attachments.holder == FREE)
 
     def _pairs(self, envs: ArrayLike | None, anchors: ArrayLike | None) -> tuple[NDArray, NDArray, NDArray]:
         """Block, lane and anchor of each pair."""

@@ -203,11 +203,22 @@ class SelfCollision:
         """How many particles contact remembers."""
         return 0 if self.options is None else self.sheet.memory.bounds.shape[1]
 
-    def forgive(self, who: NDArray, blocks: slice = slice(None)) -> None:
-        """Take from particles, (blocks, particles, lanes), their lag: it ends with the attachment that they lagged behind."""
-        memory = self.sheet.memory
-        np.moveaxis(memory.lag[blocks], 1, 3)[who] = 0
-        memory.behind[blocks] = contact_memory.largest_lag(memory.lag[blocks])
+    def let_go(self, held: NDArray, holder: NDArray, blocks: slice = slice(None)) -> None:
+        """Forget what contacts know of particles that are no longer held by what held them, (blocks, particles, lanes) each.
+
+        Their lag ends with the attachment that they lagged behind.  And impulses that have borne what an attachment pressed would
+        throw the pile up once it is free: where a particle that is free now takes part in a contact with an impulse, the contacts
+        of its sheet begin without any.
+        """
+        if self.options is None:
+            return
+        memory, freed = self.sheet.memory, (held >= 0) & (holder < 0)
+        if memory.behind[blocks].any():
+            np.moveaxis(memory.lag[blocks], 1, 3)[holder != held] = 0
+            memory.behind[blocks] = contact_memory.largest_lag(memory.lag[blocks])
+        first = blocks.indices(len(memory.contacts))[0]
+        for block, lane in np.argwhere(freed.any(axis=1)).tolist():
+            contact_memory.forget_impulses(memory, first + block, lane, freed[block, :, lane])
 
     def warn(self, steps: NDArray) -> None:
         """Tell once of environments whose sheet has gone too far to be certified; steps: since their reset, (num_envs,)."""

@@ -1,0 +1,390 @@
+"""ClothFold-v0: fold a sheet that lies on the floor in half, along its diagonal, or twice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import apart, inlined, kernel
+from clothgym.checks import one_of
+from clothgym.envs.coverage import FINE_CELLS, shared_area
+from clothgym.envs.definition import Observation
+from clothgym.envs.episode import FINE, Fields, length
+from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
+from clothgym.envs.measures import SPEED2, distance
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.targets import ON_FLOOR
+from clothgym.envs.vector import ClothVectorEnv
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera
+
+FOLDS = ("half", "diagonal", "quarter")
+ACTING_STEPS = {"half": 80, "diagonal": 90, "quarter": 150}
+# largest distance of a point of the sheet from its place and mean height over the floor, in sides; rms speed [m/s]
+ENOUGH_FOLDED, ENOUGH_FLAT, ENOUGH_REST = {"half": 0.1, "diagonal": 0.1, "quarter": 0.15}, 0.05, 0.02
+SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
+PICKING = 0.3  # share of the potential that is for taking hold
+PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
+
+# the scripted expert: height of its arc over that of a half circle; how near the end it opens, and how near points have met, in
+# sides; its share of the speed limit; how far it looks ahead on the arc, and the arc's lowest height in each fold [m]: what is
+# pressed on the layers below jumps when it is let go
+EXPERT_ARC, EXPERT_NEAR, EXPERT_MET, EXPERT_SPEED = 0.9, 0.03, 0.1, 0.8
+EXPERT_STEP, EXPERT_LOW = 0.03, (0.015, 0.018)
+EXPERT_DONE = 0.9  # best score of an episode from which on it lets well alone
+
+
+# --- the ideal folds ----------------------------------------------------------------------------------------------------------
+
+
+def ideals(fold: str, points: NDArray) -> NDArray[np.float64]:
+    """Where the points of a sheet are in the ideal folds of that name, thin and flat [m], (ways, points, 2).
+
+    points: in the flat sheet, about its center [m], (points, 2).  ways: over which of four edges, corners or both it is folded.
+    """
+    u, v = points[:, 0], points[:, 1]
+    if fold == "half":
+        ways = [(u, -abs(v)), (u, abs(v)), (-abs(u), v), (abs(u), v)]
+    elif fold == "diagonal":
+        least, most = np.minimum(u, v), np.maximum(u, v)
+        over = np.where(u + v > 0, (-v, -u), (u, v))
+        ways = [tuple(over), (most, least), (least, most), tuple(np.where(u + v < 0, (-v, -u), (u, v)))]
+    else:
+        ways = [(a * abs(u), b * abs(v)) for a in (-1, 1) for b in (-1, 1)]
+    return np.array([np.stack(way, axis=1) for way in ways])
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@kernel
+def aligned(x, share, ideal, placed):
+    """Lay an ideal fold where it is nearest to a sheet, by a rotation and a translation of the floor; returns the mean distance.
+
+    The motion minimizes the mean squared distance, in closed form in the plane: with both centered, the rotation's cosine and sine
+    are as the sums of dot and cross products (Umeyama 1991, for two dimensions and without a scale).
+    x: of the sheet [m], (3, particles).  share: of the area, by particle.  ideal: (particles, 2).  placed: out, (3, particles).
+    """
+    # both centers
+    cx = cy = px = py = 0.0
+    for p in range(x.shape[1]):
+        cx += share[p] * x[0, p]
+        cy += share[p] * x[1, p]
+        px += share[p] * ideal[p, 0]
+        py += share[p] * ideal[p, 1]
+    # the rotation
+    dot, cross = 0.0, 0.0
+    for p in range(x.shape[1]):
+        a, b = ideal[p, 0] - px, ideal[p, 1] - py
+        u, v = x[0, p] - cx, x[1, p] - cy
+        dot += share[p] * (a * u + b * v)
+        cross += share[p] * (a * v - b * u)
+    size = max(np.sqrt(dot * dot + cross * cross), 1e-30)
+    c, s = dot / size, cross / size
+    # the ideal in its place, and how far the sheet's points are from it, seen from above
+    total = 0.0
+    for p in range(x.shape[1]):
+        a, b = ideal[p, 0] - px, ideal[p, 1] - py
+        placed[0, p], placed[1, p], placed[2, p] = cx + c * a - s * b, cy + s * a + c * b, 0.0
+        total += share[p] * np.sqrt((x[0, p] - placed[0, p]) ** 2 + (x[1, p] - placed[1, p]) ** 2)
+    return total
+
+
+@kernel
+def nearest_fold(x, share, folds, placed):
+    """The least mean distance from the ideal folds [m], and which of them has it; ``placed`` is that one, (3, particles)."""
+    best, way = np.inf, 0
+    for k in range(folds.shape[0]):
+        error = aligned(x, share, folds[k], placed)
+        if error < best:
+            best, way = error, k
+    aligned(x, share, folds[way], placed)
+    return best, way
+
+
+@apart
+def fold_errors(x, share, folds):
+    """How far a sheet is from the nearest ideal fold, seen from above: on the average and at most; and its mean height [m]."""
+    placed = np.empty(x.shape, np.float64)
+    error, _ = nearest_fold(x, share, folds, placed)
+    worst, height = 0.0, 0.0
+    for p in range(x.shape[1]):
+        worst = max(worst, (x[0, p] - placed[0, p]) ** 2 + (x[1, p] - placed[1, p]) ** 2)
+        height += share[p] * x[2, p]
+    return error, np.sqrt(worst), height
+
+
+@apart
+def overlap(x, share, folds, triangles, cell):
+    """Area of the floor below a sheet and the nearest ideal fold over that below either; cell: of the grid [m]."""
+    placed = np.empty(x.shape, np.float64)
+    nearest_fold(x, share, folds, placed)
+    both, either = shared_area(x, placed, triangles, cell)
+    return both / either
+
+
+@inlined
+def _measure(own, rules, sheet):
+    """How far the sheet is from its nearest ideal fold, in sides."""
+    measure_grips(own, rules, sheet)
+    error, worst, height = fold_errors(sheet.x, sheet.mesh.share, rules.folds)
+    own.error, own.worst, own.height = error / rules.side, worst / rules.side, height / rules.side
+
+
+@inlined
+def _folded(own, rules):
+    """How far the fold is along, in [0, 1]: 0 for the flat sheet, 1 for the ideal."""
+    return min(max(1 - own.error / rules.unfolded, 0.0), 1.0)
+
+
+@inlined
+def _reached(own, rules):
+    """Whether every point is near its place, and the sheet flat."""
+    return own.worst <= rules.enough and own.height <= ENOUGH_FLAT
+
+
+@inlined
+def _potential(own, rules, sheet):
+    """How the taking hold is along, and the fold."""
+    taken = 0.0
+    for k in range(rules.places.shape[0]):
+        place = rules.places[k]
+        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
+        taken += 1.0 if sheet.holder[place] >= 0 else 0.5 / (1 + away**2)
+    return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * _folded(own, rules)
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write the error of the fold, how it overlaps the ideal and how much at rest it is; returns the normalized performance."""
+    info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, rules.side / FINE_CELLS)
+    info.fold_error_mm = 1000 * own.error * rules.side
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    info.is_success = _reached(own, rules) and info.rms_speed < ENOUGH_REST
+    flat = 1 / (1 + (own.height / ENOUGH_FLAT) ** 4)
+    return _folded(own, rules) * flat / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    """The errors after this step, and whether a success lasts; no reward terms."""
+    info.fold_error, info.fold_error_max, info.height = own.error, own.worst, own.height
+    follow(own, info, _folded(own, rules), failure == FINE and _reached(own, rules), running, failure)
+    return 0.0
+
+
+@inlined
+def _observe(own, rules, sheet, seen):
+    """The grippers, and the ways from their tips to the corners that they are meant to take first."""
+    observe_grippers(own, rules, sheet, seen)
+    for k in range(rules.places.shape[0]):
+        for c in range(3):
+            seen.ways[k, c] = (sheet.x[c, rules.places[k]] - sheet.attachments[k, c]) * (10 / rules.side)
+
+
+class FoldTask(ManipulationTask):
+    """The task of ``ClothFold-v0``, see ``ClothFoldEnv``.
+
+    Args:
+        fold: one of ``FOLDS``.
+    """
+
+    kernels = Kernels(
+        _potential,
+        _evaluate,
+        _observe,
+        measure=_measure,
+        account=_account,
+        fingers=close_or_open,
+        stop=stop_at_floor,
+    )
+    settling_steps = 60
+    observations = (
+        *ManipulationTask.observations,
+        Observation("ways", "from each tip to the corner that it is meant to take first", (2, 3), "L/10", 40.0),
+    )
+    points_relative_to = "where the sheet's center lay"
+    evaluation = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
+    accounts: ClassVar[Fields] = (
+        ("fold_error", float), ("fold_error_max", float), ("height", float), *ManipulationTask.accounts,
+    )  # fmt: skip
+    arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
+    away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
+    turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
+
+    def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:
+        one_of("fold", fold, *FOLDS)
+        self.fold, self.acting_steps = fold, ACTING_STEPS[fold]  # type: ignore[misc]
+        super().__init__(num_envs, **kwargs)
+
+    @property
+    def stages(self) -> list[list[tuple[int, int]]]:
+        """For each fold after the other: the particle that each gripper takes, and the one that it brings it to."""
+        lower_left, lower_right, left, right = self.physics.mesh.corners
+        if self.fold == "diagonal":
+            return [[(right, lower_left)]]
+        first = [(left, lower_left), (right, lower_right)]
+        if self.fold == "half":
+            return [first]
+        # the ends of the crease and of the edges that lie together
+        rows, columns = self.physics.mesh.grid_shape
+        middle = (rows // 2) * columns
+        return [first, [(middle, middle + columns - 1), (lower_left, lower_right)]]
+
+    def remembers(self) -> Fields:
+        # how the sheet was turned, and the errors now
+        return [*super().remembers(), ("turn", float, 2), ("error", float), ("worst", float), ("height", float)]
+
+    def constants(self) -> dict[str, Any]:
+        mesh = self.physics.mesh
+        flat = mesh.rest_positions[:, :2] - mesh.rest_positions[:, :2].mean(axis=0)
+        folds, share = ideals(self.fold, flat), (mesh.area / mesh.area.sum()).astype(np.float32)
+        x = np.ascontiguousarray(np.concatenate([flat, np.zeros((len(flat), 1))], axis=1).T)
+        unfolded, _ = nearest_fold(x, share, folds, np.empty_like(x))
+        places = np.array([taken for taken, _ in self.stages[0]])
+        return {"folds": folds, "unfolded": unfolded / self.physics.side, "places": places, "enough": ENOUGH_FOLDED[self.fold]}
+
+    # --- reset ----------------------------------------------------------------------------------------------------------
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        mesh, side = self.physics.mesh, self.physics.side
+        yaw, (dx, dy) = rng.uniform(-self.turned, self.turned), side * rng.uniform(-self.away, self.away, 2)
+        flat = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
+        c, s = np.cos(yaw), np.sin(yaw)
+        x = np.stack([c * flat[:, 0] - s * flat[:, 1] + dx, s * flat[:, 0] + c * flat[:, 1] + dy, flat[:, 2] + ON_FLOOR], axis=1)
+        self.episode["origin"][env], self.episode["turn"][env] = (dx, dy, 0), (c, s)
+        # both grippers above the edge that they are meant to take first
+        left, right = mesh.corners[2:]
+        away = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
+        self.gripper_starts[env] = x[[left, right]] + side * away
+        return self.uneven(x, rng)
+
+    # --- expert and picture ---------------------------------------------------------------------------------------------
+
+    def expert_actions(self) -> NDArray:
+        """Each corner along an arc onto the one that it is to meet, and then away; one fold after the other.
+
+        Without memory: a fold is done where its particles have met, and are not held apart from each other.
+        """
+        holder, side = self.simulation.grippers.holder, self.physics.side
+        x, tips = self.simulation.positions.astype(np.float64), self.simulation.grippers.positions.astype(np.float64)
+        rest, origin, turn = self.physics.mesh.rest_positions, self.episode["origin"][:, None], self.episode["turn"][:, None]
+        flat = rest - rest.mean(axis=0)
+        # where the sheet's points lay: what lies there now may be dragged along, and cannot be reached
+        across = turn[..., 0] * flat[:, 0] - turn[..., 1] * flat[:, 1], turn[..., 1] * flat[:, 0] + turn[..., 0] * flat[:, 1]
+        began = origin + np.stack([*across, np.zeros_like(across[0])], axis=2)
+        # up and open, but for the grippers of the first fold that is not done
+        move, closed = np.tile([0.0, 0.0, 0.1], (self.num_envs, 2, 1)), np.zeros((self.num_envs, 2), bool)
+        # what has been folded and let go is not taken up again
+        found = (self.episode["best"] > EXPERT_DONE) & ~np.logical_or.reduce(holder >= 0, axis=1)
+        for low, stage in zip(EXPERT_LOW, self.stages):
+            taken, goals = (np.array(part) for part in zip(*stage))
+            count, whole = len(stage), length(rest[taken] - rest[goals])
+            place, tip = x[:, taken], tips[:, :count]
+            met, held = length(x[:, goals] - place) < EXPERT_MET * side, holder[:, taken] >= 0
+            apart = held & (holder[:, goals] < 0)
+            now = ~found & ~(np.logical_and.reduce(met, axis=1) & ~np.logical_or.reduce(apart, axis=1))
+            found |= now
+            # along an arc over the goal: some way on, and as high as the arc is there
+            way = began[:, goals] - tip
+            left = np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2)
+            ahead = np.clip(left - EXPERT_STEP, 0, whole)
+            step = way * np.minimum(1, EXPERT_STEP / np.maximum(left, 1e-9))[..., None]
+            step[..., 2] = EXPERT_ARC * np.sqrt(ahead * (whole - ahead)) + low - tip[..., 2]
+            # those that hold their place wait for the others, at the start and at the end
+            to_place = place - tip
+            all_held = np.logical_and.reduce(held, axis=1, keepdims=True)
+            there = held & (left < EXPERT_NEAR * side) & (tip[..., 2] < low + 0.02)
+            all_there = np.logical_and.reduce(there, axis=1, keepdims=True)
+            going = np.where(all_held[..., None], step, np.where(held[..., None], 0.0, to_place / 2))
+            away = met & ~held
+            move[now, :count] = np.where(away[..., None], (0.0, 0.0, 0.1), going)[now]
+            closed[now, :count] = (((length(to_place) < REACH / 2) & ~away | held) & ~all_there)[now]
+        move /= self.physics.time_step * self.physics.attachment_speed
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
+        grip = np.where(closed, -1.0, 1.0)[..., None]
+        return np.concatenate([move, grip], axis=2).reshape(self.num_envs, -1)
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera  # imported here: training draws nothing
+
+        return Camera(eye=(0.9, -1.35, 1.05), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
+
+
+class ClothFoldEnv(ClothEnv):
+    """Fold a sheet that lies on the floor in half, along its diagonal, or twice.
+
+    ## Description
+    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    A sheet of 0.6 m lies flat on the floor, turned and aside.  Two grippers hover above the corners of one edge; they are those of
+    ``ClothDrapeGripper-v0``.  ``fold`` says how it is to be folded: in half, over the diagonal, or in half twice.  When the time is
+    up the fingers open, and the sheet settles for two seconds, in which actions are ignored; then it is evaluated.  To hold the
+    fold in its place until then is as good as to let go.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.7 times ``1 - e/e0``, see below, plus 0.3 times the mean over the corners
+    that are meant to be taken first of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At
+    the end it is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    Seen from above, each point of the sheet has a place in the ideal fold, which is thin and flat.  The ideal lies where it is
+    nearest: over any of the four edges or corners, and moved and turned on the floor as a whole, so that the mean squared distance
+    is least (Umeyama 1991).  ``info["fold_error"]`` is the mean distance e of the sheet's points from their places, by area, in
+    sides, ``fold_error_max`` the largest, ``height`` the mean height over the floor, all three after every step.  At the end there
+    are also ``fold_error_mm``, in millimeters, ``overlap``, the area of the floor below the sheet and the ideal over that below
+    either, and ``rms_speed`` in m/s.
+
+    Success: ``fold_error_max`` at most 0.1 (0.15 for the quarter, of four layers), ``height`` at most 0.05, and ``rms_speed`` below
+    0.02 m/s.  ``info["best"]`` is the episode's best ``1 - e/e0``, ``first_success`` the first step with both distances small
+    enough, or -1, and ``success_held`` says whether they have been from then on.
+
+    ``info["normalized_performance"]`` is ``(1 - e/e0) / (1 + (height/0.05)^4) / (1 + (rms_speed/0.1)^2)``, with the error e0 of the
+    flat sheet: 0 for doing nothing, 1 for the ideal.
+
+    ## Starting State
+    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
+    up to 0.1 L beside and 0.2 to 0.35 L above their corners.
+
+    ## Episode End
+    Terminated when evaluated, after 80 steps ("half"), 90 ("diagonal") or 150 ("quarter") and 60 of settling; or at a failure,
+    which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation goes
+    out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FoldTask
+
+
+class ClothFoldVectorEnv(ClothVectorEnv):
+    """``ClothFold-v0`` as a batch, see ``ClothFoldEnv``."""
+
+    task_class = FoldTask
