@@ -168,7 +168,7 @@ def cells(row: Row) -> dict[str, str]:
     """What a table says of a row, by column; blank where a task has no such number."""
     first, steps = row.get("first_success"), row.get("model_steps")
     # of a run its folder's name
-    name = Path(row["policy"]).name
+    name = ", ".join([Path(row["policy"]).name, *([row["about"]] if "about" in row else [])])
     return {
         "policy": " ".join([name, *(f"{key}={value}" for key, value in row["env_kwargs"].items())]),
         "episodes": str(row["episodes"]),
