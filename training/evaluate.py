@@ -1,6 +1,7 @@
 """Score policies on held-out episodes: one table for noop, random, the scripted expert and what was learned.
 
     python training/evaluate.py --env ClothDrape-v0 --policy noop random expert runs/ClothDrape-v0_0 --episodes 500
+    python training/evaluate.py --suite --json runs/suite.json      # every environment; stopped and called again, it goes on
 
 Episode ``i`` is the one that seed ``seed + i`` gives, for every policy.  Training never uses seeds of a million or more.
 """
@@ -8,32 +9,31 @@ Episode ``i`` is the one that seed ``seed + i`` gives, for every policy.  Traini
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium as gym
-import numpy as np
 import policies
+import suite
 import tyro
 from endings import refused, stopped
-from numpy.typing import NDArray
-from tqdm import tqdm
+from scoring import HELD_OUT, run_episodes, score
 
 from clothgym import files
-from clothgym.registration import checked_id
+from clothgym.registration import ENVIRONMENTS, checked_id
 
-HELD_OUT = 1_000_000
-BATCH = 250
+__all__ = ["HELD_OUT", "run_episodes", "score"]
 
 
 @dataclass
 class Args:
     """What to score, and on what."""
 
-    env: str = "ClothDrape-v0"
-    """Id of the environment."""
+    env: tuple[str, ...] = ()
+    """Ids of the environments; several make a suite.  By default ClothDrape-v0, with --suite all of them."""
+    suite: bool = False
+    """Every policy on every id that it is for: one table, and one JSON file that keeps the rows that are finished."""
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,careless,PATH} ...")] = (
         "noop",
         "random",
@@ -47,85 +47,32 @@ class Args:
     env_kwargs: str = "{}"
     """Keyword arguments of the environment, as JSON: '{"substeps": 100}'; a run's own otherwise."""
     json: Path | None = None
-    """Where to write the scores, if anywhere."""
+    """Where to write the scores, if anywhere; a suite goes on with those that are there."""
+    anew: bool = False
+    """Of a suite: score also what is in the file already."""
+    threads: int | None = None
+    """Threads of the environments, which change no score; all processors by default."""
 
     def __post_init__(self) -> None:
         """Everything is checked here, before torch is imported; errors look like those of a wrong flag."""
-        self.env = checked_id(self.env)
+        self.suite = self.suite or len(self.env) > 1
+        self.env = tuple(checked_id(one) for one in self.env or (ENVIRONMENTS if self.suite else ("ClothDrape-v0",)))
         if self.episodes < 1:
             raise ValueError(f"--episodes {self.episodes}: must be at least 1")
         if self.seed < 0:
             raise ValueError(f"--seed {self.seed}: must be zero or positive")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"--threads {self.threads}: must be at least 1")
         if self.json is not None and self.json.is_dir():
             raise ValueError(f"--json {self.json}: is a folder, name a file in it")
-        policies.parsed_kwargs(self.env_kwargs)
+        kwargs = policies.parsed_kwargs(self.env_kwargs)
+        if self.suite:
+            suite.rows_of(self.env, self.policy, self.seed, kwargs)
+            return
+        if self.anew:
+            raise ValueError("--anew: is for --suite; without it everything is scored anew")
         for name in self.policy:
-            policies.checked(name, self.env)
-
-
-def run_episodes(
-    env_id: str, policy: policies.Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any
-) -> dict[str, NDArray]:
-    """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
-    env = gym.make_vec(env_id, num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
-    batches = []
-    with tqdm(total=len(seeds), unit="episode", disable=None if progress else True, leave=False) as bar:
-        for first in range(0, len(seeds), env.num_envs):
-            wanted = seeds[first : first + env.num_envs]
-            # the last batch may be short: its spare environments run too, and are not counted
-            padded = wanted + wanted[-1:] * (env.num_envs - len(wanted))
-            episodes = _run_batch(env, policy, padded, bar, len(wanted))
-            batches.append({key: value[: len(wanted)] for key, value in episodes.items()})
-    env.close()
-    return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
-
-
-def _run_batch(env: Any, policy: policies.Policy, seeds: list[int], bar: Any, count: int) -> dict[str, NDArray]:
-    observations, _ = env.reset(seed=seeds)
-    running = np.ones(env.num_envs, bool)
-    total, length = np.zeros(env.num_envs), np.zeros(env.num_envs, int)
-    last: dict[str, NDArray] = {}
-    while running.any():
-        observations, reward, terminated, truncated, info = env.step(policy(env, observations))
-        total += reward * running
-        length += running
-        done = running & (terminated | truncated)
-        for key, value in info.items():
-            if not key.startswith("_") and isinstance(value, np.ndarray):
-                last[key] = np.where(done, value, last.get(key, value))
-        running &= ~done
-        bar.update(int(done[:count].sum()))
-    return last | {"return": total, "length": length}
-
-
-def wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
-    """95 % confidence interval of a proportion (Wilson 1927)."""
-    p = successes / trials
-    middle = (p + z * z / (2 * trials)) / (1 + z * z / trials)
-    half = z / (1 + z * z / trials) * math.sqrt(p * (1 - p) / trials + z * z / (4 * trials * trials))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
-
-
-def score(episodes: dict[str, NDArray]) -> dict[str, Any]:
-    """The row of the table: rates and means with their 95 % intervals, and the cumulated failures."""
-    from clothgym.envs.episode import FAILURES  # imported here: flags are checked before numba is loaded
-
-    count = len(episodes["return"])
-    successes = int(episodes["is_success"].sum())
-    row: dict[str, Any] = {"episodes": count, "success_rate": successes / count, "success_rate_ci95": wilson(successes, count)}
-    for key in ("normalized_performance", "return"):
-        values = episodes[key].astype(float)
-        half = 1.96 * values.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
-        row[key], row[f"{key}_ci95"] = values.mean(), (values.mean() - half, values.mean() + half)
-    if "episode_cost" in episodes:
-        costs = episodes["episode_cost"].astype(float)
-        half = 1.96 * costs.std(ddof=1) / math.sqrt(count) if count > 1 else math.nan
-        row["cost"], row["cost_ci95"] = costs.mean(), (costs.mean() - half, costs.mean() + half)
-        row["safe_success_rate"] = float(episodes["is_safe_success"].mean())
-    for code, failure in enumerate(FAILURES[1:], 1):
-        row[failure] = int((episodes["failure"] == code).sum())
-    row["mean_length"] = float(episodes["length"].mean())
-    return row
+            policies.checked(name, self.env[0])
 
 
 def table(scores: dict[str, dict[str, Any]]) -> str:
@@ -155,26 +102,49 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def main(args: Args) -> None:
-    scores = {}
+    (score_suite if args.suite else score_one)(args)
+
+
+def score_suite(args: Args) -> None:
+    """All policies on all environments that they are for."""
+    wanted = suite.rows_of(args.env, args.policy, args.seed, policies.parsed_kwargs(args.env_kwargs))
+    rows = suite.run(wanted, args.episodes, args.json, args.anew, args.threads, say=lambda text: print(text, flush=True))
+    print(f"{args.episodes} episodes from seed {args.seed}\n{suite.table(rows)}")
+    if args.json is not None:
+        print(f"written to {args.json}")
+
+
+def score_one(args: Args) -> None:
+    """Policies on one environment, with the same arguments."""
+    scores, env_id = {}, args.env[0]
     # a run is scored on the environment that it was trained on, and so are the references beside it
     kwargs: dict[str, Any] = {}
     for name in args.policy:
         kwargs |= policies.env_kwargs(name)
     kwargs |= policies.parsed_kwargs(args.env_kwargs)
+    threads = {} if args.threads is None else {"threads": args.threads}
     # what the environment or a checkpoint does not take is reported before anything runs
     with refused():
-        chosen = {name: policies.named(name, args.env, args.seed) for name in args.policy}
-        gym.make_vec(args.env, num_envs=1, **kwargs).close()
+        chosen = {name: policies.named(name, env_id, args.seed) for name in args.policy}
+        gym.make_vec(env_id, num_envs=1, **kwargs).close()
     for name, policy in chosen.items():
-        episodes = run_episodes(args.env, policy, list(range(args.seed, args.seed + args.episodes)), **kwargs)
-        scores[name] = {"policy": name, "env": args.env, "seed": args.seed} | score(episodes)
+        seeds = list(range(args.seed, args.seed + args.episodes))
+        episodes = run_episodes(env_id, policy, seeds, **(kwargs | threads))
+        scores[name] = {"policy": name, "env": env_id, "seed": args.seed} | score(episodes)
     given = f", {json.dumps(kwargs)}" if kwargs else ""
-    print(f"{args.env}{given}, episodes from seed {args.seed}\n{table(scores)}")
+    print(f"{env_id}{given}, episodes from seed {args.seed}\n{table(scores)}")
     if args.json is not None:
         write_json(args.json, scores[args.policy[0]] if len(scores) == 1 else scores)
         print(f"written to {args.json}")
 
 
+def _how_to_go_on(args: Args) -> str:
+    if not args.suite:
+        return ""
+    return f"; what is finished is in {args.json}, the same command goes on" if args.json else "; without --json nothing is kept"
+
+
 if __name__ == "__main__":
-    with stopped():
-        main(tyro.cli(Args))
+    given = tyro.cli(Args)
+    with stopped(lambda: _how_to_go_on(given)):
+        main(given)

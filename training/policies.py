@@ -72,6 +72,23 @@ def checked(name: str, env_id: str) -> None:
             raise ValueError(str(error)) from error
 
 
+def is_for(name: str, env_id: str) -> bool:
+    """Whether a policy can act in an environment: a run in that which it was trained on.
+
+    Raises:
+        ValueError: no such policy, or a checkpoint of another version.
+    """
+    if name == "careless":
+        return env_id == "ClothStrain-v0"
+    if name in ACTORS:
+        return True
+    actor_named(name, "careless")
+    try:
+        return read_config(Path(name))["env"] == env_id
+    except OSError as error:
+        raise ValueError(str(error)) from error
+
+
 def env_kwargs(name: str) -> dict[str, Any]:
     """Keyword arguments of the environment that a learned policy was trained on; none for the others."""
     return {} if name in (*ACTORS, "careless") else dict(read_config(Path(name))["env_kwargs"])
