@@ -111,6 +111,9 @@ def test_a_budget_of_model_steps_is_kept(planner):
     result = plan.episode(made, HELD_OUT)
     assert result["model_steps"] == 12 * 2 * 4 * 4 + 12 * 4 * 4 <= 600
     assert result["length"] == 40 and result["mispredicted"] == 0
+    # what was done, done again, has the same return
+    (again,) = returns_of(lambda env, step: made.taken[step], [HELD_OUT])
+    assert again == result["return"]
 
 
 def test_it_goes_on_with_the_episodes_that_are_in_the_file(scripts, tmp_path, monkeypatch, capsys):
@@ -129,8 +132,9 @@ def test_it_goes_on_with_the_episodes_that_are_in_the_file(scripts, tmp_path, mo
     timeless = [{**row, "seconds": 0, "by_episode": [{**one, "seconds": 0} for one in row["by_episode"]]} for (row,) in rows]
     assert timeless[0] == timeless[1]
     assert "cem, 12 x 2, all actions of 4 steps" in capsys.readouterr().out
-    # other settings are another row
-    plan.main(plan.Args(**(args | {"iterations": 1}), episodes=1))
+    # other settings are another row; its film
+    plan.main(plan.Args(**(args | {"iterations": 1}), episodes=1, film=tmp_path / "film.gif"))
+    assert (tmp_path / "film.gif").read_bytes()[:3] == b"GIF" and "± nan" not in capsys.readouterr().out
     assert [row["episodes"] for row in json.loads(args["json"].read_text())["rows"]] == [3, 1]
 
 

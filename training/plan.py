@@ -73,6 +73,9 @@ class Args:
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None
     """File of a suite's scores to put the row into, after each episode; it goes on with those that are there."""
 
+    film: Path | None = None
+    """Film of the first four episodes that this call plans, a .gif or .mp4."""
+
     def __post_init__(self) -> None:
         """Everything is checked here, before numba is loaded; errors look like those of a wrong flag."""
         self.env = checked_id(self.env)
@@ -88,8 +91,9 @@ class Args:
             raise ValueError(f"--spread {self.spread}: must be in (0, 10]")
         if self.minutes is not None and not self.minutes > 0:
             raise ValueError(f"--minutes {self.minutes}: must be greater than 0")
-        if self.json is not None and self.json.is_dir():
-            raise ValueError(f"--json {self.json}: is a folder, name a file in it")
+        for name, path in (("json", self.json), ("film", self.film)):
+            if path is not None and path.is_dir():
+                raise ValueError(f"--{name} {path}: is a folder, name a file in it")
         policies.parsed_kwargs(self.env_kwargs)
 
 
@@ -111,6 +115,7 @@ class Planner:
     Attributes:
         model: the batch in which sequences of actions are tried.
         spent: environment steps simulated for the present episode.
+        taken: actions executed in it, one a step.
     """
 
     def __init__(self, args: Args, env: Any, **env_kwargs: Any) -> None:
@@ -121,6 +126,7 @@ class Planner:
         self.model = made.unwrapped
         self.shape = self.env.single_action_space.shape
         self.spent = 0
+        self.taken: list[NDArray] = []
 
     def horizon(self) -> int:
         """Actions of a plan from now on: as many as asked for, but none after the time to act is up."""
@@ -155,7 +161,7 @@ class Planner:
             if not self.affords():
                 break
             tried = np.clip(mean + spread * rng.standard_normal((args.population, length, *self.shape)), -1, 1)
-            # the middle itself, and the best so far, whose return is known: so a plan is never worse than what it begins with
+            # the middle itself is one of them: so no plan is worse than what it begins with
             tried[0] = mean
             tried = tried.astype(np.float32)
             rewards = self.predicted(copies, tried)
@@ -213,7 +219,7 @@ def episode(planner: Planner, seed: int) -> dict[str, Any]:
     """Plan and act in one episode: what its last step's info says, and what it took."""
     env, args, begun = planner.env, planner.args, time.perf_counter()
     env.reset(seed=[seed])
-    planner.spent = 0
+    planner.spent, planner.taken = 0, []
     total, length, mispredicted, over, info = 0.0, 0, 0, False, {}
     # what is followed, and since how many actions and steps
     plan, age, followed = Plan(np.zeros((0, *planner.shape), np.float32), np.zeros(0)), 0, 0
@@ -231,7 +237,8 @@ def episode(planner: Planner, seed: int) -> dict[str, Any]:
             wanted = acting and args.from_expert
             action = np.clip(env.expert_actions()[0], -1, 1) if wanted else np.zeros(planner.shape)
         for _ in range(args.repeat):
-            _, reward, terminated, truncated, info = env.step(action[None].astype(np.float32))
+            planner.taken.append(action.astype(np.float32))
+            _, reward, terminated, truncated, info = env.step(planner.taken[-1][None])
             if followed < len(plan.rewards):
                 mispredicted += bool(reward[0] != plan.rewards[followed])
             total, length, followed = total + float(reward[0]), length + 1, followed + 1
@@ -253,6 +260,20 @@ def summary(row: suite.Row, results: list[dict[str, Any]]) -> suite.Row:
     return row | whole | sums | {"date": suite.today(), "by_episode": results}
 
 
+def draw(path: Path, env_id: str, env_kwargs: dict[str, Any], seed: int, taken: list[list[NDArray]]) -> None:
+    """A film of episodes side by side, from their actions."""
+    import report  # imported here: it draws, and planning does not
+
+    steps = iter(range(max(map(len, taken))))
+
+    def policy(env: Any, observations: Any) -> NDArray:
+        step = next(steps)
+        return np.stack([actions[min(step, len(actions) - 1)] for actions in taken])
+
+    report.film(path, env_id, policy, env_kwargs, episodes=len(taken), seed=seed)
+    print(f"film: {path}")
+
+
 def main(args: Args) -> None:
     kwargs = policies.parsed_kwargs(args.env_kwargs)
     row: suite.Row = {"env": args.env, "policy": "cem from expert" if args.from_expert else "cem", "seed": args.seed}
@@ -266,16 +287,19 @@ def main(args: Args) -> None:
     if results:
         print(f"{args.env}: {len(results)} episodes are in the file already")
     suite.warm(args.env, policies.noop, kwargs)
-    begun = time.perf_counter()
+    begun, first, taken = time.perf_counter(), args.seed + len(results), []
     for number in range(len(results), args.episodes):
         if args.minutes is not None and time.perf_counter() - begun > 60 * args.minutes:
             print(f"{args.minutes:g} minutes are over: the same command goes on", flush=True)
             break
         results.append(episode(planner, args.seed + number))
         one = results[-1]
+        taken.append(planner.taken)
         scored = f"score {one['normalized_performance']:.3f}, return {one['return']:.3f}"
         print(f"seed {one['seed']}: {scored}, {one['seconds']:.1f} s", flush=True)
         suite.keep(args.json, summary(row, results))
+    if args.film is not None and taken:
+        draw(args.film, args.env, kwargs, first, taken[:4])
     if not results:
         return
     whole = summary(row, results)

@@ -48,10 +48,18 @@ def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references:
     files.write(folder / "learning_curve.png", picture.getvalue())
 
 
-def film(path: Path, env_id: str, policy: policies.Policy, env_kwargs: dict[str, Any], episodes: int = 4, stride: int = 1) -> None:
-    """Some held-out episodes side by side, one after the other's end standing still; every so many frames of them."""
+def film(
+    path: Path,
+    env_id: str,
+    policy: policies.Policy,
+    env_kwargs: dict[str, Any],
+    episodes: int = 4,
+    stride: int = 1,
+    seed: int = evaluate.HELD_OUT,
+) -> None:
+    """Some episodes, by default held-out ones, side by side, each one's end standing still; every so many frames of them."""
     env = gym.make_vec(env_id, num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
-    observations, _ = env.reset(seed=evaluate.HELD_OUT)
+    observations, _ = env.reset(seed=seed)
     frames, running = [], np.ones(episodes, bool)
     still = [np.asarray(frame) for frame in env.render()]
     while running.any():

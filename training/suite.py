@@ -8,6 +8,7 @@ writes to a file.
 from __future__ import annotations
 
 import datetime
+import math
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -148,7 +149,8 @@ def _spread(row: Row, name: str) -> str:
     if row.get(name) is None:
         return ""
     low, high = row[f"{name}_ci95"]
-    return f"{row[name]:.3f} ± {(high - low) / 2:.3f}"
+    # one episode has no interval
+    return f"{row[name]:.3f}" if math.isnan(low) else f"{row[name]:.3f} ± {(high - low) / 2:.3f}"
 
 
 def _rate(row: Row, name: str) -> str:
