@@ -185,13 +185,14 @@ class TaskDefinition:
         return [drawn(one).at(places[k]) for k, one in colliders.items() if not isinstance(one, Plane)]
 
     def markers(self, env: int) -> list[Any]:
-        """What is drawn and casts no shadow: by default the anchors that hold the sheet."""
-        attachments, attached = self.simulation.attachment_positions[env], self.simulation.attached[env]
-        return [(x, HELD) for x, held in zip(attachments, attached) if held]
+        """What is drawn and casts no shadow: by default what ``marks`` says."""
+        from clothgym.render.quick_solids import drawables  # imported here: training draws nothing
+
+        return drawables(self.marks(np.array([env]))[0])
 
     def marks(self, envs: NDArray) -> NDArray:
-        """The same of many environments for pictures that are observed, as rows of ``render.quick_solids``, (len(envs), marks,
-        SOLID_ROWS); a task needs it only if its ``markers`` take too long."""
+        """The same of many environments at once, as rows of ``render.quick_solids``, (len(envs), marks, SOLID_ROWS): by default the
+        anchors that hold the sheet.  A task that gives ``markers`` in its place is drawn more slowly."""
         from clothgym.render.quick_solids import balls  # imported here: training draws nothing
         from clothgym.render.solids import MARKER_RADIUS
 
@@ -199,7 +200,7 @@ class TaskDefinition:
         return balls(self.simulation.attachment_positions[envs, : attached.shape[1]], MARKER_RADIUS, HELD, attached)
 
     def working_area(self) -> tuple[NDArray, float]:
-        """The square that pictures from above show: its middle [m], (2,), and half of its side [m].  By default that of the arena."""
+        """The square that pictures from above show, by default the arena's: its middle [m], (2,), and half of its side [m]."""
         low, high = self.arena()
         return (low[:2] + high[:2]) / 2, float(max(high[:2] - low[:2])) / 2
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, one_of
-from clothgym.collisions import Box
 from clothgym.envs import pick_place
 from clothgym.envs.episode import Fields
 from clothgym.envs.stepping import IN_NUMPY
@@ -117,27 +116,17 @@ class GripperTask(Task):
         """Put the grippers where their episodes begin with them."""
         self.simulation.grippers.place(self.gripper_starts[envs], envs)
 
-    def _drawn_grippers(self, envs: NDArray) -> tuple[NDArray, NDArray, tuple[Any, ...]]:
-        """How grippers look: two fingers and a palm each, boxes; their middles [m], (len(envs), boxes, 3), half sides [m], (boxes,
-        3), and colors."""
+    def marks(self, envs: NDArray) -> NDArray:
+        """The grippers: two fingers and a palm each."""
+        from clothgym.render.quick_solids import boxes  # imported here: training draws nothing
+
         grippers, count = self.simulation.grippers, len(self.physics.grippers)
         spans = np.array([gripper.span for gripper in self.physics.grippers])
         # fingers that hold cloth are drawn closed
-        aside = 0.006 + np.where(grippers.held[envs], 0.0, grippers.openings[envs]) * spans / 2
+        aside = 0.006 + np.where(grippers.held[envs] > 0, 0.0, grippers.openings[envs]) * spans / 2
         middles = np.repeat(grippers.positions[envs].astype(np.float64)[:, :, None], 3, axis=2)
         middles[:, :, 0, 0] -= aside
         middles[:, :, 1, 0] += aside
         middles[..., 2] += (0.025, 0.025, 0.065)
         half_sides = np.tile([(0.005, 0.01, 0.03), (0.005, 0.01, 0.03), (0.04, 0.014, 0.012)], (count, 1))
-        return middles.reshape(len(envs), -1, 3), half_sides, (FINGER, FINGER, PALM) * count
-
-    def markers(self, env: int) -> list[Any]:
-        """The grippers: two fingers and a palm each."""
-        middles, half_sides, colors = self._drawn_grippers(np.array([env]))
-        boxes = zip(middles[0].tolist(), half_sides.tolist(), colors)
-        return [(Box(center=tuple(middle), half_sides=tuple(half)), color) for middle, half, color in boxes]
-
-    def marks(self, envs: NDArray) -> NDArray:
-        from clothgym.render.quick_solids import boxes  # imported here: training draws nothing
-
-        return boxes(*self._drawn_grippers(envs))
+        return boxes(middles.reshape(len(envs), -1, 3), half_sides, (FINGER, FINGER, PALM) * count)

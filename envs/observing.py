@@ -1,7 +1,8 @@
 """What ``reset`` and ``step`` return: the state vector of a task, or pictures of it, which are drawn when they are asked for.
 
-The state vector is ``Task.observation``, part of what ``get_state`` remembers.  Pictures follow from the state: an environment whose
-state has changed is ``stale`` until it is drawn.  One that is over keeps its last picture, and one that diverges the one before.
+The state vector is ``Task.observation``, part of what ``get_state`` remembers.  Pictures follow from the state: an environment
+whose state has changed is ``stale`` until it is drawn.  One that is over keeps its last picture, one that diverges the one before;
+from a restored state it is drawn as its sheet is then, and a sheet that is not finite not at all.
 """
 
 from __future__ import annotations
@@ -202,6 +203,7 @@ class Observer:
     def _solids(self, envs: NDArray) -> NDArray:
         """The simulation's own solids, where they are now, without the thickness that contact keeps."""
         from clothgym.render import quick_solids
+        from clothgym.render.solids import WARM_GRAY
 
         simulation = self.task.simulation
         block, lane = simulation.layout.at(envs)
@@ -210,7 +212,7 @@ class Observer:
         # a point, axes and half sides come first in both
         solids[..., : quick_solids.RADIUS] = own[..., R_POINT : R_HALF + 3]
         solids[..., quick_solids.RADIUS] = np.maximum(own[..., R_RADIUS] - own[..., R_THICKNESS], 0)
-        solids[..., quick_solids.COLOR :] = quick_solids.WARM_GRAY
+        solids[..., quick_solids.COLOR :] = WARM_GRAY
         return solids
 
 
@@ -218,8 +220,8 @@ _NO_COLORS, _NO_NUMBERS = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float3
 
 
 def marks(task: TaskDefinition, envs: NDArray) -> NDArray:
-    """What ``markers`` draws of environments, as rows of ``quick_solids``: by the task's own ``marks``, if ``markers`` is not that of
-    a class derived from the one that defines it."""
+    """What ``markers`` draws of environments, as rows of ``quick_solids``: by the task's own ``marks``, unless a class derived from
+    the one that defines it has given ``markers`` in its place."""
     classes = type(task).__mro__
     first = {name: next(k for k, cls in enumerate(classes) if name in vars(cls)) for name in ("marks", "markers")}
     if first["marks"] <= first["markers"]:

@@ -51,7 +51,8 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
     "obs_mode": (
-        '``"keypoints"``', 'or ``"particles"``, ``"heightmap"``, ``"pointcloud"``, ``"rgb"``, ``"depth"``, ``"rgbd"``, see docs/observations.md',
+        '``"keypoints"``',
+        'or ``"particles"``, ``"heightmap"``, ``"pointcloud"``, ``"rgb"``, ``"depth"``, ``"rgbd"``, see docs/observations.md',
     ),
     "image_size": ("64", "pixels of a picture's side"),
     "camera": (
@@ -60,7 +61,9 @@ COMMON: dict[str, tuple[str, str]] = {
         '``{"eye": [0, -1, 1], "target": [0, 0, 0]}``',
     ),
     "num_points": ("256", "points of a point cloud"),
-    "privileged": ("``False``", "whether a picture comes with the state: ``Dict(observation=picture, state=numbers of \"keypoints\")``"),
+    "privileged": (
+        "``False``", 'whether a picture comes with the state: ``Dict(observation=picture, state=the numbers of "keypoints")``',
+    ),
     "reward_mode": ('``"delta"``', 'or ``"sparse"``'),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
     "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
@@ -127,8 +130,8 @@ def observations_of(task_class: type[Task]) -> list[str]:
     rows = [
         f'``Box`` of {ends[-1]} numbers for ``obs_mode="keypoints"`` (and 6 x {mesh.num_particles} + {ends[-1] - ends[1]} for',
         '``"particles"``, all particles row by row).  ``env.unwrapped.observation_slices["keypoints"]``: where they lie, by name.',
-        'Or a picture of ``image_size`` pixels a side: ``"heightmap"`` [L] and ``"depth"`` [m], ``float32``, of one channel; ``"rgb"``,',
-        '``uint8``; ``"rgbd"``, ``float32``, of four; or a ``"pointcloud"`` [L], (``num_points``, 3).',
+        'Or a picture of ``image_size`` pixels a side: ``"heightmap"`` [L] and ``"depth"`` [m], ``float32``, of one channel;',
+        '``"rgb"``, ``uint8``; ``"rgbd"``, ``float32``, of four; or a ``"pointcloud"`` [L], (``num_points``, 3).',
         "",
         "| Num | Name | Observation | Unit | Bound |",
         "| --- | --- | --- | --- | --- |",

@@ -41,7 +41,7 @@ def test_every_task_has_every_mode_and_a_batch_the_pictures_of_its_single_enviro
     first, many, one = batch.reset(seed=3)[0], pair.reset(seed=3)[0], single.reset(seed=5)[0]
     assert one.dtype == (np.uint8 if mode == "rgb" else np.float32)
     changed = False
-    for step, actions in zip(range(6), drawn(pair)):
+    for actions, _ in zip(drawn(pair), range(6)):
         assert first.shape == (3, *SHAPES[mode]) and one in single.observation_space and first in batch.observation_space
         assert np.array_equal(first[2], one) and np.array_equal(many[:3], first)
         before = one.copy()
@@ -328,8 +328,9 @@ def test_cameras_are_json_and_give_other_pictures():
 
 
 def test_frames_have_the_size_that_was_asked_for():
-    env, batch = make(DRAPE, render_mode="rgb_array", width=96, height=64), make_vec(
-        DRAPE, 2, render_mode="depth_array", width=50, height=70
+    env, batch = (
+        make(DRAPE, render_mode="rgb_array", width=96, height=64),
+        make_vec(DRAPE, 2, render_mode="depth_array", width=50, height=70),
     )
     env.reset(seed=0)
     batch.reset(seed=0)

@@ -5,16 +5,14 @@ import pytest
 
 from clothgym import Box, Capsule, Plane, Sphere, grid
 from clothgym.collisions import MeshCollider
-from clothgym.render import Camera
-from clothgym.render import quick, quick_solids
+from clothgym.render import Camera, quick, quick_solids
 
 SIZE = 64
 CAMERA = Camera(eye=(0.7, -1.1, 0.9), target=(0.0, 0.0, 0.1), vertical_fov=45.0)
 ABOVE = Camera(eye=(0.05, -0.1, 1.5), target=(0.05, -0.1, 0.0), up=(0.0, 1.0, 0.0), vertical_fov=50.0)
 CUBE = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-FACES = np.array(
-    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-)  # fmt: skip
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+FACES = np.array([(a, *pair) for a, b, c, d in QUADS for pair in ((b, c), (c, d))])
 TURN = (0.9, 0.2, -0.3, 0.25)  # a quaternion
 SOLIDS = {
     "sphere": Sphere(center=(0.25, 0.1, 0.2), radius=0.17),

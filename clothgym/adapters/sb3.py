@@ -17,7 +17,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.registration import checked_id
 
-
 NUMBERS = ("heightmap", "depth", "rgbd")  # modes whose pictures are of numbers
 
 

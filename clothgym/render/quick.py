@@ -48,7 +48,8 @@ TILE = 0.1  # side of a tile of the floor [m]
 
 class Sight(NamedTuple):
     """numbers: of a camera, see ``quick_solids``, (SIGHT_ROWS,).  near: the floor's nearness at each pixel, (height, width); color:
-    its colors, (height, width, 3).  Nearness is the inverse depth [1/m] of a pinhole camera, and the height [m] with parallel rays."""
+    its colors, (height, width, 3).  Nearness is the inverse depth [1/m] of a pinhole camera, and with parallel rays the height [m].
+    """
 
     numbers: NDArray[np.float64]
     near: NDArray[np.float32]
@@ -124,6 +125,7 @@ def draw_pictures(
     bound: farthest depth [m]; largest height or coordinate, in sides.
     """
     height, width = background.shape
+    colored = kind in (RGB, RGBD)
     # one picture's memory, used for one after the other
     count = max(x.shape[2], surfaces[1].shape[0])
     world, screen = np.empty((count, 3)), np.empty((count, 3))
@@ -132,7 +134,7 @@ def draw_pictures(
     for i in range(first, last):
         e = envs[i]
         draw_one(
-            kind == RGB or kind == RGBD, block[i], lane[i], x, surfaces[0], surfaces[1], surfaces[2], surfaces[3], surfaces[4],
+            colored, block[i], lane[i], x, surfaces[0], surfaces[1], surfaces[2], surfaces[3], surfaces[4],
             shapes, solids, i, sight, background, floor, world, screen, near, what, color,
         )  # fmt: skip
         if kind == RGB:

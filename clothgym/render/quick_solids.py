@@ -1,7 +1,7 @@
 """Where rays meet planes, spheres, capsules and boxes, and how these are lit: the solids of ``quick``.
 
-A solid is a row of numbers: a point of it, its x, y and z axes, half sides b, radius r, and color; with a shape: a plane (its z axis
-is the normal), a rounded box (b = 0: a sphere; b = (0, 0, h): a capsule; r = 0: a box) or a mesh.
+A solid is a row of numbers: a point of it, its x, y and z axes, half sides b, radius r, and color; with a shape: a plane, whose
+normal is the z axis, a rounded box (b = 0: a sphere; b = (0, 0, h): a capsule; r = 0: a box) or a mesh.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined, kernel, uncounted
-from clothgym.collisions import Collider, Plane
+from clothgym.collisions import Box, Collider, Plane, Sphere
 from clothgym.collisions.solids.shapes import KIND_MESH, KIND_PLANE, KIND_ROUNDED_BOX
-from clothgym.render.solids import WARM_GRAY, Color, Drawable, drawn
+from clothgym.render.solids import Color, Drawable, drawn
 
 # numbers of a camera: eye [m], unit vectors to the right, up and forward, pixels per unit of slope (or per meter, with parallel
 # rays), depth below which nothing is drawn [m], half of the picture [pixels], and whether it is a pinhole camera
@@ -59,11 +59,12 @@ def hidden(environments: int, count: int) -> NDArray[np.float64]:
     return rows
 
 
-def balls(middles: NDArray, radius: float, color: Color, drawn_ones: NDArray) -> NDArray[np.float64]:
-    """Rows of balls; middles: [m], (environments, balls, 3); drawn_ones: which of them are there, (environments, balls)."""
+def balls(middles: NDArray, radius: float, color: Color | NDArray, there: NDArray | bool = True) -> NDArray[np.float64]:
+    """Rows of balls; middles: [m], (environments, balls, 3); color: of all, or of each ball, (balls, 3); there: which of them there
+    are, (environments, balls)."""
     rows = hidden(*middles.shape[:2])
     rows[..., CENTER : CENTER + 3], rows[..., RADIUS] = middles, radius
-    rows[..., COLOR:] = np.where(drawn_ones[..., None], color, -1)
+    rows[..., COLOR:] = np.where(np.expand_dims(there, -1), color, -1)
     return rows
 
 
@@ -72,6 +73,16 @@ def boxes(middles: NDArray, half_sides: NDArray, colors: Sequence[Color]) -> NDA
     rows = hidden(*middles.shape[:2])
     rows[..., CENTER : CENTER + 3], rows[..., HALF : HALF + 3], rows[..., COLOR:] = middles, half_sides, colors
     return rows
+
+
+def drawables(rows: NDArray) -> list[Drawable]:
+    """The balls, and boxes along the axes, of one environment's rows that are drawn."""
+    found: list[Drawable] = []
+    for row in rows[rows[:, COLOR] >= 0].tolist():
+        center, half = tuple(row[CENTER : CENTER + 3]), tuple(row[HALF : HALF + 3])
+        solid = Box(center=center, half_sides=half) if any(half) else Sphere(center=center, radius=row[RADIUS])
+        found.append((solid, tuple(map(int, row[COLOR:]))))  # type: ignore[arg-type]
+    return found
 
 
 def solid_rows(things: Sequence[Sequence[Drawable]]) -> NDArray[np.float64]:
@@ -110,29 +121,35 @@ def draw_plane(colored, solids, i, s, sight, near, what, color):
 
 @uncounted
 def draw_rounded_box(colored, solids, i, s, sight, near, what, color):
-    """Draw a sphere, a capsule or a box, at the pixels within the bounds of a ball around it."""
+    """Draw a sphere, a capsule or a box, at the pixels within the bounds of the balls that reach farthest."""
     height, width = near.shape
     bx, by, bz, radius = solids[i, s, HALF], solids[i, s, HALF + 1], solids[i, s, HALF + 2], solids[i, s, RADIUS]
-    ball = np.sqrt(bx * bx + by * by + bz * bz) + radius
     mx, my, mz = solids[i, s, 0] - sight[EYE], solids[i, s, 1] - sight[EYE + 1], solids[i, s, 2] - sight[EYE + 2]
-    right = sight[RIGHT] * mx + sight[RIGHT + 1] * my + sight[RIGHT + 2] * mz
-    up = sight[UP] * mx + sight[UP + 1] * my + sight[UP + 2] * mz
-    depth = sight[FORWARD] * mx + sight[FORWARD + 1] * my + sight[FORWARD + 2] * mz
-    # bounds of the ball in the picture: it lies within depths d - R and d + R, and within R of its middle to all sides
-    closest, farthest = depth - ball, depth + ball
-    if sight[PERSPECTIVE] == 0:
-        closest, farthest = 1.0, 1.0
-    elif farthest <= sight[NEAR]:
-        return
+    # bounds of the balls at the corners, from depth d - r to d + r and within r to all sides: the solid is their convex hull
+    first, last, upper, lower, whole = np.inf, -np.inf, np.inf, -np.inf, False
+    for corner in range(8):
+        cx, cy, cz = bx if corner & 1 else -bx, by if corner & 2 else -by, bz if corner & 4 else -bz
+        x = mx + cx * solids[i, s, AXES] + cy * solids[i, s, AXES + 3] + cz * solids[i, s, AXES + 6]
+        y = my + cx * solids[i, s, AXES + 1] + cy * solids[i, s, AXES + 4] + cz * solids[i, s, AXES + 7]
+        z = mz + cx * solids[i, s, AXES + 2] + cy * solids[i, s, AXES + 5] + cz * solids[i, s, AXES + 8]
+        right = sight[RIGHT] * x + sight[RIGHT + 1] * y + sight[RIGHT + 2] * z
+        up = sight[UP] * x + sight[UP + 1] * y + sight[UP + 2] * z
+        depth = sight[FORWARD] * x + sight[FORWARD + 1] * y + sight[FORWARD + 2] * z
+        closest, farthest = depth - radius, depth + radius
+        if sight[PERSPECTIVE] == 0:
+            closest, farthest = 1.0, 1.0
+        elif closest <= sight[NEAR]:
+            # it reaches behind the near plane: anywhere in the picture
+            whole = True
+            break
+        low, high = right - radius, right + radius
+        first, last = min(first, min(low / closest, low / farthest)), max(last, max(high / closest, high / farthest))
+        low, high = up - radius, up + radius
+        upper, lower = min(upper, min(-high / closest, -high / farthest)), max(lower, max(-low / closest, -low / farthest))
     first_column, last_column, first_row, last_row = 0, width - 1, 0, height - 1
-    if sight[PERSPECTIVE] == 0 or closest > sight[NEAR]:
-        scale = sight[SCALE]
-        low, high = right - ball, right + ball
-        first = sight[HALF_WIDTH] + scale * min(low / closest, low / farthest)
-        last = sight[HALF_WIDTH] + scale * max(high / closest, high / farthest)
-        low, high = up - ball, up + ball
-        upper = sight[HALF_HEIGHT] - scale * max(high / closest, high / farthest)
-        lower = sight[HALF_HEIGHT] - scale * min(low / closest, low / farthest)
+    if not whole:
+        first, last = sight[HALF_WIDTH] + sight[SCALE] * first, sight[HALF_WIDTH] + sight[SCALE] * last
+        upper, lower = sight[HALF_HEIGHT] + sight[SCALE] * upper, sight[HALF_HEIGHT] + sight[SCALE] * lower
         if not (last > 0 and first < width and lower > 0 and upper < height):
             return
         first_column, last_column = int(max(first, 0.0)), int(min(last, width - 1.0))
