@@ -74,7 +74,7 @@ class TaskDefinition:
     settling_steps: ClassVar[int] = 0
     actions_per_attachment: ClassVar[int] = 3
     kernels: ClassVar[Kernels] = IN_NUMPY
-    obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles")
+    obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles", "heightmap", "pointcloud", "rgb", "depth", "rgbd")
     observations: ClassVar[tuple[Observation, ...]] = (Observation("time_left", "share of the time left", function=time_left),)
     points_relative_to: ClassVar[str] = "the origin"
     position_bound: ClassVar[float] = POSITION_BOUND
@@ -185,9 +185,24 @@ class TaskDefinition:
         return [drawn(one).at(places[k]) for k, one in colliders.items() if not isinstance(one, Plane)]
 
     def markers(self, env: int) -> list[Any]:
-        """What is drawn and casts no shadow: by default the anchors that hold the sheet."""
-        attachments, attached = self.simulation.attachment_positions[env], self.simulation.attached[env]
-        return [(x, HELD) for x, held in zip(attachments, attached) if held]
+        """What is drawn and casts no shadow: by default what ``marks`` says."""
+        from clothgym.render.quick_solids import drawables  # imported here: training draws nothing
+
+        return drawables(self.marks(np.array([env]))[0])
+
+    def marks(self, envs: NDArray) -> NDArray:
+        """The same of many environments at once, as rows of ``render.quick_solids``, (len(envs), marks, SOLID_ROWS): by default the
+        anchors that hold the sheet.  A task that gives ``markers`` in its place is drawn more slowly."""
+        from clothgym.render.quick_solids import balls  # imported here: training draws nothing
+        from clothgym.render.solids import MARKER_RADIUS
+
+        attached = self.simulation.attached[envs]
+        return balls(self.simulation.attachment_positions[envs, : attached.shape[1]], MARKER_RADIUS, HELD, attached)
+
+    def working_area(self) -> tuple[NDArray, float]:
+        """The square that pictures from above show, by default the arena's: its middle [m], (2,), and half of its side [m]."""
+        low, high = self.arena()
+        return (low[:2] + high[:2]) / 2, float(max(high[:2] - low[:2])) / 2
 
     def camera(self) -> Camera:
         """Where the scene is seen from; by default the whole arena from the front and right."""
@@ -199,7 +214,7 @@ class TaskDefinition:
 
 
 def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:
-    """What is observed of so many points of the sheet: where they are, and their velocities."""
+    """What is observed of so many points of the sheet, "particles" or "keypoints": where they are, and their velocities."""
     what = "3 x 3 points of the sheet (corners, edge middles, center)" if obs_mode == "keypoints" else "all particles, row by row"
     return [
         Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym._jit import inlined, kernel
 from clothgym.checks import shown
@@ -123,6 +124,10 @@ class DrapingTask(Task):
         """The floor, and a target in whose place each episode has its own."""
         floor, side = Plane(friction=FRICTION, thickness=ON_FLOOR), self.physics.side
         return [floor, Target("sphere", 0.25 * side, 0.5 * side, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
+
+    def working_area(self) -> tuple[NDArray, float]:
+        # the sheet begins before the target, which is about the origin
+        return np.array([0.0, -0.35 * self.physics.side]), 1.3 * self.physics.side
 
     def episode_colliders(self, env: int) -> Mapping[int, Collider]:
         return {TARGET_SLOT: recalled(self.episode[env]).collider(FRICTION, THICKNESS)}

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, one_of
-from clothgym.collisions import Box
 from clothgym.envs import pick_place
 from clothgym.envs.episode import Fields
 from clothgym.envs.stepping import IN_NUMPY
@@ -117,15 +116,17 @@ class GripperTask(Task):
         """Put the grippers where their episodes begin with them."""
         self.simulation.grippers.place(self.gripper_starts[envs], envs)
 
-    def markers(self, env: int) -> list[Any]:
+    def marks(self, envs: NDArray) -> NDArray:
         """The grippers: two fingers and a palm each."""
-        solids, grippers = [], self.simulation.grippers
-        for k, gripper in enumerate(self.physics.grippers):
-            x, y, z = grippers.positions[env, k].tolist()
-            # fingers that hold cloth are drawn closed
-            opening = 0.0 if grippers.held[env, k] else float(grippers.openings[env, k])
-            half = 0.006 + opening * gripper.span / 2
-            for finger in (x - half, x + half):
-                solids.append((Box(center=(finger, y, z + 0.025), half_sides=(0.005, 0.01, 0.03)), FINGER))
-            solids.append((Box(center=(x, y, z + 0.065), half_sides=(0.04, 0.014, 0.012)), PALM))
-        return solids
+        from clothgym.render.quick_solids import boxes  # imported here: training draws nothing
+
+        grippers, count = self.simulation.grippers, len(self.physics.grippers)
+        spans = np.array([gripper.span for gripper in self.physics.grippers])
+        # fingers that hold cloth are drawn closed
+        aside = 0.006 + np.where(grippers.held[envs] > 0, 0.0, grippers.openings[envs]) * spans / 2
+        middles = np.repeat(grippers.positions[envs].astype(np.float64)[:, :, None], 3, axis=2)
+        middles[:, :, 0, 0] -= aside
+        middles[:, :, 1, 0] += aside
+        middles[..., 2] += (0.025, 0.025, 0.065)
+        half_sides = np.tile([(0.005, 0.01, 0.03), (0.005, 0.01, 0.03), (0.04, 0.014, 0.012)], (count, 1))
+        return boxes(middles.reshape(len(envs), -1, 3), half_sides, (FINGER, FINGER, PALM) * count)

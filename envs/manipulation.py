@@ -88,6 +88,9 @@ class ManipulationTask(GripperTask):
     def colliders(self) -> list[Collider]:
         return [Plane(friction=FRICTION, thickness=ON_FLOOR)]
 
+    def working_area(self) -> tuple[NDArray, float]:
+        return np.zeros(2), self.workspace * self.physics.side
+
     def uneven(self, x: NDArray, rng: np.random.Generator) -> NDArray:
         """A start [m], (particles, 3), with its particles raised by tenths of a millimeter."""
         x = x.copy()

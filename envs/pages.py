@@ -50,12 +50,27 @@ COMMON: dict[str, tuple[str, str]] = {
         "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet, which solids stop',
     ),
     "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
-    "obs_mode": ('``"keypoints"``', 'or ``"particles"``'),
+    "obs_mode": (
+        '``"keypoints"``',
+        'or ``"particles"``, ``"heightmap"``, ``"pointcloud"``, ``"rgb"``, ``"depth"``, ``"rgbd"``, see docs/observations.md',
+    ),
+    "image_size": ("64", "pixels of a picture's side"),
+    "camera": (
+        "``None``",
+        'straight down on the working area; ``"task"``, that of the films; or what ``clothgym.render.Camera`` takes, '
+        '``{"eye": [0, -1, 1], "target": [0, 0, 0]}``',
+    ),
+    "num_points": ("256", "points of a point cloud"),
+    "privileged": (
+        "``False``", 'whether a picture comes with the state: ``Dict(observation=picture, state=the numbers of "keypoints")``',
+    ),
     "reward_mode": ('``"delta"``', 'or ``"sparse"``'),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
     "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
     "threads": ("1; in a batch all processors", "the outcome does not depend on it"),
     "render_mode": ("``None``", '``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``)'),
+    "width": ("480; in a batch 240", "pixels of a frame that ``render`` returns"),
+    "height": ("480; in a batch 240", "likewise"),
     "render_color": (
         '``"fabric"``',
         'or ``"strain"``: cream where no yarn is stretched, violet from $strain_shown % on; or ``"depth"``, in gray',
@@ -115,6 +130,8 @@ def observations_of(task_class: type[Task]) -> list[str]:
     rows = [
         f'``Box`` of {ends[-1]} numbers for ``obs_mode="keypoints"`` (and 6 x {mesh.num_particles} + {ends[-1] - ends[1]} for',
         '``"particles"``, all particles row by row).  ``env.unwrapped.observation_slices["keypoints"]``: where they lie, by name.',
+        'Or a picture of ``image_size`` pixels a side: ``"heightmap"`` [L] and ``"depth"`` [m], ``float32``, of one channel;',
+        '``"rgb"``, ``uint8``; ``"rgbd"``, ``float32``, of four; or a ``"pointcloud"`` [L], (``num_points``, 3).',
         "",
         "| Num | Name | Observation | Unit | Bound |",
         "| --- | --- | --- | --- | --- |",
@@ -145,7 +162,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$air_density": f"{physics.air_density:g}",
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
     }
-    defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color")}}
+    defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
         shown, meaning = COMMON.get(name, (f"``{default!r}``", ""))
         row = f"| ``{name}`` | {shown} | {task_class.arguments.get(name, meaning)} |"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.checks import one_of, shown
+from clothgym.checks import count, one_of, shown
 from clothgym.envs.task import Task
 from clothgym.forces import structural_strain
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 RENDER_MODES = ["rgb_array", "depth_array"]
 RENDER_COLORS = ("fabric", "strain", "depth")
+LARGEST_FRAME = 8192  # pixels of a side
 
 
 def check_render_mode(render_mode: str | None, render_color: str) -> None:
@@ -24,6 +25,11 @@ def check_render_mode(render_mode: str | None, render_color: str) -> None:
     if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):
         raise ValueError(f"render_mode={shown(render_mode)}: must be None or one of {', '.join(RENDER_MODES)}")
     one_of("render_color", render_color, *RENDER_COLORS)
+
+
+def checked_frame_size(width: int, height: int) -> tuple[int, int]:
+    """Width and height of a frame [pixels], whole numbers."""
+    return count("width", width, most=LARGEST_FRAME), count("height", height, most=LARGEST_FRAME)
 
 
 def renderer_of(task: Task, width: int, height: int, antialias: int = 2) -> Renderer:

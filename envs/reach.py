@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, vector
-from clothgym.collisions import Collider, Sphere
+from clothgym.collisions import Collider
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
@@ -179,9 +179,11 @@ class ReachTask(Task):
         """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
         return self.episode["goal"] - self._hangs - self.simulation.attachment_positions[:, 0]
 
-    def markers(self, env: int) -> list[Any]:
-        goal = Sphere(center=tuple(self.episode["goal"][env].tolist()), radius=NEAR_ENOUGH * self.physics.side)
-        return [*super().markers(env), (goal, GOAL)]
+    def marks(self, envs: NDArray) -> NDArray:
+        from clothgym.render.quick_solids import balls  # imported here: training draws nothing
+
+        goal = balls(self.episode["goal"][envs, None], NEAR_ENOUGH * self.physics.side, GOAL)
+        return np.concatenate([super().marks(envs), goal], axis=1)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

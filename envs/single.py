@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 from clothgym.checks import numbers
 from clothgym.envs.episode import FAILURES, TaskState
 from clothgym.envs.keyboard import actions_of_keys
+from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords, completed
-from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, renderer_of
 from clothgym.envs.task import Task
 from clothgym.exclusive import Turn, exclusive
 
 IMAGE_SIZE = 480
 
 
-class ClothEnv(gym.Env[NDArray, NDArray]):
+class ClothEnv(gym.Env[Any, NDArray]):
     """Base of the single environments; a subclass names its ``Task``, and its docstring is completed by ``pages``.
 
     ``copy.deepcopy`` and ``pickle`` take an environment in the middle of an episode; the copy goes on with the same bits.
@@ -33,33 +34,41 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
         super().__init_subclass__(**kwargs)
         cls.__doc__ = completed(cls.__doc__, getattr(cls, "task_class", None))
 
-    def __init__(self, render_mode: str | None = None, render_color: str = "fabric", **kwargs: Any) -> None:
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        render_color: str = "fabric",
+        width: int = IMAGE_SIZE,
+        height: int = IMAGE_SIZE,
+        **kwargs: Any,
+    ) -> None:
         check_keywords(self, kwargs)
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
+        self.frame_size = checked_frame_size(width, height)
         kwargs.setdefault("threads", 1)
         self.task = self.task_class(1, **kwargs)
         self.metadata = self.metadata | {"render_fps": round(1 / self.task.physics.time_step)}
-        self.observation_space = self.task.single_observation_space
+        self.observation_space = self.task.observed.space
         self.action_space = self.task.single_action_space
         self._renderer: Any = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.task.reset(np.array([0]), [seed], options)
         generator = self.task.generators[0]
         if self._np_random is not generator:  # it has been seeded anew
             sequence: Any = generator.bit_generator.seed_seq
             self._np_random, self._np_random_seed = generator, sequence.entropy
-        return self.task.observation[0].copy(), self.task.info_of(0)
+        return self.task.observed.one(0), self.task.info_of(0)
 
     @exclusive
-    def step(self, action: NDArray) -> tuple[NDArray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if type(action) is not np.ndarray or action.shape != self.action_space.shape:
             action = numbers("action", action, self.action_space.shape)  # type: ignore[arg-type]
         task = self.task
         task.advance(action[None])
         reward, terminated, *_ = task.outcome[0].item()
-        brought = task.observation[0].copy(), reward, terminated, False, task.info_of(0)
+        brought = task.observed.one(0), reward, terminated, False, task.info_of(0)
         self.turn.unfinished = ()
         return brought
 
@@ -70,8 +79,13 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """Where each observation lies in what ``reset`` and ``step`` return, by its name on the page."""
+        """Where each observation lies in the state vector, by its name on the page."""
         return dict(self.task.observation_slices)
+
+    @property
+    def mesh_edges(self) -> NDArray[np.int64]:
+        """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
+        return mesh_edges(self.task.physics.mesh)
 
     def get_keys_to_action(self) -> dict[str, NDArray]:
         """For ``gymnasium.utils.play``: what each set of keys does, see ``keyboard``."""
@@ -90,7 +104,7 @@ class ClothEnv(gym.Env[NDArray, NDArray]):
             gym.logger.warn("render() without a render_mode does nothing; use gym.make(..., render_mode='rgb_array')")
             return None
         if self._renderer is None:
-            self._renderer = renderer_of(self.task, IMAGE_SIZE, IMAGE_SIZE)
+            self._renderer = renderer_of(self.task, *self.frame_size)
         return draw(self.task, self._renderer, self.render_mode, [0], self.render_color)[0]
 
     def get_state(self) -> TaskState:

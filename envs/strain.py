@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clothgym import integrators
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, not_negative, positive, shown
-from clothgym.collisions import Capsule, Collider, Sphere
+from clothgym.collisions import Capsule, Collider
 from clothgym.envs import carriers
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
@@ -320,13 +320,13 @@ class StrainTask(Task):
     def _as_actions(self, velocities: NDArray) -> NDArray:
         return (velocities / self.physics.attachment_speed).reshape(self.num_envs, 6)
 
-    def markers(self, env: int) -> list[Any]:
-        ahead = [
-            (Sphere(center=tuple(x.tolist()), radius=0.02), GOAL if k == WAYPOINTS - 1 else WAYPOINT)
-            for k in range(int(self.episode["next"][env]), WAYPOINTS)
-            for x in self.episode["places"][env, k]
-        ]
-        return [*super().markers(env), *ahead]
+    def marks(self, envs: NDArray) -> NDArray:
+        from clothgym.render.quick_solids import balls  # imported here: training draws nothing
+
+        ahead = np.arange(WAYPOINTS) >= self.episode["next"][envs, None]
+        colors = np.repeat([WAYPOINT] * (WAYPOINTS - 1) + [GOAL], 2, axis=0)
+        places = balls(self.episode["places"][envs].reshape(len(envs), -1, 3), 0.02, colors, np.repeat(ahead, 2, axis=1))
+        return np.concatenate([super().marks(envs), places], axis=1)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

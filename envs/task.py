@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
 from clothgym.checks import not_negative, numbers, one_of, shown
-from clothgym.envs.definition import TaskDefinition, check_definition, points_observed
+from clothgym.envs.definition import TaskDefinition, check_definition
 from clothgym.envs.episode import TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
+from clothgym.envs.observing import Observer, StateVector
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
 from clothgym.exclusive import Turn, exclusive
@@ -45,7 +46,7 @@ class Task(TaskDefinition):
         substeps: substeps of a control step, or "auto"; the task's own number by default.
         physics: "true", or "fast", with short cuts, see ``Physics.chosen``.
         bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them, in place of what that fixes.
-        obs_mode: one of ``obs_modes``.
+        obs_mode, image_size, camera, num_points, privileged: what is returned of the state, see ``Observer``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
         randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
         wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
@@ -56,7 +57,8 @@ class Task(TaskDefinition):
         sheet: rows and side as they were asked for.
         episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
-        observation_slices: where each observation lies in ``observation[env]``, by its name.
+        observation_slices: where each observation lies in ``observation[env]``, the state vector, by its name.
+        observed: what ``reset`` and ``step`` return of it.
         rules: one record of numbers that all environments share.
         outcome, info, terms: records of what the last step has brought, or the reset since then, (num_envs,).
         turn: one thread at a time is in the task; ``turn.unfinished`` are the environments that need a reset.
@@ -81,6 +83,10 @@ class Task(TaskDefinition):
         contact: str | None = None,
         air_density: float | None = None,
         obs_mode: str = "keypoints",
+        image_size: int = 64,
+        camera: str | Mapping[str, Any] | None = None,
+        num_points: int = 256,
+        privileged: bool = False,
         reward_mode: str = "delta",
         randomize: Mapping[str, Sequence[float]] | None = None,
         wind: Mapping[str, Any] | None = None,
@@ -128,31 +134,22 @@ class Task(TaskDefinition):
         self.threads = self.simulation.threads
         self.num_attachments = len(fixed.held) + len(fixed.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)
-        self._prepare_observation()
         self._prepare_records()
         self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
         self._seeded = np.zeros(num_envs, bool)
         self.turn = Turn("environment", error=gym.error.ResetNeeded)
-
-    def _prepare_observation(self) -> None:
-        """Space, memory and look-up of what is observed: the sheet's points, and what the task declares."""
-        self.particles = self.observed_particles() if self.obs_mode == "keypoints" else np.arange(self.physics.mesh.num_particles)
-        declared = [*points_observed(self, self.obs_mode, len(self.particles)), *self.observations]
-        # each observation's place in the array, and its bound
-        ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
-        self.observation_slices = {one.name: slice(first, end) for one, first, end in zip(declared, [0, *ends], ends)}
-        if len(self.observation_slices) < len(declared):
-            raise TypeError(f"{type(self).__name__}.observations: two have the same name, in {[one.name for one in declared]}")
-        bounds = [np.broadcast_to(one.bound, one.shape).ravel() for one in declared]
-        self._bound = np.concatenate(bounds).astype(np.float32)
-        self.single_observation_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
-        self.observation = np.zeros((self.num_envs, len(self._bound)), np.float32)
-        # what the task declares, as records for its kernels and as the numbers in them
-        self.seen = records(self.num_envs, [(one.name, np.float32, one.shape) for one in self.observations])
+        self.state_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
+        self.observed = Observer(self, obs_mode, image_size, camera, num_points, privileged)
 
     def _prepare_records(self) -> None:
-        """Records of the episodes and their steps, and the kernels that go through them."""
+        """Records of the episodes, their steps and what is observed of them, and the kernels that go through them."""
         physics, count = self.physics, self.num_envs
+        points = "particles" if self.obs_mode == "particles" else "keypoints"
+        vector = StateVector(self, points)
+        self.particles, self.observation_slices, self._bound = vector.particles, vector.slices, vector.bound
+        self.observation = np.zeros((count, len(vector.bound)), np.float32)
+        # what the task declares, as records for its kernels and as the numbers in them
+        self.seen = records(count, [(one.name, np.float32, one.shape) for one in self.observations])
         attachment, (low, high) = (self.num_attachments, 3), self.arena()
         # what an episode remembers
         memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool)]
@@ -178,7 +175,7 @@ class Task(TaskDefinition):
         )  # fmt: skip
         numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]
-        self._belongs = {"task": type(self).__name__, "observation mode": self.obs_mode, "digest of the arguments": digest}
+        self._belongs = {"task": type(self).__name__, "observation mode": points, "digest of the arguments": digest}
         # what a step brings
         brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_attachments, self.actions_per_attachment)), ("free", np.uint8, self.num_attachments)]
@@ -272,6 +269,7 @@ class Task(TaskDefinition):
         for brought in (self.outcome, self.info, self.terms):
             brought[envs] = np.zeros((), brought.dtype)
         self._score_and_observe(envs, begins=True)
+        self.observed.begun(envs)
 
     def _checked_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
         """A reset's options, with the properties of a fabric that was named; refuses those that no episode can have."""
@@ -342,6 +340,7 @@ class Task(TaskDefinition):
         # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
             simulation.release(*np.nonzero(self.outcome["free"]))
+        self.observed.stepped()
 
     def steps_taken(self) -> NDArray:
         """Calls of ``step`` since each episode's start, (num_envs,)."""
@@ -445,4 +444,5 @@ class Task(TaskDefinition):
             value[...] = state.episode[name]
         self.generators[:] = generators
         self._seeded[:] = True
+        self.observed.begun(self._everyone)
         self.turn.unfinished = ()

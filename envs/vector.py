@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from clothgym.checks import count, mask, shown
 from clothgym.envs.episode import FAILURES, TaskState, batch_seeds
+from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords
-from clothgym.envs.pictures import RENDER_MODES, check_render_mode, draw, renderer_of
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, renderer_of
 from clothgym.envs.task import Task
 from clothgym.exclusive import Turn, exclusive
 
@@ -28,6 +29,7 @@ class ClothVectorEnv(VectorEnv):
         autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
         render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
         render_color: "fabric", or "strain" or "depth" for their colors.
+        width, height: of a frame [pixels].
         max_episode_steps: steps after which an episode is truncated, as by Gymnasium's ``TimeLimit``; None for the task's own end.
         kwargs: those of the task, see the page of the single environment.
     """
@@ -40,6 +42,8 @@ class ClothVectorEnv(VectorEnv):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         render_color: str = "fabric",
+        width: int = IMAGE_SIZE,
+        height: int = IMAGE_SIZE,
         max_episode_steps: int | None = None,
         **kwargs: Any,
     ) -> None:
@@ -53,6 +57,7 @@ class ClothVectorEnv(VectorEnv):
         self.max_episode_steps = None if max_episode_steps is None else count("max_episode_steps", max_episode_steps, "None, or ")
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
+        self.frame_size = checked_frame_size(width, height)
         self.metadata = {
             "render_modes": RENDER_MODES,
             "render_fps": round(1 / self.task_class.physics.time_step),
@@ -60,7 +65,7 @@ class ClothVectorEnv(VectorEnv):
             "failures": FAILURES,
         }
         self.task = self.task_class(self.num_envs, **kwargs)
-        self.single_observation_space = self.task.single_observation_space
+        self.single_observation_space = self.task.observed.space
         self.single_action_space = self.task.single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -68,7 +73,7 @@ class ClothVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[NDArray, dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin new episodes in all environments, or in those of ``options["reset_mask"]``, (num_envs,) of bool."""
         if not isinstance(options, Mapping | None):
             raise ValueError(f"reset options={shown(options)}: must be a dict, or None")
@@ -76,10 +81,10 @@ class ClothVectorEnv(VectorEnv):
         reset = mask("options['reset_mask']", options.pop("reset_mask", np.ones(self.num_envs, bool)), self.num_envs)
         seeds, envs = batch_seeds(seed, self.num_envs), np.flatnonzero(reset)
         self.task.reset(envs, [seeds[env] for env in envs], options)
-        return self._observation(), _with_masks(_only(self.task.infos(), reset), reset)
+        return self.task.observed.batch(), _with_masks(_only(self.task.infos(), reset), reset)
 
     @exclusive
-    def step(self, actions: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, dict[str, Any]]:
+    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
         task, everyone = self.task, np.ones(self.num_envs, bool)
         over = task.episode["over"].copy()
@@ -94,7 +99,7 @@ class ClothVectorEnv(VectorEnv):
             info = _with_masks(task.infos(), everyone) | final
         else:
             info = _with_masks(_only(task.infos(), ~over), ~over)
-        brought = self._observation(), reward, terminated, truncated, info
+        brought = self.task.observed.batch(), reward, terminated, truncated, info
         self.turn.unfinished = ()
         return brought
 
@@ -120,19 +125,16 @@ class ClothVectorEnv(VectorEnv):
             return {}
         last = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            last[env] = self.task.observation[env].copy()
+            last[env] = self.task.observed.one(env)
         final = {"final_info": _with_masks(_only(self.task.infos(), ended), ended), "final_obs": last}
         self.task.reset(np.flatnonzero(ended))
         return _with_masks(final, ended)
-
-    def _observation(self) -> NDArray:
-        return self.task.observation.copy()
 
     def render(self) -> tuple[NDArray, ...] | None:
         if self.render_mode is None:
             return None
         if self._renderer is None:
-            self._renderer = renderer_of(self.task, IMAGE_SIZE, IMAGE_SIZE, antialias=1)
+            self._renderer = renderer_of(self.task, *self.frame_size, antialias=1)
         return tuple(draw(self.task, self._renderer, self.render_mode, list(range(self.num_envs)), self.render_color))
 
     # --- what users of Gymnasium's own vector environments rely on ------------------------------------------------------
@@ -157,8 +159,13 @@ class ClothVectorEnv(VectorEnv):
 
     @property
     def observation_slices(self) -> dict[str, slice]:
-        """Where each observation lies in an environment's row of what ``reset`` and ``step`` return, by its name on the page."""
+        """Where each observation lies in an environment's row of the state vectors, by its name on the page."""
         return dict(self.task.observation_slices)
+
+    @property
+    def mesh_edges(self) -> NDArray[np.int64]:
+        """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
+        return mesh_edges(self.task.physics.mesh)
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""

@@ -17,6 +17,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.registration import checked_id
 
+NUMBERS = ("heightmap", "depth", "rgbd")  # modes whose pictures are of numbers
+
 
 class ClothSB3VecEnv(VecEnv):
     """A ``ClothVectorEnv`` in same-step mode as an SB3 ``VecEnv``."""
@@ -29,18 +31,35 @@ class ClothSB3VecEnv(VecEnv):
         self._seed: int | None = None
         self._next_options: dict[str, Any] = {}
         self.render_mode = env.render_mode
-        super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
+        super().__init__(env.num_envs, self._space_for_cnn(env.single_observation_space), env.single_action_space)
 
-    def reset(self) -> NDArray:
+    def reset(self) -> Any:
         observation, _ = self.env.reset(seed=self._seed, options=self._next_options)
         self._seed, self._next_options = None, {}
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return observation
+        return self._for_cnn(observation)
+
+    def _for_cnn(self, observation: Any) -> Any:
+        """Pictures of numbers with their channels first, as SB3's CNN takes them; those of colors it turns round itself."""
+        if self.env.task.observed.mode not in NUMBERS:
+            return observation
+        if isinstance(observation, dict):
+            return observation | {"observation": self._for_cnn(observation["observation"])}
+        heights = self.env.task.observed.mode == "heightmap"
+        return np.expand_dims(observation, -3) if heights else np.moveaxis(observation, -1, -3)
+
+    def _space_for_cnn(self, space: gym.Space) -> gym.Space:
+        """The space of these."""
+        if isinstance(space, gym.spaces.Dict):
+            picture = self._space_for_cnn(space["observation"])
+            return gym.spaces.Dict({**space.spaces, "observation": picture})
+        assert isinstance(space, gym.spaces.Box)
+        return gym.spaces.Box(self._for_cnn(space.low), self._for_cnn(space.high), dtype=space.dtype)  # type: ignore[arg-type]
 
     def step_async(self, actions: NDArray) -> None:
         self._actions = actions
 
-    def step_wait(self) -> tuple[NDArray, NDArray, NDArray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, NDArray, NDArray, list[dict[str, Any]]]:
         observation, reward, terminated, truncated, info = self.env.step(self._actions)  # type: ignore[arg-type]
         done = terminated | truncated
         # a constrained learner needs each step's cost
@@ -49,9 +68,9 @@ class ClothSB3VecEnv(VecEnv):
             for env in np.flatnonzero(done):
                 final = info["final_info"]
                 infos[env] = {key: value[env].item() for key, value in final.items() if not key.startswith("_")}
-                infos[env]["terminal_observation"] = info["final_obs"][env]
+                infos[env]["terminal_observation"] = self._for_cnn(info["final_obs"][env])
                 infos[env]["TimeLimit.truncated"] = bool(truncated[env] and not terminated[env])
-        return observation, reward.astype(np.float32), done, infos
+        return self._for_cnn(observation), reward.astype(np.float32), done, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Seed the next reset: environment ``i`` gets ``seed + i``."""
@@ -92,6 +111,9 @@ class ClothSB3VecEnv(VecEnv):
 def make_sb3_vec_env(env_id: str, num_envs: int = 64, seed: int | None = None, **kwargs: Any) -> ClothSB3VecEnv:
     """A batch of a clothgym environment for SB3: ``PPO("MlpPolicy", make_sb3_vec_env("ClothDrape-v0", 64, seed=0))``.
 
+    Of pictures, ``rgb`` is for ``CnnPolicy`` as it is; those of numbers, ``heightmap``, ``depth`` and ``rgbd``, come with their
+    channels first, for ``CnnPolicy`` with ``policy_kwargs={"normalize_images": False}``; and with ``privileged=True``, for
+    ``MultiInputPolicy`` likewise.
     Put SB3's ``VecMonitor`` on it to have episodes logged.  ``env_id``: any registered id whose environment is a ``ClothEnv``, see
     ``registration.checked_id``.  ``kwargs`` go to the environment.
 
