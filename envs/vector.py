@@ -125,7 +125,7 @@ class ClothVectorEnv(VectorEnv):
             return {}
         last = np.full(self.num_envs, None, dtype=object)
         for env in np.flatnonzero(ended):
-            last[env] = self.task.observed.one(env)
+            last[env] = self.task.observed.one(int(env))
         final = {"final_info": _with_masks(_only(self.task.infos(), ended), ended), "final_obs": last}
         self.task.reset(np.flatnonzero(ended))
         return _with_masks(final, ended)
