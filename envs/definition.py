@@ -170,6 +170,10 @@ class TaskDefinition:
         """What a scripted expert does now, (num_envs, numbers); it sees the whole state.  By default it keeps still."""
         return np.zeros((self.num_envs, self.actions_per_attachment * self.num_attachments))
 
+    def expert(self) -> NDArray:
+        """The scripted expert's action as ``step`` takes it, (num_envs, numbers)."""
+        return self.expert_actions()
+
     # --- picture --------------------------------------------------------------------------------------------------------
 
     def observed_particles(self) -> NDArray:

@@ -101,6 +101,19 @@ class GripperTask(Task):
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         pick_place.perform(self, actions)
 
+    def expert(self) -> NDArray:
+        return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
+
+    def expert_picks(self) -> NDArray:
+        """What the scripted expert does with "pick_place", (num_envs, numbers); tasks that have one define it.
+
+        Raises:
+            NotImplementedError: this task has none.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no scripted expert for action_mode='pick_place': take action_mode='velocity'"
+        )
+
     def steps_taken(self) -> NDArray:
         step = self.episode["step"]
         return step if self.action_mode == "velocity" else -(-step // pick_place.STEPS)

@@ -97,7 +97,7 @@ class ClothEnv(gym.Env[Any, NDArray]):
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
-        return self.task.expert_actions()[0].astype(np.float32)
+        return self.task.expert()[0].astype(np.float32)
 
     def render(self) -> NDArray | None:  # type: ignore[override]
         if self.render_mode is None:

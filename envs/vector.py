@@ -173,7 +173,7 @@ class ClothVectorEnv(VectorEnv):
 
     def expert_actions(self) -> NDArray:
         """What the task's scripted expert does now, (num_envs, actions)."""
-        return self.task.expert_actions().astype(np.float32)
+        return self.task.expert().astype(np.float32)
 
     def get_state(self) -> TaskState:
         """All that is needed to continue the batch bit for bit."""

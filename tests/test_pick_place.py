@@ -106,3 +106,10 @@ def test_it_is_an_environment_that_gymnasium_accepts_and_truncates_by_actions():
     env.reset(seed=0)
     ends = [env.step(np.zeros((2, 10)))[3].tolist() for _ in range(2)]
     assert ends == [[False, False], [True, True]]
+
+
+def test_a_task_without_a_scripted_expert_for_it_says_so():
+    env = gym.make(ID, action_mode="pick_place").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(NotImplementedError, match="no scripted expert for action_mode='pick_place'"):
+        env.expert_action()
