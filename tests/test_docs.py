@@ -50,7 +50,7 @@ def test_readme_runs(monkeypatch, tmp_path, capsys):
         quick = block.replace("400_000", "2_560").replace("n_eval_episodes=500", "n_eval_episodes=100")
         exec(compile(quick, "README.md", "exec"), names)
     assert names["terminated"] and names["info"]["normalized_performance"] > 0.5  # the expert's
-    assert names["images"].shape == (16, 48, 48, 1) and names["state"].shape == (16, 83)
+    assert names["images"].shape == (16, 48, 48, 1) and names["state"].shape == (16, 68)
     assert (tmp_path / "reach.zip").exists()
     assert "return, mean and deviation" in capsys.readouterr().out
 
