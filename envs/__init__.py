@@ -9,6 +9,7 @@ from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.gripper_task import GripperTask
+from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv, ClothHangHardVectorEnv, ClothHangVectorEnv
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
@@ -23,6 +24,10 @@ __all__ = [
     "ClothDrapeGripperVectorEnv",
     "ClothDrapeVectorEnv",
     "ClothEnv",
+    "ClothHangEnv",
+    "ClothHangHardEnv",
+    "ClothHangHardVectorEnv",
+    "ClothHangVectorEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
     "ClothStrainEnv",

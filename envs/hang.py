@@ -121,8 +121,8 @@ def _observe_grippers(own, rules, sheet, seen):
 
 
 def ways_over(task: HangingTask, hands: NDArray, beside: NDArray) -> tuple[NDArray, NDArray]:
-    """What is left of the way of two hands that carry an edge over the rail [m], in its frame, (num_envs, 2, 3), and whether they are
-    there, (num_envs, 1).
+    """What is left of the way of two hands that carry an edge over the rail [m], in its frame, (num_envs, 2, 3), and whether they
+    are there, (num_envs, 1).
 
     hands: in that frame [m], (num_envs, 2, 3).  beside: of each on the rail, at the end [m], (2,).
     """
@@ -145,7 +145,6 @@ class HangTask(HangingTask):
     """The task of ``ClothHang-v0``, see ``ClothHangEnv``."""
 
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
-    # as with grippers the hands' time goes on when they hold nothing, until they hold nothing
     kernels = Kernels(
         _hanging, hanging.evaluate_hang, _observe_held, act=_let_go, measure=measure_hang, done=_holds_nothing,
         account=hanging.account_hang, stop=stop_at_rail,
@@ -185,7 +184,6 @@ class HangHardTask(HangingTask, GripperTask):
         draping.PHYSICS,
         mesh=grid(21, 21, 0.8, 0.8),
         material=chosen_fabric("silk", MEDIAN),
-        substeps="auto",
         grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2,
         fast={"air_density": 0.0},
     )
@@ -202,8 +200,8 @@ class HangHardTask(HangingTask, GripperTask):
         *hanging.OBSERVATIONS,
         Observation(
             "grippers",
-            "for each gripper its tip relative to the middle of the rail [L], the way from its tip to the corner that it is meant to "
-            "take [L/10], how far open its fingers are, and whether it holds anything",
+            "for each gripper its tip relative to the middle of the rail [L], the way from its tip to the corner that it is meant "
+            "to take [L/10], how far open its fingers are, and whether it holds anything",
             (2, 8),
             "",
             (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0, 1.0),
@@ -218,7 +216,7 @@ class HangHardTask(HangingTask, GripperTask):
 
     def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
         if action_mode != "velocity":
-            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity' here; what is picked and placed ends on the floor")
+            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed ends on the floor")
         super().__init__(num_envs, **kwargs)
 
     @property
@@ -278,3 +276,152 @@ class HangHardTask(HangingTask, GripperTask):
         near = length(to_place) < REACH / 2
         grip = np.where(begun & (there | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
         return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
+
+
+class ClothHangEnv(ClothEnv):
+    """Hang a sheet that is held by two corners over a rail, and let go of it.
+
+    ## Description
+    True physics: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves through air.
+
+    A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.5 to 0.7 L in front of a rail: a rod of
+    radius 0.05 L and length 1.6 L, level, on two posts of the same radius, its axis 0.75 to 1 L above the floor.  The agent moves
+    both corners and may let go of each.  When it holds none, or after 80 steps, at which both are let go, the sheet has five
+    seconds, 150 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until then is as good as
+    to let go.
+
+    The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), whole-sheet contact with friction
+    0.5, strict self-collision, quadratic bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; rail and
+    posts stop the corners; 30 Hz control, ``semi_implicit_euler`` with 50 substeps.  Cloth rests 6 mm from the rail's surface,
+    about the height of the rail's arc over a side of a triangle, so that particles carry it and it does not tremble.
+
+    ``physics="fast"`` has short cuts: contact of particles alone, none of the sheet with itself, skip springs without rigidity,
+    hands that go through solids, a cotton in a linear drag of 4.8 per second and no other air.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each corner:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | let go for good, if above 0.8 | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance
+    d of the sheet's center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.  At
+    the end it is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    The rail's vertical plane cuts the sheet.  Balance B is twice the smaller part's share of the area.  Support S is the length of
+    the cut, measured on the flat sheet, that lies between the rail's posts, and between its axis and 0.05 L above the surface on
+    which cloth rests: in sides, at most 1, since no line that halves a square is shorter.  F is the share of the area lower than
+    3 cm.  All are of the triangles' surface, so another resolution of the same surface has the same.  The score after each step
+    is B S (1 - F): 0 on the floor, beside or under the rail; 1 for a sheet that the rail halves.  So cloth that is held up without
+    the rail, that lies beneath it, or that hangs by a corner scores nothing or little.
+
+    ``info["normalized_performance"]`` = B S (1 - F) / (1 + (v / 0.1 m/s)^2), with the rms speed v, after the five seconds.
+    ``info["is_success"]``: B >= 0.6 (3/10 of the sheet on either side), S >= 0.9, F <= 0.02 and v under 0.02 m/s.  ``info`` also
+    has ``balance``, ``support``, ``lying`` (F), ``rms_speed`` [m/s], which are 0 until then, and in each step ``best``, the
+    episode's best score, ``first_success``, the first step after which the sheet hangs so and nothing holds it, or -1,
+    ``success_held``, whether it has hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the
+    ``reward/...`` terms.
+
+    ## Starting State
+    The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
+    the rail, with a ripple of a millimeter.  The rail's middle is within 0.15 L of the origin in x and y; it is turned by up to
+    45 degrees.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged"
+    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"rail"``, a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad] (the
+    rest is drawn), and ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = HangTask
+
+
+class ClothHangVectorEnv(ClothVectorEnv):
+    """``ClothHang-v0`` as a batch, see ``ClothHangEnv``."""
+
+    task_class = HangTask
+
+
+class ClothHangHardEnv(ClothEnv):
+    """Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.
+
+    ## Description
+    True physics, as in ``ClothHang-v0``: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves
+    through air.
+
+    The rail and the evaluation are those of ``ClothHang-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles), of silk
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction 0.3, and cloth rests
+    7 mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail.
+    A gripper is a kinematic body with two fingers: when these have closed it holds the particles within 3 cm of its tip, and when
+    they begin to open it lets go; it may take hold as often as it likes.  The fingers do not push the cloth; the rail stops a
+    gripper's tip, the floor what it holds, and while they move it does not sink.  After 130 steps they open, and the sheet has five
+    seconds, 150 steps, in which actions are ignored; then it is evaluated.
+
+    ``physics="fast"`` has the short cuts of ``ClothHang-v0``, but for the fabric, which stays, and no air but a linear drag.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners
+    of 1 for one that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At the end it is the normalized
+    performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    As in ``ClothHang-v0``, with the same ``info``.
+
+    ## Starting State
+    The sheet lies before the rail, all of it 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the side; in
+    half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L
+    beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged"
+    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"rail"``, as in ``ClothHang-v0``, ``"rumpled"``, True or False, and ``"material"``, a preset's
+    name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = HangHardTask
+
+
+class ClothHangHardVectorEnv(ClothVectorEnv):
+    """``ClothHang-Hard-v0`` as a batch, see ``ClothHangHardEnv``."""
+
+    task_class = HangHardTask

@@ -34,7 +34,7 @@ LYING = 0.03  # cloth lower than this lies on the floor [m]
 OVER = 0.05  # cloth less than this above the rail's contact surface rests on it, in sides
 GUIDE_SCALE = 0.4  # in sides: how the guidance falls with the center's distance from where it should be
 SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
-# twice the smaller side's share; of the fold; of the sheet; [m/s]
+# twice the smaller side's share; in sides; share of the sheet; [m/s]
 ENOUGH_BALANCE, ENOUGH_SUPPORT, MOST_LYING, ENOUGH_REST = 0.6, 0.9, 0.02, 0.02
 
 
@@ -59,17 +59,18 @@ def _share_above(a, b, c):
 
 
 @apart
-def hang_of(x, triangles, rest, areas, rail, turn, ends, low, high, out):
-    """How a sheet hangs over a rail: (share of it beyond the rail, share on the floor, share of the fold that the rail carries).
+def hang_of(x, triangles, rest, areas, side, rail, turn, ends, low, high, out):
+    """How a sheet hangs over a rail: (share of it beyond the rail, share on the floor, length that the rail carries, in sides).
 
     The rail's vertical plane cuts the sheet's triangles.  Areas and lengths are those of the flat sheet, by linear functions on the
     triangles, so that the same surface in other triangles has the same shares.  A point of the cut is carried if it is between
-    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.
+    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.  A line that halves a square is as
+    long as a side or longer: length beyond that counts for nothing.
 
     x: (3, particles) [m].  rest: (particles, 2) [m].  areas: of the triangles, summing to 1.  rail: middle of its axis [m].
     turn: cosine and sine of its yaw.
     """
-    beyond, lying, fold, carried = 0.0, 0.0, 0.0, 0.0
+    beyond, lying, carried = 0.0, 0.0, 0.0
     v, cut, d = np.empty(3), np.empty((2, 4)), np.empty(3)
     for t in range(triangles.shape[0]):
         # signed distances from the rail's plane, and the areas
@@ -94,20 +95,19 @@ def hang_of(x, triangles, rest, areas, rail, turn, ends, low, high, out):
                 cut[found, 0] = turn[0] * (here_x - rail[0]) + turn[1] * (here_y - rail[1])
                 cut[found, 1] = x[2, p] + s * (x[2, q] - x[2, p]) - rail[2]
                 found += 1
-        length = np.sqrt((cut[1, 2] - cut[0, 2]) ** 2 + (cut[1, 3] - cut[0, 3]) ** 2)
         along, above = (cut[0, 0] + cut[1, 0]) / 2, (cut[0, 1] + cut[1, 1]) / 2
-        fold += length
         if abs(along) <= ends and low <= above <= high:
-            carried += length
-    out[0], out[1], out[2] = beyond, lying, carried / fold if fold > 0 else 0.0
+            carried += np.sqrt((cut[1, 2] - cut[0, 2]) ** 2 + (cut[1, 3] - cut[0, 3]) ** 2)
+    out[0], out[1], out[2] = beyond, lying, min(carried / side, 1.0)
 
 
 @inlined
 def measure_hang(own, rules, sheet):
     """Write how the sheet hangs, see ``hang_of``."""
     hang_of(
-        sheet.x, sheet.mesh.triangles, rules.rest, rules.areas, own.rail, own.turn, rules.ends, 0.0, rules.carried_within, own.hang
-    )
+        sheet.x, sheet.mesh.triangles, rules.rest, rules.areas, rules.side, own.rail, own.turn, rules.ends, 0.0,
+        rules.carried_within, own.hang,
+    )  # fmt: skip
 
 
 @inlined
@@ -198,7 +198,9 @@ def observe_rail(own, rules, sheet, seen):
 
 OBSERVATIONS = (
     Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND),
-    Observation("hang", "share of the sheet beyond the rail, share on the floor, share of the fold that the rail carries", (3,)),
+    Observation(
+        "hang", "share of the sheet beyond the rail, share on the floor, length that the rail carries [L], at most 1", (3,)
+    ),
     Observation("rail_height", "height of the rail's axis", (), "L", 2.0),
     Observation("rail_turn", "cosine and sine of its yaw", (2,)),
     Observation("settling", "whether the sheet settles, and actions are ignored"),
