@@ -53,6 +53,10 @@ def draw_strips() -> None:
             strip("ClothStrain-v0", (0, 30, 50, 75), 7),
             strip("ClothStrain-v0", (0, 12, 22, 35), 7, careless=True),
         ],
+        "hang.png": [
+            strip("ClothHang-v0", (0, 12, 18, 30), 7),
+            strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
+        ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
     }
     for name, rows in pictures.items():

@@ -391,8 +391,8 @@ class ClothHangHardEnv(ClothEnv):
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners
-    of 1 for one that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At the end it is the normalized
-    performance, at a failure 0.
+    of 1 for one that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At the end it is the
+    normalized performance, at a failure 0.
     ``reward_mode="sparse"``: the normalized performance, at the evaluation.
 
     ## Evaluation

@@ -261,19 +261,20 @@ class HangingTask(Task):
 
     def frame(self, rail: NDArray, turn: NDArray) -> list[Collider]:
         """A rail and its posts, with these records."""
-        radius, half, surface = self.radius * self.physics.side, HALF_LENGTH * self.physics.side, self.surface
+        side, friction, thickness = self.physics.side, self.rail_friction, self.rail_thickness
+        radius, half = self.radius * side, HALF_LENGTH * side
         x, y, z = rail.tolist()
         along = (float(turn[0]), float(turn[1]), 0.0)
-        bar = Capsule(center=(x, y, z), radius=radius, height=2 * (half + radius), axis=along, **surface)
+        bar = Capsule(
+            center=(x, y, z), radius=radius, height=2 * (half + radius), axis=along, friction=friction, thickness=thickness
+        )
         # the lower round end of a post is sunk, and its upper one is the rail's
         ends = [(x + way * half * along[0], y + way * half * along[1]) for way in (-1, 1)]
-        posts = [Capsule(center=(*end, z / 2), radius=radius, height=z + 2 * radius, **surface) for end in ends]
+        posts = [
+            Capsule(center=(*end, z / 2), radius=radius, height=z + 2 * radius, friction=friction, thickness=thickness)
+            for end in ends
+        ]
         return [bar, *posts]
-
-    @property
-    def surface(self) -> dict[str, float]:
-        """Friction and thickness of the rail."""
-        return {"friction": self.rail_friction, "thickness": self.rail_thickness}
 
     def episode_colliders(self, env: int) -> Mapping[int, Collider]:
         own = self.episode[env]
@@ -333,4 +334,4 @@ class HangingTask(Task):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         far = self.physics.side / 0.6
-        return Camera(eye=(1.75 * far, -1.3 * far, 1.15 * far), target=(0.0, -0.12 * far, 0.27 * far), vertical_fov=36.0)
+        return Camera(eye=(0.8 * far, -2.0 * far, 1.0 * far), target=(0.0, -0.1 * far, 0.4 * far), vertical_fov=34.0)
