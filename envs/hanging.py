@@ -334,4 +334,4 @@ class HangingTask(Task):
         from clothgym.render import Camera  # imported here: training draws nothing
 
         far = self.physics.side / 0.6
-        return Camera(eye=(0.8 * far, -2.0 * far, 1.0 * far), target=(0.0, -0.1 * far, 0.4 * far), vertical_fov=34.0)
+        return Camera(eye=(0.8 * far, -2.0 * far, 1.0 * far), target=(0.0, -0.15 * far, 0.36 * far), vertical_fov=37.0)
