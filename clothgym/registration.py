@@ -24,6 +24,14 @@ ENVIRONMENTS = {
         "ClothDrapeGripper",
         "Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.",
     ),
+    "ClothHang-v0": (
+        "ClothHang",
+        "Hang a sheet that is held by two corners over a rail, and let go of it.",
+    ),
+    "ClothHang-Hard-v0": (
+        "ClothHangHard",
+        "Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.",
+    ),
     "ClothStrain-v0": (
         "ClothStrain",
         "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
@@ -34,7 +42,10 @@ ENVIRONMENTS = {
     ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
-LONGEST = {"ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFold-v0": 210}
+LONGEST = {
+    "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
+    "ClothStrain-v0": 150, "ClothFold-v0": 210,
+}  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 
 

@@ -3,6 +3,7 @@
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
 python docs/pictures.py --contact                                  # contact alone
 python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learned policy
+python docs/pictures.py --expert ClothHang-Hard-v0 hang.gif        # or of a scripted expert
 """
 
 from __future__ import annotations
@@ -52,6 +53,10 @@ def draw_strips() -> None:
         "strain.png": [
             strip("ClothStrain-v0", (0, 30, 50, 75), 7),
             strip("ClothStrain-v0", (0, 12, 22, 35), 7, careless=True),
+        ],
+        "hang.png": [
+            strip("ClothHang-v0", (0, 12, 18, 30), 7),
+            strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
         ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
     }
@@ -118,12 +123,13 @@ def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", nargs=2, metavar=("FOLDER", "GIF"), help="folder of a training run, and the film's name")
+    parser.add_argument("--expert", nargs=2, metavar=("ENV", "GIF"), help="id whose scripted expert is filmed, and the film's name")
     parser.add_argument("--contact", action="store_true", help="draw contact alone")
     options = parser.parse_args()
     if options.contact:
         draw_contact()
         return
-    if options.run is None:
+    if options.run is None and options.expert is None:
         draw_strips()
         draw_contact()
         return
@@ -131,6 +137,11 @@ def main() -> None:
     import policies
     import report
 
+    if options.expert is not None:
+        env_id, name = options.expert
+        expert = policies.named("expert", f"clothgym:{env_id}", 0)
+        report.film(HERE / name, f"clothgym:{env_id}", expert, {}, episodes=2, stride=4)
+        return
     folder = Path(options.run[0])
     config = policies.read_config(folder)
     policy = policies.learned(folder, config["env"])

@@ -10,6 +10,7 @@ from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperV
 from clothgym.envs.episode import TaskState
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldVectorEnv
 from clothgym.envs.gripper_task import GripperTask
+from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv, ClothHangHardVectorEnv, ClothHangVectorEnv
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
@@ -26,6 +27,10 @@ __all__ = [
     "ClothEnv",
     "ClothFoldEnv",
     "ClothFoldVectorEnv",
+    "ClothHangEnv",
+    "ClothHangHardEnv",
+    "ClothHangHardVectorEnv",
+    "ClothHangVectorEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
     "ClothStrainEnv",

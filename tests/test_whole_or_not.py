@@ -35,6 +35,8 @@ OPTIONS = {
     "ClothReach-v0": [{"goal": (9, 9, 9)}, {"goal": (0, np.nan, 0)}, {"goal": 1.0}],
     "ClothDrape-v0": OF_A_TARGET,
     "ClothDrapeGripper-v0": [*OF_A_TARGET, {"rumpled": 1}],
+    "ClothHang-v0": [{"rail": {"height": 9}}, {"rail": {"yaw": 2}}, {"rail": {"color": 1}}, {"rail": 7}],
+    "ClothHang-Hard-v0": [{"rail": {"center": (5, 5)}}, {"rumpled": 1}],
     "ClothStrain-v0": [{"target": {}}],
 }
 SEEDS = [-1, 1.5, "1", True]

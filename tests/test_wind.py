@@ -298,9 +298,9 @@ def test_wind_blows_in_every_environment(env_id):
     assert moved[:, :, :3] == pytest.approx(np.broadcast_to([0, 3, 0], (8, 2, 3)), abs=1e-6)
     drift = windy.get_state().simulation.positions - windless.get_state().simulation.positions
     # a sheet that lies on the floor stays there: skin friction is less than the floor's
-    lies = start[:, :, 2].max() < 0.1
+    lies = start[:, :, 2].max(axis=1) < 0.09  # rumpled silk, which is higher, is blown away
     along = drift[:, :, 1].mean(axis=1)
-    assert np.all(np.abs(along) < 1e-3) if lies else np.all(along > 2e-3)
+    assert np.all(np.where(lies, np.abs(along) < 1e-3, along > 2e-3))
     # with the keyword there is air about; without it, as the id says
     assert windless.unwrapped.task.simulation.air_density == RHO
     assert own.unwrapped.task.simulation.air_density == own.unwrapped.task.physics.air_density

@@ -1,0 +1,427 @@
+"""ClothHang-v0 and ClothHang-Hard-v0: hang a sheet over a rail, held by two corners or lying on the floor, and let go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import inlined
+from clothgym.attachments import Gripper
+from clothgym.checks import shown
+from clothgym.envs import draping, hanging
+from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.drape import LETS_GO
+from clothgym.envs.episode import Fields, length
+from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail, stop_at_rail
+from clothgym.envs.measures import distance
+from clothgym.envs.physics import MEDIAN, chosen_fabric
+from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.targets import ON_FLOOR
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.mesh import grid
+
+GUIDING = 0.5  # share of the potential that is for bringing the sheet to the rail
+PICKING, PICK_SCALE = 0.2, 0.15  # share of it that is for taking hold; in sides, how it rises as a gripper nears its corner
+REACH = 0.03  # of the fingers [m]
+
+# the scripted expert's ways, in sides: how far above the rail on the way and how far beyond it; where it lets go, beyond the rail
+# and below it; and how far above the rail it sets out
+EXPERT_LIFT, EXPERT_BEYOND, EXPERT_AT, EXPERT_DROP, EXPERT_CLEARS = 0.42, 0.32, 0.14, 0.39, 0.15
+EXPERT_SPEED = 0.8  # share of the speed limit
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _let_go(own, rules, sheet, move, free):
+    """Open the anchors that the action opens, or all when time is up."""
+    for k in range(free.shape[0]):
+        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
+            free[k], sheet.holds[k] = 1, 0
+
+
+@inlined
+def _holds_nothing(own, rules, sheet):
+    """Whether both anchors are open."""
+    for k in range(sheet.holds.shape[0]):
+        if sheet.holds[k] > 0:
+            return False
+    return True
+
+
+@inlined
+def _hanging(own, rules, sheet):
+    """How well the sheet hangs, and how near it is to that."""
+    return GUIDING * guidance(own, rules, sheet) + (1 - GUIDING) * hang_score(own)
+
+
+@inlined
+def _observe_held(own, rules, sheet, seen):
+    """What is observed in both tasks, and whether each corner is held."""
+    observe_rail(own, rules, sheet, seen)
+    for k in range(sheet.holds.shape[0]):
+        seen.holds[k] = sheet.holds[k] > 0
+
+
+@inlined
+def _take(own, rules, sheet, move, free):
+    """Remember which corners have been taken."""
+    for k in range(rules.places.shape[0]):
+        if sheet.holder[rules.places[k]] >= 0:
+            own.picked[k] = 1
+
+
+@inlined
+def _measure_both(own, rules, sheet):
+    """How the sheet hangs, and how far the tips must stay above the floor."""
+    measure_hang(own, rules, sheet)
+    measure_grips(own, rules, sheet)
+
+
+@inlined
+def _stop_at_solids(own, rules, k):
+    """The rail stops a tip, and the floor what it holds."""
+    stop_at_rail(own, rules, k)
+    stop_at_floor(own, rules, k)
+
+
+@inlined
+def _picking_and_hanging(own, rules, sheet):
+    """How far the taking hold is along, and the hanging."""
+    # 1 for a corner that has been taken, at most a half for one that its gripper is near
+    taken = 0.0
+    for k in range(rules.places.shape[0]):
+        place = rules.places[k]
+        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
+        taken += 1.0 if own.picked[k] else 0.5 / (1 + away**2)
+    return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * _hanging(own, rules, sheet)
+
+
+@inlined
+def _observe_grippers(own, rules, sheet, seen):
+    """What is observed in both tasks, and each gripper: its tip, the way to its corner, its fingers, whether it holds anything."""
+    observe_rail(own, rules, sheet, seen)
+    for k in range(rules.places.shape[0]):
+        attachment, place = sheet.attachments[k], rules.places[k]
+        for c in range(3):
+            seen.grippers[k, c] = (attachment[c] - own.origin[c]) / rules.side
+            seen.grippers[k, 3 + c] = (sheet.x[c, place] - attachment[c]) * (10 / rules.side)
+        seen.grippers[k, 6], seen.grippers[k, 7] = sheet.openings[k], sheet.holds[k] > 0
+
+
+# --- the tasks ----------------------------------------------------------------------------------------------------------------
+
+
+def ways_over(task: HangingTask, hands: NDArray, beside: NDArray) -> tuple[NDArray, NDArray]:
+    """What is left of the way of two hands that carry an edge over the rail [m], in its frame, (num_envs, 2, 3), and whether they
+    are there, (num_envs, 1).
+
+    hands: in that frame [m], (num_envs, 2, 3).  beside: of each on the rail, at the end [m], (2,).
+    """
+    side = task.physics.side
+    across, above = hands[..., 1].mean(axis=1, keepdims=True), hands[..., 2].min(axis=1, keepdims=True)
+    high = above > EXPERT_CLEARS * side
+    # over it; or, beyond the rail, down
+    down = (across > (EXPERT_BEYOND - 0.04) * side) | ((across > 0.5 * EXPERT_AT * side) & ~high)
+    goal = np.empty_like(hands)
+    goal[..., 0] = beside
+    goal[..., 1] = np.where(down, EXPERT_AT * side, np.where(high, EXPERT_BEYOND * side, hands[..., 1]))
+    goal[..., 2] = np.where(down, -EXPERT_DROP * side, EXPERT_LIFT * side)
+    # on the way down, outside first
+    goal[..., 1] = np.where(down & high, EXPERT_BEYOND * side, goal[..., 1])
+    there = down & (np.abs(above + EXPERT_DROP * side) < 0.02) & (np.abs(across - EXPERT_AT * side) < 0.02)
+    return goal - hands, there
+
+
+class HangTask(HangingTask):
+    """The task of ``ClothHang-v0``, see ``ClothHangEnv``."""
+
+    physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
+    kernels = Kernels(
+        _hanging, hanging.evaluate_hang, _observe_held, act=_let_go, measure=measure_hang, done=_holds_nothing,
+        account=hanging.account_hang, stop=stop_at_rail,
+    )  # fmt: skip
+    acting_steps = 80
+    actions_per_attachment = 4
+    observations = (*hanging.OBSERVATIONS, Observation("holds", "whether each corner is held", (2,)))
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        self.draw_rail(env, rng, options.get("rail", {}))
+        mesh, side = self.physics.mesh, self.physics.side
+        away, sideways, clearance = side * rng.uniform(0.5, 0.7), side * rng.uniform(-0.15, 0.15), side * rng.uniform(0.1, 0.25)
+        yaw, ripple = rng.uniform(-0.3, 0.3), rng.normal(scale=1e-3, size=mesh.num_particles)
+        # the sheet hangs in a plane before the rail, its held edge up
+        rest = mesh.rest_positions
+        c, s = np.cos(yaw), np.sin(yaw)
+        x = np.stack([c * rest[:, 0] - s * ripple, s * rest[:, 0] + c * ripple, clearance + side / 2 + rest[:, 1]], axis=1)
+        return self.before(env, x, -away, sideways)
+
+    def expert_actions(self) -> NDArray:
+        """Up, over the rail, and down on its other side until half of the sheet is there, then let go.
+
+        Without memory: where the anchors are says which part of the way they are on.
+        """
+        hands = self.episode["targets"]
+        goal, there = ways_over(self, self.in_frame(hands), self.physics.mesh.rest_positions[list(self.physics.held), 0])
+        move = self.out_of_frame(goal) / (2 * self.physics.time_step * self.physics.attachment_speed)
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
+        release = np.where(there, 1.0, -1.0)[..., None] * np.ones((1, 2, 1))
+        return np.concatenate([move, release], axis=2).reshape(self.num_envs, -1)
+
+
+class HangHardTask(HangingTask, GripperTask):
+    """The task of ``ClothHang-Hard-v0``, see ``ClothHangHardEnv``."""
+
+    physics = replace(
+        draping.PHYSICS,
+        mesh=grid(21, 21, 0.8, 0.8),
+        material=chosen_fabric("silk", MEDIAN),
+        grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2,
+        fast={"air_density": 0.0},
+    )
+    # an agent is never done: it may take hold again until its time is up
+    kernels = Kernels(
+        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=_take, measure=_measure_both,
+        account=hanging.account_hang, fingers=close_or_open, stop=_stop_at_solids,
+    )  # fmt: skip
+    acting_steps = 130
+    radius = 0.035
+    rail_friction = 0.3
+    rail_thickness = 0.007
+    observations = (
+        *hanging.OBSERVATIONS,
+        Observation(
+            "grippers",
+            "for each gripper its tip relative to the middle of the rail [L], the way from its tip to the corner that it is meant "
+            "to take [L/10], how far open its fingers are, and whether it holds anything",
+            (2, 8),
+            "",
+            (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0, 1.0),
+        ),
+    )
+    ranges: ClassVar = {**HangingTask.ranges, **GripperTask.ranges, "picked": (0, 1)}
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "rail", "rumpled")
+    arguments: ClassVar = {
+        **GripperTask.arguments,
+        "action_mode": '"velocity" alone: what is picked and placed ends on the floor',
+    }
+
+    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
+        if action_mode != "velocity":
+            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed ends on the floor")
+        super().__init__(num_envs, **kwargs)
+
+    @property
+    def places(self) -> NDArray:
+        """The particles that each gripper is to take: both corners of the edge at the rail."""
+        return np.array(self.physics.mesh.corners[2:])
+
+    def remembers(self) -> Fields:
+        # whether each corner has ever been held
+        return [*super().remembers(), ("picked", np.uint8, len(self.places))]
+
+    def constants(self) -> dict[str, Any]:
+        return super().constants() | {"places": self.places}
+
+    def check_options(self, options: Mapping[str, Any]) -> None:
+        super().check_options(options)
+        if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
+            raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        self.draw_rail(env, rng, options.get("rail", {}))
+        mesh, side = self.physics.mesh, self.physics.side
+        gap, sideways, yaw = side * rng.uniform(0.1, 0.2), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
+        sheets = rumpled_sheets(*mesh.grid_shape, side)
+        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(sheets)))
+        flat = mesh.rest_positions + (0, 0, ON_FLOOR)
+        x = sheets[number].copy() if options.get("rumpled", rumpled) else flat
+        c, s = np.cos(yaw), np.sin(yaw)
+        x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
+        # beside the rail, all of it
+        x = self.before(env, x, -x[:, 1].max() - (self.radius * side + gap), sideways)
+        x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
+        away = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
+        self.gripper_starts[env] = x[self.places] + side * away
+        self.episode["picked"][env] = False
+        return x
+
+    def expert_actions(self) -> NDArray:
+        """To the corners, close, up, over the rail, and down on its other side until half of the sheet is there; open, and away.
+
+        Without memory: where the grippers are, and what they hold, says which part of the way they are on.
+        """
+        grippers, places = self.simulation.grippers, self.places
+        tips = grippers.positions.astype(np.float64)
+        to_place = self.simulation.positions[:, places] - tips
+        own = grippers.holder[:, places] >= 0
+        ready = np.logical_and.reduce(own, axis=1, keepdims=True)
+        begun = np.logical_and.reduce(self.episode["picked"], axis=1, keepdims=True)
+        hands = self.in_frame(tips)
+        goal, there = ways_over(self, hands, self.physics.mesh.rest_positions[places, 0])
+        # when it hangs, out of its way
+        away = self.out_of_frame(np.where((hands[..., 1] > 0)[..., None], (0.0, 0.1, 0.0), (0.0, 0.0, 0.1)))
+        move = np.where(ready[..., None], self.out_of_frame(goal) / 2, np.where((begun & ~ready)[..., None], away, to_place / 2))
+        move = np.where((own & ~ready)[..., None], 0.0, move)
+        move /= self.physics.time_step * self.physics.attachment_speed
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
+        near = length(to_place) < REACH / 2
+        grip = np.where(begun & (there | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
+        return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
+
+
+class ClothHangEnv(ClothEnv):
+    """Hang a sheet that is held by two corners over a rail, and let go of it.
+
+    ## Description
+    True physics: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves through air.
+
+    A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.5 to 0.7 L in front of a rail: a rod of
+    radius 0.05 L and length 1.6 L, level, on two posts of the same radius, its axis 0.75 to 1 L above the floor.  The agent moves
+    both corners and may let go of each.  When it holds none, or after 80 steps, at which both are let go, the sheet has five
+    seconds, 150 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until then is as good as
+    to let go.
+
+    The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), whole-sheet contact with friction
+    0.5, strict self-collision, quadratic bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; rail and
+    posts stop the corners; 30 Hz control, ``semi_implicit_euler`` with 50 substeps.  Cloth rests 6 mm from the rail's surface,
+    about the height of the rail's arc over a side of a triangle, so that particles carry it and it does not tremble.
+
+    ``physics="fast"`` has short cuts: contact of particles alone, none of the sheet with itself, skip springs without rigidity,
+    hands that go through solids, a cotton in a linear drag of 4.8 per second and no other air.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each corner:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | let go for good, if above 0.8 | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance
+    d of the sheet's center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.  At
+    the end it is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    The rail's vertical plane cuts the sheet.  Balance B is twice the smaller part's share of the area.  Support S is the length of
+    the cut, measured on the flat sheet, that lies between the rail's posts, and between its axis and 0.05 L above the surface on
+    which cloth rests: in sides, at most 1, since no line that halves a square is shorter.  F is the share of the area lower than
+    3 cm.  All are of the triangles' surface, so another resolution of the same surface has the same.  The score after each step
+    is B S (1 - F): 0 on the floor, beside or under the rail; 1 for a sheet that the rail halves.  So cloth that is held up without
+    the rail, that lies beneath it, or that hangs by a corner scores nothing or little.
+
+    ``info["normalized_performance"]`` = B S (1 - F) / (1 + (v / 0.1 m/s)^2), with the rms speed v, after the five seconds.
+    ``info["is_success"]``: B >= 0.6 (3/10 of the sheet on either side), S >= 0.9, F <= 0.02 and v under 0.02 m/s.  ``info`` also
+    has ``balance``, ``support``, ``lying`` (F), ``rms_speed`` [m/s], which are 0 until then, and in each step ``best``, the
+    episode's best score, ``first_success``, the first step after which the sheet hangs so and nothing holds it, or -1,
+    ``success_held``, whether it has hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the
+    ``reward/...`` terms.
+
+    ## Starting State
+    The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
+    the rail, with a ripple of a millimeter.  The rail's middle is within 0.15 L of the origin in x and y; it is turned by up to
+    45 degrees.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged"
+    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"rail"``, a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad] (the
+    rest is drawn), and ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = HangTask
+
+
+class ClothHangVectorEnv(ClothVectorEnv):
+    """``ClothHang-v0`` as a batch, see ``ClothHangEnv``."""
+
+    task_class = HangTask
+
+
+class ClothHangHardEnv(ClothEnv):
+    """Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.
+
+    ## Description
+    True physics, as in ``ClothHang-v0``: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves
+    through air.
+
+    The rail and the evaluation are those of ``ClothHang-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles), of silk
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction 0.3, and cloth rests
+    7 mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail.
+    A gripper is a kinematic body with two fingers: when these have closed it holds the particles within 3 cm of its tip, and when
+    they begin to open it lets go; it may take hold as often as it likes.  The fingers do not push the cloth; the rail stops a
+    gripper's tip, the floor what it holds, and while they move it does not sink.  After 130 steps they open, and the sheet has five
+    seconds, 150 steps, in which actions are ignored; then it is evaluated.
+
+    ``physics="fast"`` has the short cuts of ``ClothHang-v0``, but for the fabric, which stays, and no air but a linear drag.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners
+    of 1 for one that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At the end it is the
+    normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    As in ``ClothHang-v0``, with the same ``info``.
+
+    ## Starting State
+    The sheet lies before the rail, all of it 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the side; in
+    half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L
+    beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged"
+    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"rail"``, as in ``ClothHang-v0``, ``"rumpled"``, True or False, and ``"material"``, a preset's
+    name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = HangHardTask
+
+
+class ClothHangHardVectorEnv(ClothVectorEnv):
+    """``ClothHang-Hard-v0`` as a batch, see ``ClothHangHardEnv``."""
+
+    task_class = HangHardTask
