@@ -84,9 +84,9 @@ def test_areas_are_those_of_the_polygons(rows):
     assert covered_area(laid(flat * (1, 0) - abs(flat) * (0, 1)), triangles, cell) == pytest.approx(SIDE**2 / 2, rel=1e-2)
 
 
-def episodes(count, seed=1_000_000, still=False, **kwargs):
+def episodes(count, seed=1_000_000, still=False, env_id=ID, **kwargs):
     """The last infos of so many episodes, of the expert, or of nobody; and how high the sheet ever was in the last 60 steps [m]."""
-    env = gym.make_vec(ID, num_envs=count, autoreset_mode="Disabled", **kwargs)
+    env = gym.make_vec(env_id, num_envs=count, autoreset_mode="Disabled", **kwargs)
     env.reset(seed=seed)
     terminated, highest = np.zeros(count, bool), 0.0
     while not terminated.all():
