@@ -128,7 +128,7 @@ class FoldGoalTask(ManipulationTask):
     }
     away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
     turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
-    single: ClassVar[float] = 0.0  # share of the episodes in which one corner is carried alone: a stiff sheet springs back from that
+    single: ClassVar[float] = 0.0  # share of the episodes with one carried corner alone: a stiff sheet springs back from that
 
     def __init__(self, num_envs: int, reward_mode: str = "goal", **kwargs: Any) -> None:
         one_of("reward_mode", reward_mode, "goal", *REWARD_MODES)
@@ -163,8 +163,9 @@ class FoldGoalTask(ManipulationTask):
         else:
             own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * side
             own["goal"][a] += share * (corners[beyond] - corners[a]) + (0, 0, LAYER)
-        hands = corners[[a, b]]
-        self.gripper_starts[env] = hands + side * np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], 1)
+        # above the corner that each is to take
+        beside = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
+        self.gripper_starts[env] = corners[[a, b]] + side * beside
         return self.uneven(x, rng)
 
     def advance(self, actions: Any) -> None:
@@ -328,15 +329,15 @@ class ClothFoldGoalEnv(GoalEnv):
     the ideal.
 
     ## Starting State
-    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges is
-    to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
+    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges
+    is to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
     corners.
 
     ## Episode End
     Terminated when evaluated, after 80 steps and 40 of settling; or at a failure, which ``env.metadata["failures"]`` names by the
-    code ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond
-    the arena of 2.4 m), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit is part of
-    the task, and the time left is observed.
+    code ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m
+    beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit is
+    part of the task, and the time left is observed.
 
     ## Arguments
     $arguments
@@ -364,9 +365,9 @@ class ClothFoldGoalHardEnv(GoalEnv):
     moves through air.
 
     Everything is as in ``ClothFoldGoal-v0`` but for the sheet and its start, which are those of ``ClothFold-Hard-v0``: L = 0.8 m
-    (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  And as often as not one
-    corner is to be carried alone, at least half the way to the opposite one, while the other gripper, which begins above the next
-    corner, has nothing to do.  The time is 100 steps, and 50 of settling.
+    (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  And as often as not
+    one corner is to be carried alone, at least half the way to the opposite one, while the other gripper, which begins above the
+    next corner, has nothing to do.  The time is 100 steps, and 50 of settling.
 
     ## Action Space
     As in ``ClothFoldGoal-v0``: ``Box(-1, 1, (8,))``, for each gripper a velocity, and what the fingers do.

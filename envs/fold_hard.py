@@ -16,9 +16,7 @@ from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 # a larger sheet of silk, with the short cuts of the others but for their fabric
-LARGE_SILK = replace(
-    PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0}
-)
+LARGE_SILK = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0})
 
 
 class FoldHardTask(FoldTask):

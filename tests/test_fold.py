@@ -110,6 +110,12 @@ def test_what_was_pressed_together_does_not_jump_when_it_is_let_go():
     assert episodes(2, seed=1_000_006, fold="quarter")[1] < 0.15
 
 
+def test_the_expert_folds_a_large_sheet_of_silk_twice():
+    info, _ = episodes(4, env_id=ID.replace("-v0", "-Hard-v0"))
+    assert info["is_success"].sum() >= 3 and info["fold_error_mm"].max() < 45 and not info["failure"].any()
+    assert np.allclose(info["fold_error_mm"], 800 * info["fold_error"])
+
+
 def test_doing_nothing_scores_nothing():
     info, _ = episodes(2, still=True)
     assert not info["is_success"].any() and info["normalized_performance"].max() < 0.02
