@@ -40,11 +40,23 @@ ENVIRONMENTS = {
         "ClothFold",
         "Fold a sheet that lies on the floor in half, along its diagonal, or twice.",
     ),
+    "ClothFold-Hard-v0": (
+        "ClothFoldHard",
+        "Fold a large sheet of silk, turned by any angle on the floor, in half twice.",
+    ),
+    "ClothFoldGoal-v0": (
+        "ClothFoldGoal",
+        "Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.",
+    ),
+    "ClothFoldGoal-Hard-v0": (
+        "ClothFoldGoalHard",
+        "Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
-    "ClothStrain-v0": 150, "ClothFold-v0": 210,
+    "ClothStrain-v0": 150, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150,
 }  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 

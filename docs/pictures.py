@@ -2,6 +2,7 @@
 
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
 python docs/pictures.py --contact                                  # contact alone
+python docs/pictures.py --folds                                    # a film of the three folds
 python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learned policy
 python docs/pictures.py --expert ClothHang-Hard-v0 hang.gif        # or of a scripted expert
 """
@@ -24,12 +25,19 @@ from clothgym.render.renderer import Renderer
 from clothgym.starts import MANEUVERS
 
 HERE = Path(__file__).parent
-SIZE = 300
+SIZE, FILMED = 300, 220
 
 
-def strip(env_id: str, moments: tuple[int, ...], seed: int, options: dict[str, Any] | None = None, careless: bool = False) -> Any:
+def strip(
+    env_id: str,
+    moments: tuple[int, ...],
+    seed: int,
+    options: dict[str, Any] | None = None,
+    careless: bool = False,
+    **kwargs: Any,
+) -> Any:
     """One episode of a scripted agent as a row of moments, the last of which is its end, (height, width, 3)."""
-    env = gym.make(f"clothgym:{env_id}").unwrapped
+    env = gym.make(f"clothgym:{env_id}", **kwargs).unwrapped
     env.reset(seed=seed, options=options)
     renderer = renderer_of(env.task, SIZE, SIZE, antialias=3)
     frames, step, terminated = [], 0, False
@@ -59,9 +67,39 @@ def draw_strips() -> None:
             strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
         ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
+        "fold.png": fold_strips(),
     }
     for name, rows in pictures.items():
         iio.imwrite(HERE / name, np.concatenate(rows, axis=0))
+
+
+def fold_strips() -> list[Any]:
+    """A row for each fold."""
+    return [
+        strip("ClothFold-v0", (0, 16, 30, 44), 7, fold="half"),
+        strip("ClothFold-v0", (0, 18, 36, 54), 7, fold="diagonal"),
+        strip("ClothFold-Hard-v0", (0, 30, 60, 100), 8),
+    ]
+
+
+def draw_folds() -> None:
+    """The strip of the folds, and their film, side by side: what has ended stands still."""
+    from clothgym.render import write_video
+
+    iio.imwrite(HERE / "fold.png", np.concatenate(fold_strips(), axis=0))
+    columns = []
+    for env_id, fold in (("ClothFold-v0", "half"), ("ClothFold-v0", "diagonal"), ("ClothFold-Hard-v0", "quarter")):
+        env = gym.make(f"clothgym:{env_id}", fold=fold).unwrapped
+        env.reset(seed=7)
+        renderer = renderer_of(env.task, FILMED, FILMED, antialias=1)
+        frames, terminated = [draw(env.task, renderer, "rgb_array", [0])[0]], False
+        while not terminated:
+            *_, terminated, _, _ = env.step(env.expert_action())
+            frames.append(draw(env.task, renderer, "rgb_array", [0])[0])
+        columns.append(frames)
+    longest = max(map(len, columns))
+    film = [np.concatenate([column[min(k, len(column) - 1)] for column in columns], axis=1) for k in range(0, longest, 4)]
+    write_video(HERE / "fold.gif", film, fps=7.5)
 
 
 def stool(width: float = 0.3, leg: float = 0.05, height: float = 0.25, thick: float = 0.04) -> tuple[Any, Any]:
@@ -125,9 +163,13 @@ def main() -> None:
     parser.add_argument("--run", nargs=2, metavar=("FOLDER", "GIF"), help="folder of a training run, and the film's name")
     parser.add_argument("--expert", nargs=2, metavar=("ENV", "GIF"), help="id whose scripted expert is filmed, and the film's name")
     parser.add_argument("--contact", action="store_true", help="draw contact alone")
+    parser.add_argument("--folds", action="store_true", help="draw and film the folds alone")
     options = parser.parse_args()
     if options.contact:
         draw_contact()
+        return
+    if options.folds:
+        draw_folds()
         return
     if options.run is None and options.expert is None:
         draw_strips()

@@ -9,6 +9,8 @@ from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldVectorEnv
+from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv, ClothFoldGoalHardVectorEnv, ClothFoldGoalVectorEnv
+from clothgym.envs.fold_hard import ClothFoldHardEnv, ClothFoldHardVectorEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv, ClothHangHardVectorEnv, ClothHangVectorEnv
 from clothgym.envs.physics import Physics
@@ -26,6 +28,12 @@ __all__ = [
     "ClothDrapeVectorEnv",
     "ClothEnv",
     "ClothFoldEnv",
+    "ClothFoldGoalEnv",
+    "ClothFoldGoalHardEnv",
+    "ClothFoldGoalHardVectorEnv",
+    "ClothFoldGoalVectorEnv",
+    "ClothFoldHardEnv",
+    "ClothFoldHardVectorEnv",
     "ClothFoldVectorEnv",
     "ClothHangEnv",
     "ClothHangHardEnv",

@@ -188,6 +188,19 @@ def _observe(own, rules, sheet, seen):
             seen.ways[k, c] = (sheet.x[c, rules.places[k]] - sheet.attachments[k, c]) * (10 / rules.side)
 
 
+def along_arc(way: NDArray, height: NDArray, whole: NDArray, low: float) -> tuple[NDArray, NDArray]:
+    """The expert's next step on an arc to a goal [m], (..., 3), and the way that is left along the floor [m], (...).
+
+    It goes some way on, and as high as the arc is there.  way: from each tip to its goal [m], (..., 3).  height: of the tips [m].
+    whole: width of the arcs [m].  low: height of their ends [m].
+    """
+    left = np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2)
+    ahead = np.clip(left - EXPERT_STEP, 0, whole)
+    step = way * np.minimum(1, EXPERT_STEP / np.maximum(left, 1e-9))[..., None]
+    step[..., 2] = EXPERT_ARC * np.sqrt(ahead * (whole - ahead)) + low - height
+    return step, left
+
+
 class FoldTask(ManipulationTask):
     """The task of ``ClothFold-v0``, see ``ClothFoldEnv``.
 
@@ -217,10 +230,11 @@ class FoldTask(ManipulationTask):
     arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
     away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
     turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
+    acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
 
     def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:
         one_of("fold", fold, *FOLDS)
-        self.fold, self.acting_steps = fold, ACTING_STEPS[fold]  # type: ignore[misc]
+        self.fold, self.acting_steps = fold, self.acting[fold]  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
 
     @property
@@ -291,12 +305,7 @@ class FoldTask(ManipulationTask):
             apart = held & (holder[:, goals] < 0)
             now = ~found & ~(np.logical_and.reduce(met, axis=1) & ~np.logical_or.reduce(apart, axis=1))
             found |= now
-            # along an arc over the goal: some way on, and as high as the arc is there
-            way = began[:, goals] - tip
-            left = np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2)
-            ahead = np.clip(left - EXPERT_STEP, 0, whole)
-            step = way * np.minimum(1, EXPERT_STEP / np.maximum(left, 1e-9))[..., None]
-            step[..., 2] = EXPERT_ARC * np.sqrt(ahead * (whole - ahead)) + low - tip[..., 2]
+            step, left = along_arc(began[:, goals] - tip, tip[..., 2], whole, low)
             # those that hold their place wait for the others, at the start and at the end
             to_place = place - tip
             all_held = np.logical_and.reduce(held, axis=1, keepdims=True)
@@ -314,7 +323,8 @@ class FoldTask(ManipulationTask):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        return Camera(eye=(0.9, -1.35, 1.05), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
+        far = self.physics.side / FoldTask.physics.side
+        return Camera(eye=(0.9 * far, -1.35 * far, 1.05 * far), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
 
 
 class ClothFoldEnv(ClothEnv):

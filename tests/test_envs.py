@@ -34,6 +34,11 @@ def drawn(env, seed=0):
         yield rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
 
 
+def flat(observation):
+    """An observation as one array, of goals as well."""
+    return np.concatenate(list(observation.values()), axis=-1) if isinstance(observation, dict) else observation
+
+
 def length(task):
     """Steps of an episode that goes on to its evaluation."""
     return task.acting_steps + task.settling_steps
@@ -79,7 +84,8 @@ def test_observations_lie_in_their_space_and_are_fresh(env_id, obs_mode):
     for _, action in zip(range(30), drawn(env)):
         observation, _, terminated, *_ = env.step(action)
         assert observation in env.observation_space
-        assert not np.shares_memory(observation, previous)
+        parts = [(observation, previous)] if isinstance(observation, np.ndarray) else zip(observation.values(), previous.values())
+        assert not any(np.shares_memory(*part) for part in parts)
         previous = env.reset()[0] if terminated else observation
 
 
@@ -243,7 +249,7 @@ def test_bad_reset_options_are_named_and_leave_nothing_behind(env_id, options, n
         with pytest.raises(ValueError, match=name):
             env.reset(seed=0, options=options)
     again, _ = env.reset(seed=0)
-    assert np.array_equal(again, fresh) and np.array_equal(env.task.simulation.parameters, properties)
+    assert np.array_equal(flat(again), flat(fresh)) and np.array_equal(env.task.simulation.parameters, properties)
 
 
 @every_id
@@ -279,7 +285,7 @@ def test_a_diverged_environment_is_contained(env_id):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 env.unwrapped.task.simulation.set_parameters(stiff, stretch_stiffness=261.1 * 1000)
-        runs.append([env.step(still(env)) for _ in range(12)])
+        runs.append([(flat(seen), *brought) for seen, *brought in (env.step(still(env)) for _ in range(12))])
     ends = [step for step, result in enumerate(runs[1]) if result[2][1]]
     assert len(ends) == 1
     _, reward, _, truncated, info = runs[1][ends[0]]

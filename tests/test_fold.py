@@ -84,9 +84,9 @@ def test_areas_are_those_of_the_polygons(rows):
     assert covered_area(laid(flat * (1, 0) - abs(flat) * (0, 1)), triangles, cell) == pytest.approx(SIDE**2 / 2, rel=1e-2)
 
 
-def episodes(count, seed=1_000_000, still=False, **kwargs):
+def episodes(count, seed=1_000_000, still=False, env_id=ID, **kwargs):
     """The last infos of so many episodes, of the expert, or of nobody; and how high the sheet ever was in the last 60 steps [m]."""
-    env = gym.make_vec(ID, num_envs=count, autoreset_mode="Disabled", **kwargs)
+    env = gym.make_vec(env_id, num_envs=count, autoreset_mode="Disabled", **kwargs)
     env.reset(seed=seed)
     terminated, highest = np.zeros(count, bool), 0.0
     while not terminated.all():
@@ -108,6 +108,12 @@ def test_the_expert_folds(fold, error):
 def test_what_was_pressed_together_does_not_jump_when_it_is_let_go():
     """Impulses that had borne what the fingers pressed threw it up by half a meter."""
     assert episodes(2, seed=1_000_006, fold="quarter")[1] < 0.15
+
+
+def test_the_expert_folds_a_large_sheet_of_silk_twice():
+    info, _ = episodes(4, env_id=ID.replace("-v0", "-Hard-v0"))
+    assert info["is_success"].sum() >= 3 and info["fold_error_mm"].max() < 45 and not info["failure"].any()
+    assert np.allclose(info["fold_error_mm"], 800 * info["fold_error"])
 
 
 def test_doing_nothing_scores_nothing():

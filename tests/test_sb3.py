@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor
+from test_envs import flat
 
 from clothgym.adapters.sb3 import make_sb3_vec_env
 from clothgym.registration import ENVIRONMENTS, LONGEST
 
-every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
+# a harder tier has its task's spaces
+every_id = pytest.mark.parametrize("env_id", [env_id for env_id in ENVIRONMENTS if "-Hard" not in env_id])
 
 
 @every_id
@@ -20,20 +22,20 @@ def test_it_gives_what_the_native_batch_gives(env_id):
     native = gym.make_vec(f"clothgym:{env_id}", num_envs=3, autoreset_mode="SameStep")
     rng, task = np.random.default_rng(0), native.unwrapped.task
     observation, _ = native.reset(seed=4)
-    assert np.array_equal(adapter.reset(), observation)
+    assert np.array_equal(flat(adapter.reset()), flat(observation))
     ended = False
     for _ in range(task.acting_steps + task.settling_steps + 2):
         actions = rng.uniform(-1, 1, native.action_space.shape).astype(np.float32)
         observation, rewards, dones, infos = adapter.step(actions)
         expected, reward, terminated, truncated, info = native.step(actions)
-        assert np.array_equal(observation, expected) and rewards.dtype == np.float32
+        assert np.array_equal(flat(observation), flat(expected)) and rewards.dtype == np.float32
         assert np.array_equal(rewards, reward.astype(np.float32)) and np.array_equal(dones, terminated | truncated)
         for i in range(3):
             # of a step within an episode there is nothing to tell but its cost, where the task has one
             assert dones[i] or infos[i] == ({"cost": info["cost"][i]} if "cost" in info else {})
             if dones[i]:
                 ended = True
-                assert np.array_equal(infos[i]["terminal_observation"], info["final_obs"][i])
+                assert np.array_equal(flat(infos[i]["terminal_observation"]), flat(info["final_obs"][i]))
                 assert infos[i]["TimeLimit.truncated"] is False
                 for key in ("normalized_performance", *(name for name, *_ in task.evaluation), "strain_max", "failure"):
                     assert infos[i][key] == info["final_info"][key][i], key
@@ -44,7 +46,8 @@ def test_it_gives_what_the_native_batch_gives(env_id):
 @every_id
 def test_sb3_trains_on_it_and_logs_episodes(env_id):
     env = VecMonitor(make_sb3_vec_env(env_id, 8, seed=0))
-    model = PPO("MlpPolicy", env, n_steps=64, batch_size=128, n_epochs=1, seed=0, device="cpu")
+    policy = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
+    model = PPO(policy, env, n_steps=64, batch_size=128, n_epochs=1, seed=0, device="cpu")
     model.learn(8 * 64 * math.ceil(LONGEST[env_id] / 64))
     assert len(model.ep_info_buffer) > 0
     assert all(np.isfinite(episode["r"]) for episode in model.ep_info_buffer)

@@ -1,0 +1,405 @@
+"""ClothFoldGoal-v0 and ClothFoldGoal-Hard-v0: one fold, asked for by where the sheet's corners are to be; for HER."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from clothgym._jit import inlined
+from clothgym.checks import one_of
+from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.episode import FINE, Fields, length
+from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, EXPERT_SPEED, FoldTask, along_arc
+from clothgym.envs.fold_hard import LARGE_SILK
+from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
+from clothgym.envs.measures import SPEED2, distance
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.targets import ON_FLOOR
+from clothgym.envs.task import REWARD_MODES
+from clothgym.envs.vector import ClothVectorEnv
+
+CORNERS = 4
+# largest distance of a corner from its goal, in sides; rms speed [m/s]
+ENOUGH_NEAR, ENOUGH_REST = 0.075, 0.02
+SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
+LAYER = 0.008  # height of what is folded over the layer below [m]
+LEAST, MOST = 0.5, 1.0  # how far a corner is carried, as a share of the way to the opposite edge or corner
+# the corners in order around the sheet, as places in ``mesh.corners``: each edge joins one to the next
+AROUND = (0, 1, 3, 2)
+GOALS = ("achieved_goal", "desired_goal")
+
+
+@inlined
+def _measure(own, rules, sheet):
+    """How far the corners are from their goals, in sides: on the average and at most."""
+    measure_grips(own, rules, sheet)
+    total, worst = 0.0, 0.0
+    for k in range(CORNERS):
+        away = distance(sheet.x[:, rules.corners[k]], own.goal[k]) / rules.side
+        total += away
+        worst = max(worst, away)
+    own.away, own.worst = total / CORNERS, worst
+    if own.step == 0:
+        own.began = own.away
+
+
+@inlined
+def _near(own, rules, sheet):
+    """How far the corners have come on the way from the start, in [0, 1]."""
+    return min(max(1 - own.away / own.began, 0.0), 1.0)
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write how much at rest the sheet is, and whether it is folded as asked for; returns the normalized performance."""
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    info.is_success = own.worst <= ENOUGH_NEAR and info.rms_speed < ENOUGH_REST
+    return _near(own, rules, sheet) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    """The distances after this step, and whether a success lasts; no reward terms."""
+    info.distance, info.distance_max = own.away, own.worst
+    reached = failure == FINE and own.worst <= ENOUGH_NEAR
+    follow(own, info, _near(own, rules, sheet), reached, running, failure)
+    return 0.0
+
+
+@inlined
+def _observe(own, rules, sheet, seen):
+    """The grippers, and where the corners are and are to be."""
+    observe_grippers(own, rules, sheet, seen)
+    for k in range(CORNERS):
+        for c in range(3):
+            seen.achieved_goal[k, c] = (sheet.x[c, rules.corners[k]] - own.origin[c]) / rules.side
+            seen.desired_goal[k, c] = (own.goal[k, c] - own.origin[c]) / rules.side
+
+
+def goal_reward(achieved: Any, desired: Any) -> NDArray[np.float32]:
+    """0 where every corner is near its goal, else -1, (...).
+
+    achieved, desired: of the corners, in sides, (..., 12).
+    """
+    way = np.asarray(achieved, np.float32) - np.asarray(desired, np.float32)
+    away2 = np.square(way.reshape(*way.shape[:-1], CORNERS, 3)).sum(axis=-1)
+    return -(away2.max(axis=-1) > np.float32(ENOUGH_NEAR**2)).astype(np.float32)
+
+
+class FoldGoalTask(ManipulationTask):
+    """The task of ``ClothFoldGoal-v0``, see ``ClothFoldGoalEnv``.
+
+    Args:
+        reward_mode: "goal", or what ``Task`` takes.
+    """
+
+    kernels = Kernels(
+        _near,
+        _evaluate,
+        _observe,
+        measure=_measure,
+        account=_account,
+        fingers=close_or_open,
+        stop=stop_at_floor,
+    )
+    acting_steps = 80
+    settling_steps = 40
+    obs_modes = ("keypoints", "particles")
+    # the goals at the end, from where ``as_dict`` takes them
+    observations = (
+        *ManipulationTask.observations,
+        Observation(GOALS[0], "where the four corners are", (CORNERS, 3), "L", POSITION_BOUND),
+        Observation(GOALS[1], "where they are to be", (CORNERS, 3), "L", POSITION_BOUND),
+    )
+    points_relative_to = "where the sheet's center lay"
+    evaluation = (("rms_speed", float),)
+    accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**ManipulationTask.ranges, "carried": (-1, CORNERS - 1)}
+    arguments: ClassVar = {
+        **ManipulationTask.arguments,
+        "reward_mode": '-1, and 0 where every corner is near its goal; or ``"delta"`` or ``"sparse"``',
+    }
+    away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
+    turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
+    single: ClassVar[float] = 0.0  # share of the episodes with one carried corner alone: a stiff sheet springs back from that
+
+    def __init__(self, num_envs: int, reward_mode: str = "goal", **kwargs: Any) -> None:
+        one_of("reward_mode", reward_mode, "goal", *REWARD_MODES)
+        super().__init__(num_envs, reward_mode="sparse" if reward_mode == "goal" else reward_mode, **kwargs)
+        self.reward_mode = reward_mode
+
+    def remembers(self) -> Fields:
+        # goals of the corners [m], those that each gripper is meant to take, or -1, and how far [m]; the corners' distances from
+        # their goals now, and on the average at the start, in sides
+        own: Fields = [("goal", float, (CORNERS, 3)), ("carried", np.int64, 2), ("width", float)]
+        return [*super().remembers(), *own, ("away", float), ("worst", float), ("began", float)]
+
+    def constants(self) -> dict[str, Any]:
+        return {"corners": np.array(self.physics.mesh.corners)}
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        mesh, side, own = self.physics.mesh, self.physics.side, self.episode[env]
+        yaw, (dx, dy) = rng.uniform(-self.turned, self.turned), side * rng.uniform(-self.away, self.away, 2)
+        flat = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
+        c, s = np.cos(yaw), np.sin(yaw)
+        x = np.stack([c * flat[:, 0] - s * flat[:, 1] + dx, s * flat[:, 0] + c * flat[:, 1] + dy, flat[:, 2] + ON_FLOOR], axis=1)
+        own["origin"] = dx, dy, 0
+        # the fold: of an edge or of a corner, which, and how far
+        corners, edge, first = x[list(mesh.corners)], rng.uniform() >= self.single, int(rng.integers(4))
+        share = rng.uniform(LEAST, MOST)
+        a, b, beyond, before = (AROUND[(first + k) % 4] for k in range(4))
+        own["goal"] = corners
+        if edge:
+            # both along the edges that leave it
+            own["carried"], own["width"] = (a, b), share * side
+            own["goal"][[a, b]] += share * (corners[[before, beyond]] - corners[[a, b]]) + (0, 0, LAYER)
+        else:
+            own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * side
+            own["goal"][a] += share * (corners[beyond] - corners[a]) + (0, 0, LAYER)
+        # above the corner that each is to take
+        beside = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
+        self.gripper_starts[env] = corners[[a, b]] + side * beside
+        return self.uneven(x, rng)
+
+    def advance(self, actions: Any) -> None:
+        running = ~self.episode["over"]
+        super().advance(actions)
+        if self.reward_mode == "goal":
+            achieved, desired = (self.observation[:, self.observation_slices[name]] for name in GOALS)
+            self.terms[...] = np.zeros((), self.terms.dtype)
+            self.terms["progress"] = self.outcome["reward"] = np.where(running, goal_reward(achieved, desired), 0)
+
+    def expert_actions(self) -> NDArray:
+        """Each carried corner along an arc to its goal, and then up and away.
+
+        Without memory: a corner that is near its goal and is not held has been brought, and so has one that was, and was let go.
+        """
+        grippers, side, envs = self.simulation.grippers, self.physics.side, np.arange(self.num_envs)[:, None]
+        tips, carried = grippers.positions.astype(np.float64), self.episode["carried"]
+        place = np.array(self.physics.mesh.corners)[np.maximum(carried, 0)]
+        x, goal = self.simulation.positions[envs, place].astype(np.float64), self.episode["goal"][envs, np.maximum(carried, 0)]
+        used, held = carried >= 0, grippers.holder[envs, place] >= 0
+        met = length(x - goal) < ENOUGH_NEAR * side
+        step, left = along_arc(goal - tips, tips[..., 2], self.episode["width"][:, None], EXPERT_LOW[0])
+        # those that hold their corner wait for the others, at the start and at the end
+        all_held = np.logical_and.reduce(held | ~used, axis=1, keepdims=True)
+        there = (left < EXPERT_NEAR * side) & (tips[..., 2] < EXPERT_LOW[0] + 0.02)
+        all_there = np.logical_and.reduce(there | ~used, axis=1, keepdims=True)
+        to_place = x - tips
+        going = np.where((held & all_held)[..., None], step, np.where(held[..., None], 0.0, to_place / 2))
+        brought = (self.episode["best"] > EXPERT_DONE) & ~np.logical_or.reduce(grippers.holder >= 0, axis=1)
+        away = ~used | (met & ~held) | brought[:, None]
+        move = np.where(away[..., None], (0.0, 0.0, 0.1), going)
+        closed = used & ((((length(to_place) < REACH / 2) & ~away) | held) & ~all_there)
+        move /= self.physics.time_step * self.physics.attachment_speed
+        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
+        return np.concatenate([move, np.where(closed, -1.0, 1.0)[..., None]], axis=2).reshape(self.num_envs, -1)
+
+    def camera(self) -> Any:
+        return FoldTask.camera(self)  # type: ignore[arg-type]
+
+
+class FoldGoalHardTask(FoldGoalTask):
+    """The task of ``ClothFoldGoal-Hard-v0``, see ``ClothFoldGoalHardEnv``."""
+
+    physics = LARGE_SILK
+    acting_steps = 100
+    settling_steps = 50
+    away = 0.25
+    turned = np.pi
+    single = 0.5
+
+
+# --- the environments -----------------------------------------------------------------------------------------------------
+
+
+def goal_space(space: gym.Space, slices: Mapping[str, slice]) -> gym.spaces.Dict:
+    """The space of ``as_dict``, of one environment; space: of what it takes apart."""
+    assert isinstance(space, gym.spaces.Box)
+    low, high = as_dict(space.low, slices), as_dict(space.high, slices)
+    return gym.spaces.Dict({name: gym.spaces.Box(low[name], high[name], dtype=np.float32) for name in low})
+
+
+def as_dict(observation: NDArray, slices: Mapping[str, slice]) -> dict[str, NDArray]:
+    """Observations of a ``FoldGoalTask``, (..., numbers), with both goals, (..., 12), taken out of them."""
+    goals = {name: observation[..., slices[name]].copy() for name in GOALS}
+    return {"observation": observation[..., : slices[GOALS[0]].start].copy(), **goals}
+
+
+class GoalEnv(ClothEnv):
+    """Base of the single environments with goals."""
+
+    def __init__(self, render_mode: str | None = None, render_color: str = "fabric", **kwargs: Any) -> None:
+        super().__init__(render_mode=render_mode, render_color=render_color, **kwargs)
+        self.observation_space = goal_space(self.observation_space, self.task.observation_slices)  # type: ignore[assignment]
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = super().reset(seed=seed, options=options)
+        return as_dict(observation, self.task.observation_slices), info
+
+    def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, *brought = super().step(action)
+        return as_dict(observation, self.task.observation_slices), *brought  # type: ignore[return-value]
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
+        """0 where every corner is near its goal, else -1, (...); goals: (..., 12), for instance a batch of relabeled ones."""
+        return goal_reward(achieved_goal, desired_goal)
+
+
+class GoalVectorEnv(ClothVectorEnv):
+    """Base of the batches with goals."""
+
+    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
+        super().__init__(num_envs, **kwargs)
+        self.single_observation_space = goal_space(self.single_observation_space, self.task.observation_slices)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        observation, info = super().reset(seed=seed, options=options)
+        return as_dict(observation, self.task.observation_slices), info
+
+    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
+        observation, *brought, info = super().step(actions)
+        slices = self.task.observation_slices
+        # what was last seen of those that have been reset
+        for env, last in enumerate(info.get("final_obs", ())):
+            if last is not None:
+                info["final_obs"][env] = as_dict(last, slices)
+        return as_dict(observation, slices), *brought, info  # type: ignore[return-value]
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
+        """0 where every corner is near its goal, else -1, (...); goals: (..., 12), for instance a batch of relabeled ones."""
+        return goal_reward(achieved_goal, desired_goal)
+
+
+class ClothFoldGoalEnv(GoalEnv):
+    """Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.
+
+    ## Description
+    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    The sheet and both grippers are those of ``ClothFold-v0``.  Each episode draws one fold and asks for it by where the four
+    corners are to be: those of one edge are carried over the sheet, at least half the way to the opposite edge, and the others stay
+    where they lie.  When the time is up the fingers open, and the sheet settles, in which actions are ignored.
+
+    Observations and ``compute_reward`` are those of Gymnasium-Robotics' goal environments, so that hindsight experience replay
+    can put other goals in the place of those that were asked for: SB3's ``HerReplayBuffer`` takes the single environment, and a
+    batch from ``clothgym.adapters.sb3.make_sb3_vec_env``.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
+    these.
+
+    $observations
+
+    ## Rewards
+    ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: what
+    ``compute_reward(achieved_goal, desired_goal, info)`` says, of one goal, (12,), or of many, (..., 12).
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is ``1 - d/d0``, see below; at the end it is the normalized performance, at a
+    failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    ``info["distance"]`` is the mean distance d of the corners from their goals, in sides, and ``distance_max`` the largest, after
+    every step; at the end there is also ``rms_speed`` in m/s.  Only the corners count: how flat the rest lies is
+    ``ClothFold-v0``'s.
+
+    Success: ``distance_max`` at most 0.075 and ``rms_speed`` below 0.02 m/s, at the end, when the grippers have let go.
+    ``info["best"]`` is the episode's best ``1 - d/d0``, ``first_success`` the first step with every corner near, or -1, and
+    ``success_held`` says whether they have been from then on.
+
+    ``info["normalized_performance"]`` is ``(1 - d/d0) / (1 + (rms_speed/0.1)^2)``, with d0 of the start: 0 for doing nothing, 1 for
+    the ideal.
+
+    ## Starting State
+    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges
+    is to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
+    corners.
+
+    ## Episode End
+    Terminated when evaluated, after 80 steps and 40 of settling; or at a failure, which ``env.metadata["failures"]`` names by the
+    code ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m
+    beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit is
+    part of the task, and the time left is observed.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FoldGoalTask
+
+
+class ClothFoldGoalVectorEnv(GoalVectorEnv):
+    """``ClothFoldGoal-v0`` as a batch, see ``ClothFoldGoalEnv``."""
+
+    task_class = FoldGoalTask
+
+
+class ClothFoldGoalHardEnv(GoalEnv):
+    """Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.
+
+    ## Description
+    True physics, as in ``ClothFoldGoal-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    Everything is as in ``ClothFoldGoal-v0`` but for the sheet and its start, which are those of ``ClothFold-Hard-v0``: L = 0.8 m
+    (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  And as often as not
+    one corner is to be carried alone, at least half the way to the opposite one, while the other gripper, which begins above the
+    next corner, has nothing to do.  The time is 100 steps, and 50 of settling.
+
+    ## Action Space
+    As in ``ClothFoldGoal-v0``: ``Box(-1, 1, (8,))``, for each gripper a velocity, and what the fingers do.
+
+    ## Observation Space
+    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
+    these.
+
+    $observations
+
+    ## Rewards
+    As in ``ClothFoldGoal-v0``.
+
+    ## Evaluation
+    As in ``ClothFoldGoal-v0``, with the same ``info``.
+
+    ## Episode End
+    As in ``ClothFoldGoal-v0``, with an arena of 3.2 m.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FoldGoalHardTask
+
+
+class ClothFoldGoalHardVectorEnv(GoalVectorEnv):
+    """``ClothFoldGoal-Hard-v0`` as a batch, see ``ClothFoldGoalHardEnv``."""
+
+    task_class = FoldGoalHardTask
