@@ -28,9 +28,20 @@ ENVIRONMENTS = {
         "ClothStrain",
         "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
     ),
+    "ClothFlatten-v0": (
+        "ClothFlatten",
+        "Spread a crumpled sheet on the floor with two grippers, and let go.",
+    ),
+    "ClothFlatten-Hard-v0": (
+        "ClothFlattenHard",
+        "Spread a larger crumpled sheet, of a fabric that varies, on the floor with two grippers, and let go.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
-LONGEST = {"ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150}
+LONGEST = {
+    "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
+    "ClothFlatten-Hard-v0": 360,
+}  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 
 

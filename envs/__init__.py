@@ -8,6 +8,7 @@ from clothgym.envs.definition import Observation
 from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
+from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv, ClothFlattenHardVectorEnv, ClothFlattenVectorEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
@@ -23,6 +24,10 @@ __all__ = [
     "ClothDrapeGripperVectorEnv",
     "ClothDrapeVectorEnv",
     "ClothEnv",
+    "ClothFlattenEnv",
+    "ClothFlattenHardEnv",
+    "ClothFlattenHardVectorEnv",
+    "ClothFlattenVectorEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
     "ClothStrainEnv",

@@ -1,0 +1,79 @@
+"""How much of the floor a sheet covers, seen from above: by triangles on a grid of the world, and by particles as SoftGym does.
+
+The grid's cells lie where they lie, whatever the sheet does.  A cell is covered if its center is in the projection of a triangle,
+so that the same surface covers the same cells, however many triangles it is made of.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from clothgym._jit import apart
+
+CELL, FINE_CELL = 0.01, 0.0025  # of the grid after each step, and at an episode's start and end [m]
+MOST_CELLS = 2000  # along a side of what is looked at, from the sheet's lowest x and y
+SOFTGYM_CELLS = 100  # along a side of the particles' bounding box
+
+
+@apart
+def covered_area(x, triangles, cell):
+    """Area of the union of a sheet's triangles, seen from above [m^2].
+
+    x: [m], (3, particles), finite.  triangles: (triangles, 3).  cell: side of the grid's cells [m]; centers at (i + 1/2) cell.
+    """
+    # the part of the grid that the sheet may cover: first cell and number of cells along x and y
+    first, count = np.empty(2, np.int64), np.empty(2, np.int64)
+    for c in range(2):
+        least, most = np.float64(x[c, 0]), np.float64(x[c, 0])
+        for p in range(1, x.shape[1]):
+            least, most = min(least, np.float64(x[c, p])), max(most, np.float64(x[c, p]))
+        first[c] = int(np.floor(least / cell))
+        count[c] = min(int(np.floor(most / cell)) - first[c] + 1, MOST_CELLS)
+    covered = np.zeros((count[1], count[0]), np.uint8)
+    # corners in cells, from the center of the first
+    u, v = np.empty(x.shape[1]), np.empty(x.shape[1])
+    for p in range(x.shape[1]):
+        u[p] = x[0, p] / cell - (first[0] + 0.5)
+        v[p] = x[1, p] / cell - (first[1] + 0.5)
+    for t in range(triangles.shape[0]):
+        # corners from low to high: neighbors go along an edge they share in the same direction, and round alike
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if v[b] < v[a] or (v[b] == v[a] and b < a):
+            a, b = b, a
+        if v[c] < v[b] or (v[c] == v[b] and c < b):
+            b, c = c, b
+            if v[b] < v[a] or (v[b] == v[a] and b < a):
+                a, b = b, a
+        # each row of centers between them, from one edge to the other: the lower end belongs to the triangle, the upper does not
+        for row in range(max(int(np.ceil(v[a])), 0), min(int(np.ceil(v[c])), count[1])):
+            low, high = (a, b) if row < v[b] else (b, c)
+            one = u[low] + (u[high] - u[low]) * ((row - v[low]) / (v[high] - v[low]))
+            other = u[a] + (u[c] - u[a]) * ((row - v[a]) / (v[c] - v[a]))
+            for column in range(max(int(np.ceil(min(one, other))), 0), min(int(np.ceil(max(one, other))), count[0])):
+                covered[row, column] = 1
+    # cells that are covered
+    total = 0
+    for row in range(count[1]):
+        for column in range(count[0]):
+            total += covered[row, column]
+    return total * cell * cell
+
+
+@apart
+def softgym_area(x, radius):
+    """Covered area as SoftGym's cloth tasks measure it [m^2]: of cells within ``radius`` of a particle along both axes.
+
+    The cells are 100 x 100 in the bounding box of the particles, so that they change with the pose.
+    """
+    low, span = np.empty(2), np.empty(2)
+    for c in range(2):
+        low[c] = x[c].min()
+        span[c] = max((x[c].max() - low[c]) / SOFTGYM_CELLS, 1e-9)
+    covered = np.zeros((SOFTGYM_CELLS, SOFTGYM_CELLS), np.uint8)
+    for p in range(x.shape[1]):
+        # from the nearest cell border below the particle to that above it
+        u, v = x[0, p] - low[0], x[1, p] - low[1]
+        for i in range(max(round((u - radius) / span[0]), 0), min(round((u + radius) / span[0]), SOFTGYM_CELLS)):
+            for j in range(max(round((v - radius) / span[1]), 0), min(round((v + radius) / span[1]), SOFTGYM_CELLS)):
+                covered[i, j] = 1
+    return covered.sum() * span[0] * span[1]
