@@ -171,7 +171,8 @@ class ClothFlattenHardEnv(ClothEnv):
     True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
     moves through air.
 
-    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers, as in ``ClothDrapeGripper-v0``, take the particles within
+    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers, as in
+    ``ClothDrapeGripper-v0``, take the particles within
     3 cm of their tips when their fingers have closed, other layers too.  After 320 steps they open, and the sheet settles for 40
     steps, in which actions are ignored; then it is evaluated.
 
@@ -211,7 +212,8 @@ class ClothFlattenHardEnv(ClothEnv):
     ## Starting State
     One of 96 crumpled sheets that cover 0.12 to 0.42 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a
     random particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by
-    up to 0.2 L along x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are
+    up to 0.2 L along x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the
+    sheet.  The grippers are
     open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
 
     ## Episode End

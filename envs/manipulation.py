@@ -65,7 +65,7 @@ class ManipulationTask(GripperTask):
     physics = PHYSICS
     acting_steps = 120
     settling_steps = 40
-    observations = (
+    observations: ClassVar[tuple[Observation, ...]] = (
         Observation(
             "grippers",
             "for each gripper its tip [L], how far open its fingers are, and whether it holds anything",
