@@ -53,6 +53,10 @@ def draw_strips() -> None:
             strip("ClothStrain-v0", (0, 30, 50, 75), 7),
             strip("ClothStrain-v0", (0, 12, 22, 35), 7, careless=True),
         ],
+        "flatten.png": [
+            strip("ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
+            strip("ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_003),
+        ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
     }
     for name, rows in pictures.items():
