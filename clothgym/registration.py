@@ -52,11 +52,20 @@ ENVIRONMENTS = {
         "ClothFoldGoalHard",
         "Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.",
     ),
+    "ClothFlatten-v0": (
+        "ClothFlatten",
+        "Spread a crumpled sheet on the floor with two grippers, and let go.",
+    ),
+    "ClothFlatten-Hard-v0": (
+        "ClothFlattenHard",
+        "Spread a larger crumpled sheet, of a fabric that varies, on the floor with two grippers, and let go.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
 LONGEST = {
-    "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
-    "ClothStrain-v0": 150, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150,
+    "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
+    "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
+    "ClothFoldGoal-Hard-v0": 150, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
 }  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 

@@ -66,6 +66,10 @@ def draw_strips() -> None:
             strip("ClothHang-v0", (0, 12, 18, 30), 7),
             strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
         ],
+        "flatten.png": [
+            strip("ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
+            strip("ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_003),
+        ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
         "fold.png": fold_strips(),
     }

@@ -8,6 +8,7 @@ from clothgym.envs.definition import Observation
 from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
+from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv, ClothFlattenHardVectorEnv, ClothFlattenVectorEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldVectorEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv, ClothFoldGoalHardVectorEnv, ClothFoldGoalVectorEnv
 from clothgym.envs.fold_hard import ClothFoldHardEnv, ClothFoldHardVectorEnv
@@ -27,6 +28,10 @@ __all__ = [
     "ClothDrapeGripperVectorEnv",
     "ClothDrapeVectorEnv",
     "ClothEnv",
+    "ClothFlattenEnv",
+    "ClothFlattenHardEnv",
+    "ClothFlattenHardVectorEnv",
+    "ClothFlattenVectorEnv",
     "ClothFoldEnv",
     "ClothFoldGoalEnv",
     "ClothFoldGoalHardEnv",

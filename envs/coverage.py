@@ -1,107 +1,114 @@
-"""How much of the floor a sheet covers, seen from above, as a kernel.
+"""How much of the floor a sheet covers, seen from above: by triangles on a grid of the world, and by particles as SoftGym does.
 
-The floor has one grid of square cells, the same for every sheet wherever it lies.  A cell is covered if its middle lies below a
-triangle, so no particle and no resolution of the sheet enters: peers count cells around particles, in a grid over their bounding
-box, whose cells change with the pose.
+The grid's cells lie where they lie, whatever the sheet does.  A cell is covered if its center is in the projection of a triangle,
+so that the same surface covers the same cells, however many triangles it is made of.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined
+from clothgym._jit import apart
 
-CELLS = 64  # cells along a side of the sheet
-FINE_CELLS = 256  # the same at the evaluation
-MARGIN = 1e-9  # in cells: an edge that two triangles share leaves no gap between them
-
-
-@inlined
-def _row_of(value, cell):
-    """The first row of cells whose middle lies at or beyond a coordinate [m]."""
-    return int(np.ceil(value / cell - 0.5 - MARGIN))
-
-
-@inlined
-def _extend(y, ax, ay, bx, by, ends):
-    """Extend the ends of a row's span, at height y, to where an edge from a to b crosses it."""
-    if min(ay, by) <= y <= max(ay, by):
-        x = ax if ay == by else ax + (bx - ax) * ((y - ay) / (by - ay))
-        ends[0], ends[1] = min(ends[0], x), max(ends[1], x)
-        if ay == by:
-            ends[0], ends[1] = min(ends[0], bx), max(ends[1], bx)
+CELL, FINE_CELL = 0.01, 0.0025  # of the grid after each step, and at an episode's start and end [m]
+MOST_CELLS = 2000  # along a side of what is looked at, from the sheet's lowest x and y
+SOFTGYM_CELLS = 100  # along a side of the particles' bounding box
 
 
 @apart
-def window_of(x, cell, window):
-    """The cells that sheets may cover: first column and row, and the number of both; x: [m], (3, particles).
+def window(x, cell, first, count):
+    """The cells that a sheet may cover: first cell and number of cells along x and y, (2,) each, out.
 
-    window: (4,), int64, extended if it is not empty (its numbers of columns and rows are positive).
+    x: [m], (3, particles), finite.  A ``count`` above zero is extended.
     """
     for c in range(2):
-        low, high = np.inf, -np.inf
-        for p in range(x.shape[1]):
-            low, high = min(low, np.float64(x[c, p])), max(high, np.float64(x[c, p]))
-        first, last = _row_of(low, cell), _row_of(high, cell)
-        if window[2 + c] > 0:
-            first, last = min(first, window[c]), max(last, window[c] + window[2 + c] - 1)
-        window[c], window[2 + c] = first, last - first + 1
+        least, most = np.float64(x[c, 0]), np.float64(x[c, 0])
+        for p in range(1, x.shape[1]):
+            least, most = min(least, np.float64(x[c, p])), max(most, np.float64(x[c, p]))
+        low, high = int(np.floor(least / cell)), int(np.floor(most / cell))
+        if count[c] > 0:
+            low, high = min(low, first[c]), max(high, first[c] + count[c] - 1)
+        first[c], count[c] = low, min(high - low + 1, MOST_CELLS)
 
 
 @apart
-def cover(x, triangles, cell, window, covered):
-    """Mark the cells of a window whose middles lie below a sheet, in ``covered``, (rows, columns), uint8.
+def cover(x, triangles, cell, first, covered):
+    """Mark the cells whose centers are in the projection of a triangle, in ``covered``, (rows, columns), uint8.
 
-    x: [m], (3, particles).  Each row of cells that a triangle crosses is covered between where its edges cross the row's middle.
+    x: [m], (3, particles), finite.  cell: side of the grid's cells [m]; centers at (i + 1/2) cell.  first: cell of covered[0, 0].
     """
-    ends = np.empty(2)
+    # corners in cells, from the center of the first
+    u, v = np.empty(x.shape[1]), np.empty(x.shape[1])
+    for p in range(x.shape[1]):
+        u[p] = x[0, p] / cell - (first[0] + 0.5)
+        v[p] = x[1, p] / cell - (first[1] + 0.5)
     for t in range(triangles.shape[0]):
-        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        ax, ay, bx, by, cx, cy = (
-            np.float64(x[0, i]), np.float64(x[1, i]), np.float64(x[0, j]), np.float64(x[1, j]), np.float64(x[0, k]),
-            np.float64(x[1, k]),
-        )  # fmt: skip
-        low, high = min(ay, min(by, cy)), max(ay, max(by, cy))
-        for row in range(max(_row_of(low, cell), window[1]), min(_row_of(high, cell), window[1] + window[3] - 1) + 1):
-            # the part of this row's middle line that lies in the triangle
-            y = (row + 0.5) * cell
-            ends[0], ends[1] = np.inf, -np.inf
-            _extend(y, ax, ay, bx, by, ends)
-            _extend(y, bx, by, cx, cy, ends)
-            _extend(y, cx, cy, ax, ay, ends)
-            if ends[0] > ends[1]:
-                continue
-            first, last = _row_of(ends[0], cell), int(np.floor(ends[1] / cell - 0.5 + MARGIN))
-            for column in range(max(first, window[0]), min(last, window[0] + window[2] - 1) + 1):
-                covered[row - window[1], column - window[0]] = 1
+        # corners from low to high: neighbors go along an edge they share in the same direction, and round alike
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if v[b] < v[a] or (v[b] == v[a] and b < a):
+            a, b = b, a
+        if v[c] < v[b] or (v[c] == v[b] and c < b):
+            b, c = c, b
+            if v[b] < v[a] or (v[b] == v[a] and b < a):
+                a, b = b, a
+        # each row of centers between them, from one edge to the other: the lower end belongs to the triangle, the upper does not
+        for row in range(max(int(np.ceil(v[a])), 0), min(int(np.ceil(v[c])), covered.shape[0])):
+            low, high = (a, b) if row < v[b] else (b, c)
+            one = u[low] + (u[high] - u[low]) * ((row - v[low]) / (v[high] - v[low]))
+            other = u[a] + (u[c] - u[a]) * ((row - v[a]) / (v[c] - v[a]))
+            for column in range(max(int(np.ceil(min(one, other))), 0), min(int(np.ceil(max(one, other))), covered.shape[1])):
+                covered[row, column] = 1
 
 
 @apart
 def covered_area(x, triangles, cell):
-    """Area of the floor below a sheet [m^2]; x: [m], (3, particles), finite; cell: of the grid [m]."""
-    window = np.zeros(4, np.int64)
-    window_of(x, cell, window)
-    covered = np.zeros((window[3], window[2]), np.uint8)
-    cover(x, triangles, cell, window, covered)
-    count = 0
-    for row in range(covered.shape[0]):
-        for column in range(covered.shape[1]):
-            count += covered[row, column]
-    return count * cell * cell
+    """Area of the union of a sheet's triangles, seen from above [m^2].
+
+    x: [m], (3, particles), finite.  triangles: (triangles, 3).  cell: side of the grid's cells [m].
+    """
+    first, count = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    window(x, cell, first, count)
+    covered = np.zeros((count[1], count[0]), np.uint8)
+    cover(x, triangles, cell, first, covered)
+    total = 0
+    for row in range(count[1]):
+        for column in range(count[0]):
+            total += covered[row, column]
+    return total * cell * cell
 
 
 @apart
 def shared_area(x, other, triangles, cell):
-    """Area of the floor below two sheets of one mesh [m^2]: of both, and of either."""
-    window = np.zeros(4, np.int64)
-    window_of(x, cell, window)
-    window_of(other, cell, window)
-    first, second = np.zeros((2, window[3], window[2]), np.uint8)
-    cover(x, triangles, cell, window, first)
-    cover(other, triangles, cell, window, second)
+    """Area of the floor below two sheets of one mesh, seen from above [m^2]: below both, and below either."""
+    first, count = np.zeros(2, np.int64), np.zeros(2, np.int64)
+    window(x, cell, first, count)
+    window(other, cell, first, count)
+    one, two = np.zeros((count[1], count[0]), np.uint8), np.zeros((count[1], count[0]), np.uint8)
+    cover(x, triangles, cell, first, one)
+    cover(other, triangles, cell, first, two)
     both, either = 0, 0
-    for row in range(window[3]):
-        for column in range(window[2]):
-            both += first[row, column] & second[row, column]
-            either += first[row, column] | second[row, column]
+    for row in range(count[1]):
+        for column in range(count[0]):
+            both += one[row, column] & two[row, column]
+            either += one[row, column] | two[row, column]
     return both * cell * cell, either * cell * cell
+
+
+@apart
+def softgym_area(x, radius):
+    """Covered area as SoftGym's cloth tasks measure it [m^2]: of cells within ``radius`` of a particle along both axes.
+
+    The cells are 100 x 100 in the bounding box of the particles, so that they change with the pose.
+    """
+    low, span = np.empty(2), np.empty(2)
+    for c in range(2):
+        low[c] = x[c].min()
+        span[c] = max((x[c].max() - low[c]) / SOFTGYM_CELLS, 1e-9)
+    covered = np.zeros((SOFTGYM_CELLS, SOFTGYM_CELLS), np.uint8)
+    for p in range(x.shape[1]):
+        # from the nearest cell border below the particle to that above it
+        u, v = x[0, p] - low[0], x[1, p] - low[1]
+        for i in range(max(round((u - radius) / span[0]), 0), min(round((u + radius) / span[0]), SOFTGYM_CELLS)):
+            for j in range(max(round((v - radius) / span[1]), 0), min(round((v + radius) / span[1]), SOFTGYM_CELLS)):
+                covered[i, j] = 1
+    return covered.sum() * span[0] * span[1]

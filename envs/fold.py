@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel
 from clothgym.checks import one_of
-from clothgym.envs.coverage import FINE_CELLS, shared_area
+from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
@@ -163,7 +163,7 @@ def _potential(own, rules, sheet):
 @inlined
 def _evaluate(own, rules, sheet, info):
     """Write the error of the fold, how it overlaps the ideal and how much at rest it is; returns the normalized performance."""
-    info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, rules.side / FINE_CELLS)
+    info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, FINE_CELL)
     info.fold_error_mm = 1000 * own.error * rules.side
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = _reached(own, rules) and info.rms_speed < ENOUGH_REST

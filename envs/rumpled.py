@@ -1,9 +1,10 @@
-"""The rumpled sheets with which episodes may begin: those of ``benchmarks/rumpled_sheets.py``, at whatever resolution and side."""
+"""The sheets with which episodes may begin: those of ``benchmarks/rumpled_sheets.py``, at whatever resolution and side."""
 
 from __future__ import annotations
 
 from functools import cache
 from importlib import resources
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,29 @@ UNEVEN = 1e-4  # a sheet begins with its particles raised by about so much [m]: 
 TRIALS = 20  # uneven starts of each sheet that must be free of intersections
 
 
+class Bank(NamedTuple):
+    """A file of sheets: its name, the kind of ``starts.make``, how often each was dropped, rows, side [m], and how many.
+
+    made: those of which the file keeps some.
+    """
+
+    file: str
+    kind: str
+    picks: int
+    rows: int
+    side: float
+    made: int
+    kept: int
+
+
+RUMPLED = Bank("rumpled.npz", "rumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 256, 64)
+CRUMPLED = Bank("crumpled.npz", "crumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 192, 128)
+CRUMPLED_LARGE = Bank("crumpled_large.npz", "crumpled", 3, 21, 0.8, 144, 96)
+BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE)}
+
+
 @cache
-def rumpled_sheets(rows: int, columns: int, side: float) -> NDArray:
+def rumpled_sheets(rows: int, columns: int, side: float, bank: Bank = RUMPLED) -> NDArray:
     """Sheets that were picked up and dropped, free of intersections, about the origin on the floor [m], (sheets, particles, 3).
 
     side: of the square sheet [m].  At another resolution than the file's they are points of the same surfaces, scaled to the side;
@@ -28,20 +50,20 @@ def rumpled_sheets(rows: int, columns: int, side: float) -> NDArray:
     Raises:
         ValueError: all do.
     """
-    with resources.as_file(resources.files("clothgym.envs").joinpath("rumpled.npz")) as path, np.load(path) as file:
+    with resources.as_file(resources.files("clothgym.envs").joinpath(bank.file)) as path, np.load(path) as file:
         sheets = file["positions"] * UNIT
-    own = PHYSICS.mesh
-    if (rows, columns) == own.grid_shape and side == PHYSICS.side:
+    own = grid(bank.rows, bank.rows, bank.side, bank.side)
+    if (rows, columns) == own.grid_shape and side == bank.side:
         return sheets
     # the lowest particles stay on the floor
     mesh = grid(rows, columns, side, side)
-    sheets = resampled(sheets, own, mesh) * (side / PHYSICS.side)
+    sheets = resampled(sheets, own, mesh) * (side / bank.side)
     sheets[:, :, 2] += ON_FLOOR - sheets[:, :, 2].min(axis=1, keepdims=True)
     sheets = sheets[robust(mesh, sheets)]
     if not len(sheets):
+        remedy = ', or reset with options={"rumpled": False}' if bank is RUMPLED else ""
         raise ValueError(
-            f"rows={rows}, side={side!r}: no rumpled sheet of so few particles is free of intersections; take more rows, or reset "
-            'with options={"rumpled": False}'
+            f"rows={rows}, side={side!r}: no {bank.kind} sheet of so few particles is free of intersections; take more rows{remedy}"
         )
     return sheets
 

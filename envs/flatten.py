@@ -1,0 +1,240 @@
+"""ClothFlatten-v0 and ClothFlatten-Hard-v0: spread a crumpled sheet on the floor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.flatten_expert import flatten_actions
+from clothgym.envs.flattening import (
+    SpreadingTask,
+    account_spread,
+    evaluate_spread,
+    measure_coverage,
+    observe_spread,
+    spread_potential,
+)
+from clothgym.envs.gripper_task import close_or_open, stop_at_floor
+from clothgym.envs.manipulation import PHYSICS
+from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.mesh import grid
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera
+
+FABRICS = {"density": (0.12, 0.3), "bend_rigidity": (2e-6, 4e-5)}  # of ClothFlatten-Hard-v0
+
+
+class FlattenTask(SpreadingTask):
+    """The task of ``ClothFlatten-v0``, see ``ClothFlattenEnv``."""
+
+    physics = PHYSICS
+    kernels = Kernels(
+        spread_potential,
+        evaluate_spread,
+        observe_spread,
+        measure=measure_coverage,
+        account=account_spread,
+        fingers=close_or_open,
+        stop=stop_at_floor,
+    )
+    acting_steps = 300
+    settling_steps = 40
+    picks = 6
+    enough = 0.95
+    bank: ClassVar[Bank] = CRUMPLED
+
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
+        super().__init__(num_envs, **kwargs)
+        # the sheets of this resolution, before the first reset asks for them
+        rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        side = self.physics.side
+        sheets = rumpled_sheets(*self.physics.mesh.grid_shape, side, self.bank)
+        x = sheets[int(rng.integers(len(sheets)))].copy()
+        # mirrored, turned and moved
+        x[:, 0] *= 1 if rng.uniform() < 0.5 else -1
+        yaw = rng.uniform(-np.pi, np.pi)
+        c, s = np.cos(yaw), np.sin(yaw)
+        x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]]) + side * rng.uniform(-0.2, 0.2, 2)
+        for k, place in enumerate((-0.4, 0.4)):
+            self.gripper_starts[env, k] = side * (np.array([place, 0.0, 0.5]) + rng.uniform(-0.1, 0.1, 3))
+        self.episode["origin"][env] = 0.0
+        return self.uneven(x, rng)
+
+    def expert_actions(self) -> NDArray:
+        return flatten_actions(self)
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera
+
+        far = self.physics.side / 0.6
+        return Camera(eye=(0.9 * far, -1.5 * far, 1.35 * far), target=(0.0, 0.0, 0.14 * far), vertical_fov=36.0)
+
+
+class FlattenHardTask(FlattenTask):
+    """The task of ``ClothFlatten-Hard-v0``, see ``ClothFlattenHardEnv``."""
+
+    physics = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8))
+    acting_steps = 320
+    bank = CRUMPLED_LARGE
+
+    def __init__(self, num_envs: int, randomize: Mapping[str, Sequence[float]] | None = None, **kwargs: Any) -> None:
+        super().__init__(num_envs, randomize=FABRICS if randomize is None else randomize, **kwargs)
+
+
+class ClothFlattenEnv(ClothEnv):
+    """Spread a crumpled sheet on the floor with two grippers, and let go.
+
+    ## Description
+    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers, as in ``ClothDrapeGripper-v0``, take the particles within
+    3 cm of their tips when their fingers have closed, other layers too.  After 300 steps they open, and the sheet settles for 40
+    steps, in which actions are ignored; then it is evaluated.
+
+    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
+    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
+    is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1: on a
+    grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The normalized performance is the
+    normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.
+    A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and held by nothing.
+
+    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``best``, the best normalized improvement so far;
+    ``first_success``, the first step with enough coverage, or -1; and ``success_held``, whether it has been enough ever since.  At
+    the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and ``softgym_coverage``, SoftGym's
+    measure: of 100 x 100 cells of the particles' bounding box those within a particle's spacing of a particle, over the flat
+    sheet's area.  This one depends on how the sheet is turned, and may exceed 1.
+
+    ## Starting State
+    One of 128 crumpled sheets that cover 0.18 to 0.47 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a
+    random particle and dropped, twice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along
+    x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are
+    open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
+    goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FlattenTask
+
+
+class ClothFlattenVectorEnv(ClothVectorEnv):
+    """``ClothFlatten-v0`` as a batch, see ``ClothFlattenEnv``."""
+
+    task_class = FlattenTask
+
+
+class ClothFlattenHardEnv(ClothEnv):
+    """Spread a larger crumpled sheet, of a fabric that varies, on the floor with two grippers, and let go.
+
+    ## Description
+    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers, as in
+    ``ClothDrapeGripper-v0``, take the particles within
+    3 cm of their tips when their fingers have closed, other layers too.  After 320 steps they open, and the sheet settles for 40
+    steps, in which actions are ignored; then it is evaluated.
+
+    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``; but each episode draws the
+    fabric's density from 0.12 to 0.3 kg/m^2, and its bending rigidity from 2 to 40 uN m.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
+    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
+    is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1: on a
+    grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The normalized performance is the
+    normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.
+    A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and held by nothing.
+
+    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``best``, the best normalized improvement so far;
+    ``first_success``, the first step with enough coverage, or -1; and ``success_held``, whether it has been enough ever since.  At
+    the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and ``softgym_coverage``, SoftGym's
+    measure: of 100 x 100 cells of the particles' bounding box those within a particle's spacing of a particle, over the flat
+    sheet's area.  This one depends on how the sheet is turned, and may exceed 1.
+
+    ## Starting State
+    One of 96 crumpled sheets that cover 0.12 to 0.42 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a
+    random particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by
+    up to 0.2 L along x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the
+    sheet.  The grippers are
+    open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged" (not finite; the last finite observation
+    goes out).  Never truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FlattenHardTask
+
+
+class ClothFlattenHardVectorEnv(ClothVectorEnv):
+    """``ClothFlatten-Hard-v0`` as a batch, see ``ClothFlattenHardEnv``."""
+
+    task_class = FlattenHardTask

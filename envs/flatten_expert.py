@@ -1,0 +1,202 @@
+"""The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
+
+It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  A gripper
+takes all particles within its reach, so it nears a corner from where no other cloth is within reach.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.episode import length
+from clothgym.envs.manipulation import REACH
+
+# corners of each edge, and of the opposite one, as places in ``mesh.corners``
+EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
+OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
+AWAY = 0.85 * REACH  # distance of a tip from the corner that it is to take [m]
+CLEAR = 1.1 * REACH  # distance from it within which no other cloth may be [m]
+NEAR = 0.006  # of a tip from its place, when the fingers close [m]
+LIFT, LIFT_ONE = 1.22, 0.95  # how high an edge is lifted, and a corner alone, in sides
+CALM, CALM_ONE = 0.5, 0.7  # rms speed at which the sheet is laid down, and the other corner taken [m/s]
+TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
+SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sheet is laid down [m/s]
+DONE = 0.96  # coverage with which it is content
+TEARING = 0.5  # strain at which it lets go
+AGAIN = 95  # steps that another try takes
+
+
+def _directions() -> NDArray:
+    """From a corner to where a tip may be: straight up, and in rings, (directions, 3), of length 1."""
+    rings = [(0.0, 0.0, 1.0)]
+    for up, count in ((0.75, 6), (0.35, 8), (0.0, 8)):
+        angles = 2 * np.pi * (np.arange(count) + 0.5 * (up > 0.5)) / count
+        out = np.sqrt(1 - up**2)
+        rings += [(out * np.cos(a), out * np.sin(a), up) for a in angles]
+    return np.array(rings)
+
+
+def places_to_take(x: NDArray, corners: NDArray, allowed: NDArray) -> tuple[NDArray, NDArray]:
+    """Where tips take each corner [m], (sheets, 4, 3), and how many other particles they would take, (sheets, 4).
+
+    x: [m], (sheets, particles, 3).  allowed: particles that may be taken along, (4, particles).
+    """
+    tips = x[:, corners][:, :, None] + AWAY * _directions()
+    tips[..., 2] = np.maximum(tips[..., 2], 0.012)
+    # other particles within reach; of each sheet in turn, so that no sum depends on how many there are
+    others = np.empty(tips.shape[:3], np.int64)
+    for sheet, at, count in zip(x, tips, others):
+        for c in range(4):
+            near = sheet[~allowed[c] & (length(sheet - sheet[corners[c]]) < AWAY + CLEAR)]
+            count[c] = (length(at[c][:, None] - near) < CLEAR).sum(axis=1)
+    reached = length(tips - x[:, corners][:, :, None]) < 0.95 * REACH
+    # straight up is best, where it is as good
+    worth = others + np.where(reached, 0, 1000) + 0.02 * np.arange(tips.shape[2])
+    best = worth.argmin(axis=2)[..., None]
+    return np.take_along_axis(tips, best[..., None], axis=2)[:, :, 0], np.take_along_axis(worth, best, axis=2)[..., 0] // 1
+
+
+def flatten_actions(task: Any) -> NDArray:
+    """Actions of all environments, (num_envs, 8)."""
+    mesh, side, grippers = task.physics.mesh, task.physics.side, task.simulation.grippers
+    corners, rest = np.array(mesh.corners), mesh.rest_positions
+    x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)
+    v = task.simulation.velocities.astype(np.float64)
+    speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
+    holder, n = grippers.holder, task.num_envs
+    near_corner = np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)
+    # where corners can be taken, of the sheets of which one is to be
+    takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
+    looking = np.logical_or.reduce(grippers.held == 0, axis=1)
+    takes[looking], others[looking] = places_to_take(x[looking], corners, near_corner)
+    move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
+    for e in range(n):
+        own = task.episode[e]
+        held = [np.flatnonzero(holder[e] == k) for k in range(2)]
+        corner = [next((i for i in range(4) if holder[e, corners[i]] == k), -1) for k in range(2)]
+        laid = own["raised"].max() > LIFT * side - 0.03 and max(tips[e, k, 2] for k in range(2)) < 0.06
+        if laid and min(corner) < 0:
+            pass  # what has been laid down is let go of
+        elif any(len(held[k]) and corner[k] < 0 for k in range(2)):
+            # nothing is held by mistake
+            move[e, :, 2], grip[e] = 0.3, [1.0 if corner[k] < 0 else -1.0 for k in range(2)]
+        elif corner[0] >= 0 and corner[1] >= 0:
+            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, side, own, speed[e], v[e])
+            # what is entangled is pulled slowly, and let go of before it tears
+            strain = float(task.info["strain_max"][e])
+            move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
+            grip[e] = 1 if strain > TEARING else grip[e]
+        elif corner[0] >= 0 or corner[1] >= 0:
+            move[e], grip[e] = _take_other(x[e], tips[e], takes[e], others[e], corner, side, own, speed[e])
+        elif own["coverage"] >= DONE or own["step"] > task.acting_steps - AGAIN:
+            move[e, :, 2] = np.where(tips[e, :, 2] < 0.3, 0.5, 0)
+        else:
+            move[e], grip[e] = _take_first(x[e], tips[e], takes[e], others[e], corners, side)
+    # fingers that have closed on nothing open again
+    grip[(grippers.openings == 0) & (grippers.held == 0)] = 1
+    move /= np.maximum(length(move) / SPEED, 1)[..., None]
+    return np.concatenate([move / task.physics.attachment_speed, grip[..., None]], axis=2).reshape(n, -1)
+
+
+def _to(goal: NDArray, tip: NDArray) -> NDArray:
+    """Velocity that takes a tip half of the way in a step [m/s]."""
+    return (goal - tip) * 15
+
+
+def _take_first(x: Any, tips: Any, takes: Any, others: Any, corners: Any, side: float) -> Any:
+    """An edge by both corners where they lie free; else the corner that lies freest."""
+    apart = np.linalg.norm(x[corners[EDGES[:, 0]]] - x[corners[EDGES[:, 1]]], axis=1)
+    pairs = np.stack([EDGES, EDGES[:, ::-1]], axis=1)  # edges, and which gripper takes which end
+    ways = np.linalg.norm(tips[None, None] - takes[pairs], axis=3).sum(axis=2)
+    worth = others[EDGES].sum(axis=1) + 3 * (apart < 0.25 * side) + 0.1 * ways.min(axis=1) / side
+    edge = int(worth.argmin())
+    move, grip = np.zeros((2, 3)), np.ones(2)
+    if worth[edge] < 1:
+        goal = takes[pairs[edge, ways[edge].argmin()]]
+        near = np.linalg.norm(goal - tips, axis=1)
+        move = _to(goal, tips)
+        if near.max() < NEAR:
+            grip[:] = -1
+        return move, grip
+    way = np.linalg.norm(tips[:, None] - takes, axis=2)
+    which = int((others + 0.3 * way.min(axis=0) / side - 2 * x[corners, 2] / side).argmin())
+    k = int(way[:, which].argmin())
+    move[k] = _to(takes[which], tips[k])
+    move[1 - k, 2] = 0.5 if tips[1 - k, 2] < 0.4 * side else 0.0
+    grip[k] = -1 if way[k, which] < NEAR else 1
+    return move, grip
+
+
+def _take_other(x: Any, tips: Any, takes: Any, others: Any, corner: Any, side: float, own: Any, speed: float) -> Any:
+    """Lift the corner that is held; then take a neighbor of it, in the air."""
+    k = 0 if corner[0] >= 0 else 1
+    move, grip = np.zeros((2, 3)), np.ones(2)
+    grip[k] = -1
+    # the neighbor that is free, and near
+    neighbors = [i for i in range(4) if i != corner[k] and i != 3 - corner[k]]
+    ways = np.array([np.linalg.norm(takes[i] - tips[1 - k]) for i in neighbors])
+    best = int((others[neighbors] + 0.5 * ways / side).argmin())
+    close = ways[best] < 0.05 and others[neighbors[best]] < 1
+    up = own["raised"][k] > LIFT_ONE * side - 0.03
+    goal = np.array([0.0, 0.0, LIFT_ONE * side])
+    if not up and not close:
+        move[k] = _to(goal, tips[k])
+        move[k, :2] *= 0.5
+        move[1 - k] = _to(takes[neighbors[best]] + (0, 0, 0.1), tips[1 - k])
+    elif speed < CALM_ONE or close:
+        move[1 - k] = _to(takes[neighbors[best]], tips[1 - k])
+        grip[1 - k] = -1 if ways[best] < NEAR else 1
+    else:
+        # it waits beside
+        move[1 - k] = _to(takes[neighbors[best]] + (0, 0, 0.1), tips[1 - k])
+    return move, grip
+
+
+def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, side: float, own: Any, speed: float, v: Any) -> Any:
+    """Lift the edge, stretch it, lay the sheet down behind its far edge, and let go."""
+    ends = corners[corner]
+    between = rest[held[0]][:, None] - rest[held[1]]
+    taut = TAUT * np.linalg.norm(between, axis=2).min()
+    edge = next((i for i in range(4) if set(EDGES[i]) == set(corner)), -1)
+    if edge < 0:  # a diagonal
+        return np.zeros((2, 3)), np.array([-1.0, 1.0])
+    # along the edge, and to the far edge, its front up
+    along = (tips[1] - tips[0]) * (1, 1, 0)
+    along /= max(np.linalg.norm(along), 1e-9)
+    far_rest = rest[corners[OPPOSITE[edge]]].mean(axis=0) - rest[ends].mean(axis=0)
+    turn = np.cross(rest[ends[1]] - rest[ends[0]], far_rest)[2]
+    out = np.array([-along[1], along[0], 0.0]) * np.sign(turn)
+    middle = tips.mean(axis=0)
+    apart = np.stack([-along, along]) * taut / 2
+    low = x[ends, 2].min()
+    far = x[corners[OPPOSITE[edge]]].mean(axis=0)
+    lifted = own["raised"].min() > LIFT * side - 0.03
+    if not lifted:
+        goal = 0.5 * side * out + (0, 0, LIFT * side)
+        move = _to(goal + apart, tips)
+        # upward before aside
+        move[:, :2] *= 0.6
+        move /= np.maximum(length(move) / SPEED, 1)[:, None]
+        # never farther apart than the cloth between them is long
+        way = tips[1] + move[1] / 30 - tips[0] - move[0] / 30
+        beyond = max(np.linalg.norm(way) - max(taut, 0.01), 0.0)
+        pull = 15 * beyond * way / max(np.linalg.norm(way), 1e-9)
+        return move + np.stack([pull, -pull]), -np.ones(2)
+    # the tips keep the edge taut
+    keep = (middle + apart - tips) * 10
+    # begin as the far edge swings outward, or hangs still
+    swing, reach = float(v[corners[OPPOSITE[edge]]].mean(axis=0) @ out), float((far - middle) @ out)
+    sways = speed > CALM or (speed > 0.2 and (swing < 0 or reach < -0.02))
+    if middle[2] > LIFT * side - 0.04 and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
+        return keep, -np.ones(2)
+    height = x[ends, 2].mean()
+    if low < 0.012 and (reach > 0.96 * side or -middle @ out > 1.3 * side):
+        return np.zeros((2, 3)), np.ones(2)
+    # down behind the far edge, backward as it touches the floor
+    touching = far[2] < 0.03 or height < 0.5 * side
+    back = LAYING * max(height / side, 0.4 if reach < 0.97 * side else 0.0) if touching else 0.4 * LAYING
+    down = LAYING * max(reach / side, 0.15) if touching else 0.8 * LAYING
+    return keep - back * out - (0, 0, down), -np.ones(2)
