@@ -58,7 +58,7 @@ ENVIRONMENTS = {
     ),
     "ClothFlatten-Hard-v0": (
         "ClothFlattenHard",
-        "Spread a larger crumpled sheet, of a fabric that varies, on the floor with two grippers, and let go.",
+        "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.",
     ),
 }
 # steps after which an episode of an id has ended by itself, at the latest

@@ -3,8 +3,8 @@
 python docs/task_pages.py
 
 A page is made of the id's docstring, of its picture, and of its rows in benchmarks/results/suite.json, which are made by
-training/evaluate.py --suite and training/plan.py; a test holds what is committed against what this makes.  The picture is
-docs/tasks/ID.gif or ID.png, else the id's film in the gallery.
+training/evaluate.py --suite and training/plan.py; a test holds what is committed against what this makes.  The picture is one of
+docs/pictures.py, else the id's film in the gallery.
 """
 
 from __future__ import annotations
@@ -22,6 +22,10 @@ from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
 HERE = Path(__file__).parent
+FILMS = {
+    "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif", "ClothHang-v0": "hang.png",
+    "ClothHang-Hard-v0": "hang.gif",
+}  # fmt: skip
 ROOT, PAGES = HERE.parent, HERE / "tasks"
 RESULTS = ROOT / "benchmarks" / "results" / "suite.json"
 COMMAND = "python training/evaluate.py --suite --json benchmarks/results/suite.json"
@@ -69,11 +73,10 @@ def _linked(text: str, own: str) -> str:
 
 def _picture(env_id: str) -> str:
     """The id's picture as a link, if there is one in the repository."""
-    clips = [name for name, clip in gallery.CLIPS.items() if clip.name == env_id]
-    for path in (PAGES / f"{env_id}.gif", PAGES / f"{env_id}.png", *(gallery.HERE / f"{name}.gif" for name in clips)):
+    clips = [gallery.HERE / f"{name}.gif" for name, clip in gallery.CLIPS.items() if clip.name == env_id]
+    for path in ([HERE / FILMS[env_id]] if env_id in FILMS else []) + clips:
         if path.exists():
-            place = path.name if path.parent == PAGES else path.relative_to(HERE).as_posix()
-            return f"![{env_id}]({place if path.parent == PAGES else f'../{place}'})"
+            return f"![{env_id}](../{path.relative_to(HERE).as_posix()})"
     return ""
 
 

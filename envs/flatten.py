@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,6 +20,7 @@ from clothgym.envs.flattening import (
 )
 from clothgym.envs.gripper_task import close_or_open, stop_at_floor
 from clothgym.envs.manipulation import PHYSICS
+from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
@@ -28,8 +29,6 @@ from clothgym.mesh import grid
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
-
-FABRICS = {"density": (0.12, 0.3), "bend_rigidity": (2e-6, 4e-5)}  # of ClothFlatten-Hard-v0
 
 
 class FlattenTask(SpreadingTask):
@@ -83,12 +82,11 @@ class FlattenTask(SpreadingTask):
 class FlattenHardTask(FlattenTask):
     """The task of ``ClothFlatten-Hard-v0``, see ``ClothFlattenHardEnv``."""
 
-    physics = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8))
+    physics = replace(
+        PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("wool_tropical", PHYSICS.material), substeps="auto"
+    )
     acting_steps = 320
     bank = CRUMPLED_LARGE
-
-    def __init__(self, num_envs: int, randomize: Mapping[str, Sequence[float]] | None = None, **kwargs: Any) -> None:
-        super().__init__(num_envs, randomize=FABRICS if randomize is None else randomize, **kwargs)
 
 
 class ClothFlattenEnv(ClothEnv):
@@ -165,7 +163,7 @@ class ClothFlattenVectorEnv(ClothVectorEnv):
 
 
 class ClothFlattenHardEnv(ClothEnv):
-    """Spread a larger crumpled sheet, of a fabric that varies, on the floor with two grippers, and let go.
+    """Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.
 
     ## Description
     True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
@@ -176,8 +174,8 @@ class ClothFlattenHardEnv(ClothEnv):
     3 cm of their tips when their fingers have closed, other layers too.  After 320 steps they open, and the sheet settles for 40
     steps, in which actions are ignored; then it is evaluated.
 
-    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``; but each episode draws the
-    fabric's density from 0.12 to 0.3 kg/m^2, and its bending rigidity from 2 to 40 uN m.
+    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``; but the fabric is the tropical
+    wool of ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity.
 
     ## Action Space
     ``Box(-1, 1, (8,))``; for each gripper:
