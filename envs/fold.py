@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel
 from clothgym.checks import one_of
+from clothgym.envs import pick_place
 from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
@@ -279,6 +280,13 @@ class FoldTask(ManipulationTask):
         self.gripper_starts[env] = x[[left, right]] + side * away
         return self.uneven(x, rng)
 
+    def _began(self) -> NDArray:
+        """Where the sheet's points lay at the start [m], (num_envs, particles, 3)."""
+        rest, turn = self.physics.mesh.rest_positions, self.episode["turn"][:, None]
+        u, v, _ = (rest - rest.mean(axis=0)).T
+        across = np.stack([turn[..., 0] * u - turn[..., 1] * v, turn[..., 1] * u + turn[..., 0] * v, 0 * turn[..., 0] * u], axis=2)
+        return self.episode["origin"][:, None] + across
+
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
@@ -288,11 +296,8 @@ class FoldTask(ManipulationTask):
         """
         holder, side = self.simulation.grippers.holder, self.physics.side
         x, tips = self.simulation.positions.astype(np.float64), self.simulation.grippers.positions.astype(np.float64)
-        rest, origin, turn = self.physics.mesh.rest_positions, self.episode["origin"][:, None], self.episode["turn"][:, None]
-        flat = rest - rest.mean(axis=0)
-        # where the sheet's points lay: what lies there now may be dragged along, and cannot be reached
-        across = turn[..., 0] * flat[:, 0] - turn[..., 1] * flat[:, 1], turn[..., 1] * flat[:, 0] + turn[..., 0] * flat[:, 1]
-        began = origin + np.stack([*across, np.zeros_like(across[0])], axis=2)
+        # goals are where the sheet's points lay: what lies there now may be dragged along, and cannot be reached
+        rest, began = self.physics.mesh.rest_positions, self._began()
         # up and open, but for the grippers of the first fold that is not done
         move, closed = np.tile([0.0, 0.0, 0.1], (self.num_envs, 2, 1)), np.zeros((self.num_envs, 2), bool)
         # what has been folded and let go is not taken up again
@@ -319,6 +324,22 @@ class FoldTask(ManipulationTask):
         move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
         grip = np.where(closed, -1.0, 1.0)[..., None]
         return np.concatenate([move, grip], axis=2).reshape(self.num_envs, -1)
+
+    def expert_picks(self) -> NDArray:
+        """The corners of the first fold that is not done to those that they are to meet; else nothing, beside the sheet."""
+        side, half = self.physics.side, self.workspace * self.physics.side
+        x, rest, began = self.simulation.positions.astype(np.float64), self.physics.mesh.rest_positions, self._began()
+        actions = np.ones((self.num_envs, len(self.physics.grippers), pick_place.NUMBERS))
+        found = self.episode["best"] > EXPERT_DONE
+        for stage in self.stages:
+            taken, goals = (np.array(part) for part in zip(*stage))
+            now = ~found & ~np.logical_and.reduce(length(x[:, goals] - x[:, taken]) < EXPERT_MET * side, axis=1)
+            found |= now
+            for k, (particle, goal) in enumerate(stage):
+                lift = EXPERT_ARC / 2 * length(rest[particle] - rest[goal])
+                actions[now, k, 0:2], actions[now, k, 2:4] = x[now, particle, :2] / half, began[now, goal, :2] / half
+                actions[now, k, 4] = 2 * lift / side - 1
+        return np.clip(actions, -1, 1).reshape(self.num_envs, -1)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

@@ -128,7 +128,9 @@ class FoldGoalTask(ManipulationTask):
     }
     away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
     turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
-    single: ClassVar[float] = 0.0  # share of the episodes with one carried corner alone: a stiff sheet springs back from that
+    single: ClassVar[float] = (
+        0.0  # share of the episodes with one carried corner alone, which tends to slide back
+    )
 
     def __init__(self, num_envs: int, reward_mode: str = "goal", **kwargs: Any) -> None:
         one_of("reward_mode", reward_mode, "goal", *REWARD_MODES)

@@ -105,6 +105,18 @@ def test_the_expert_folds(fold, error):
     assert np.allclose(info["fold_error_mm"], 1000 * SIDE * info["fold_error"])
 
 
+@pytest.mark.parametrize("fold, actions", [("half", 1), ("quarter", 2)])
+def test_the_expert_folds_by_picking_and_placing(fold, actions):
+    env = gym.make_vec(ID, num_envs=2, autoreset_mode="Disabled", fold=fold, action_mode="pick_place")
+    env.reset(seed=1_000_000)
+    for _ in range(actions):
+        *_, info = env.step(env.expert_actions())
+    assert np.all(info["best"] > 0.9) and np.all(info["first_success"] <= 60 * actions)
+    # then it lets well alone
+    placed = env.expert_actions().reshape(2, 2, 5)
+    assert np.all(placed == 1)
+
+
 def test_what_was_pressed_together_does_not_jump_when_it_is_let_go():
     """Impulses that had borne what the fingers pressed threw it up by half a meter."""
     assert episodes(2, seed=1_000_006, fold="quarter")[1] < 0.15
