@@ -57,6 +57,7 @@ class TaskDefinition:
         acting_steps: steps after which the agent's time is up; settling_steps: those that follow, in which actions are ignored.
         actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
         observations: what is observed beside the points of the sheet, in that order.
+        goals: names of the last of these, which are given apart, in a dictionary, as goal environments have it.
         points_relative_to: what the observed points of the sheet are relative to, ``episode["origin"]``, for the page.
         position_bound: of these points, in sides.
         evaluation: fields of info that an evaluation writes, zero until then, beside performance and success.
@@ -76,6 +77,7 @@ class TaskDefinition:
     kernels: ClassVar[Kernels] = IN_NUMPY
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles", "heightmap", "pointcloud", "rgb", "depth", "rgbd")
     observations: ClassVar[tuple[Observation, ...]] = (Observation("time_left", "share of the time left", function=time_left),)
+    goals: ClassVar[tuple[str, ...]] = ()
     points_relative_to: ClassVar[str] = "the origin"
     position_bound: ClassVar[float] = POSITION_BOUND
     evaluation: ClassVar[Fields] = ()

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
@@ -118,6 +116,7 @@ class FoldGoalTask(ManipulationTask):
         Observation(GOALS[0], "where the four corners are", (CORNERS, 3), "L", POSITION_BOUND),
         Observation(GOALS[1], "where they are to be", (CORNERS, 3), "L", POSITION_BOUND),
     )
+    goals = GOALS
     points_relative_to = "where the sheet's center lay"
     evaluation = (("rms_speed", float),)
     accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
@@ -128,9 +127,7 @@ class FoldGoalTask(ManipulationTask):
     }
     away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
     turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
-    single: ClassVar[float] = (
-        0.0  # share of the episodes with one carried corner alone, which tends to slide back
-    )
+    single: ClassVar[float] = 0.0  # share of the episodes with one carried corner alone, which tends to slide back
 
     def __init__(self, num_envs: int, reward_mode: str = "goal", **kwargs: Any) -> None:
         one_of("reward_mode", reward_mode, "goal", *REWARD_MODES)
@@ -222,66 +219,15 @@ class FoldGoalHardTask(FoldGoalTask):
 # --- the environments -----------------------------------------------------------------------------------------------------
 
 
-def goal_space(space: gym.Space, slices: Mapping[str, slice]) -> gym.spaces.Dict:
-    """The space of ``as_dict``, of one environment; space: of what it takes apart."""
-    assert isinstance(space, gym.spaces.Box)
-    low, high = as_dict(space.low, slices), as_dict(space.high, slices)
-    return gym.spaces.Dict({name: gym.spaces.Box(low[name], high[name], dtype=np.float32) for name in low})
-
-
-def as_dict(observation: NDArray, slices: Mapping[str, slice]) -> dict[str, NDArray]:
-    """Observations of a ``FoldGoalTask``, (..., numbers), with both goals, (..., 12), taken out of them."""
-    goals = {name: observation[..., slices[name]].copy() for name in GOALS}
-    return {"observation": observation[..., : slices[GOALS[0]].start].copy(), **goals}
-
-
-class GoalEnv(ClothEnv):
-    """Base of the single environments with goals."""
-
-    def __init__(self, render_mode: str | None = None, render_color: str = "fabric", **kwargs: Any) -> None:
-        super().__init__(render_mode=render_mode, render_color=render_color, **kwargs)
-        self.observation_space = goal_space(self.observation_space, self.task.observation_slices)  # type: ignore[assignment]
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        observation, info = super().reset(seed=seed, options=options)
-        return as_dict(observation, self.task.observation_slices), info
-
-    def step(self, action: NDArray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        observation, *brought = super().step(action)
-        return as_dict(observation, self.task.observation_slices), *brought  # type: ignore[return-value]
+class GoalReward:
+    """What hindsight experience replay asks of an environment."""
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
         """0 where every corner is near its goal, else -1, (...); goals: (..., 12), for instance a batch of relabeled ones."""
         return goal_reward(achieved_goal, desired_goal)
 
 
-class GoalVectorEnv(ClothVectorEnv):
-    """Base of the batches with goals."""
-
-    def __init__(self, num_envs: int = 1, **kwargs: Any) -> None:
-        super().__init__(num_envs, **kwargs)
-        self.single_observation_space = goal_space(self.single_observation_space, self.task.observation_slices)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        observation, info = super().reset(seed=seed, options=options)
-        return as_dict(observation, self.task.observation_slices), info
-
-    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
-        observation, *brought, info = super().step(actions)
-        slices = self.task.observation_slices
-        # what was last seen of those that have been reset
-        for env, last in enumerate(info.get("final_obs", ())):
-            if last is not None:
-                info["final_obs"][env] = as_dict(last, slices)
-        return as_dict(observation, slices), *brought, info  # type: ignore[return-value]
-
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
-        """0 where every corner is near its goal, else -1, (...); goals: (..., 12), for instance a batch of relabeled ones."""
-        return goal_reward(achieved_goal, desired_goal)
-
-
-class ClothFoldGoalEnv(GoalEnv):
+class ClothFoldGoalEnv(GoalReward, ClothEnv):
     """Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.
 
     ## Description
@@ -353,13 +299,13 @@ class ClothFoldGoalEnv(GoalEnv):
     task_class = FoldGoalTask
 
 
-class ClothFoldGoalVectorEnv(GoalVectorEnv):
+class ClothFoldGoalVectorEnv(GoalReward, ClothVectorEnv):
     """``ClothFoldGoal-v0`` as a batch, see ``ClothFoldGoalEnv``."""
 
     task_class = FoldGoalTask
 
 
-class ClothFoldGoalHardEnv(GoalEnv):
+class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
     """Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.
 
     ## Description
@@ -401,7 +347,7 @@ class ClothFoldGoalHardEnv(GoalEnv):
     task_class = FoldGoalHardTask
 
 
-class ClothFoldGoalHardVectorEnv(GoalVectorEnv):
+class ClothFoldGoalHardVectorEnv(GoalReward, ClothVectorEnv):
     """``ClothFoldGoal-Hard-v0`` as a batch, see ``ClothFoldGoalHardEnv``."""
 
     task_class = FoldGoalHardTask

@@ -88,11 +88,16 @@ class Observer:
             raise ValueError(f"privileged=True: obs_mode={mode!r} is the state already; it is for {', '.join(PICTURES)}")
         self.pictures: NDArray | None = None
         self.stale = np.zeros(task.num_envs, bool)
-        self.space: gym.Space = task.state_space
+        # goals are the last numbers of the state vector
+        self._goals = {name: task.observation_slices[name] for name in task.goals}
+        self._own = slice(0, min((one.start for one in self._goals.values()), default=None))
+        own = _part(task.state_space, self._own)
         if mode in PICTURES:
-            picture = self._prepare(size, camera, points)
-            self.pictures = np.zeros((task.num_envs, *picture.shape), picture.dtype)
-            self.space = gym.spaces.Dict(observation=picture, state=task.state_space) if self.privileged else picture
+            own = self._prepare(size, camera, points)
+            self.pictures = np.zeros((task.num_envs, *own.shape), own.dtype)
+        parts = {"observation": own} | ({"state": task.state_space} if self.privileged else {})
+        parts |= {name: _part(task.state_space, where) for name, where in self._goals.items()}
+        self.space: gym.Space = gym.spaces.Dict(parts) if len(parts) > 1 else own  # type: ignore[arg-type]
 
     def _prepare(self, size: int, camera: Any, points: int) -> gym.spaces.Box:
         """Where the scene is seen from, and what kernels need of it; returns the space of a picture."""
@@ -144,20 +149,23 @@ class Observer:
 
     def batch(self) -> Any:
         """What is observed of all environments, a fresh copy."""
-        if self.pictures is None:
-            return self.task.observation.copy()
         self._draw(np.flatnonzero(self.stale))
-        picture = self.pictures.copy()
-        return {"observation": picture, "state": self.task.observation.copy()} if self.privileged else picture
+        return self._given(slice(None))
 
     def one(self, env: int) -> Any:
         """The same of one environment."""
-        if self.pictures is None:
-            return self.task.observation[env].copy()
         if self.stale[env]:
             self._draw(np.array([env]))
-        picture = self.pictures[env].copy()
-        return {"observation": picture, "state": self.task.observation[env].copy()} if self.privileged else picture
+        return self._given(env)
+
+    def _given(self, which: int | slice) -> Any:
+        """Picture or state vector, and what goes with it."""
+        state = self.task.observation[which]
+        own = (state[..., self._own] if self.pictures is None else self.pictures[which]).copy()
+        if not self._goals and not self.privileged:
+            return own
+        given = {"observation": own} | ({"state": state.copy()} if self.privileged else {})
+        return given | {name: state[..., where].copy() for name, where in self._goals.items()}
 
     # --- pictures -------------------------------------------------------------------------------------------------------
 
@@ -214,6 +222,11 @@ class Observer:
         solids[..., quick_solids.RADIUS] = np.maximum(own[..., R_RADIUS] - own[..., R_THICKNESS], 0)
         solids[..., quick_solids.COLOR :] = WARM_GRAY
         return solids
+
+
+def _part(space: gym.spaces.Box, where: slice) -> gym.spaces.Box:
+    """Of a space of numbers."""
+    return gym.spaces.Box(space.low[where], space.high[where], dtype=np.float32)
 
 
 _NO_COLORS, _NO_NUMBERS = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float32)

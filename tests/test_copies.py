@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.play import play
 from gymnasium.wrappers import RecordVideo
-from test_envs import drawn, every_id, make, make_vec, still
+from test_envs import drawn, every_task, make, make_vec, still
 
 import clothgym
 from clothgym import INTEGRATORS, Plane, Simulation, Sphere
@@ -25,7 +25,7 @@ def same(one, other):
     return alike and one[4].keys() == other[4].keys() and all(np.array_equal(one[4][key], other[4][key]) for key in one[4])
 
 
-@every_id
+@every_task
 @every_way
 @pytest.mark.parametrize("kwargs", [{}, {"self_collision": "strict", "randomize": {"density": [0.1, 0.2]}}])
 def test_a_copy_of_an_environment_goes_on_with_the_same_bits(env_id, way, kwargs):
@@ -99,7 +99,7 @@ def test_another_process_goes_on_from_a_pickle(tmp_path):
 # --- play and films ---------------------------------------------------------------------------------------------------------------
 
 
-@every_id
+@every_task
 def test_keys_move_all_attachments(env_id):
     env = make(env_id).unwrapped
     keys, count = env.get_keys_to_action(), env.task.num_attachments
@@ -128,7 +128,7 @@ def test_gymnasium_plays_it(monkeypatch):
     assert np.diff(places) == pytest.approx([speed, speed, 0, 0], abs=1e-9)
 
 
-@every_id
+@every_task
 def test_depths_as_gray_pictures(env_id):
     depths, gray = make(env_id, render_mode="depth_array"), make(env_id, render_mode="rgb_array", render_color="depth")
     for env in (depths, gray):

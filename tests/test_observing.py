@@ -10,15 +10,13 @@ import hang_towel
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from test_envs import drawn, make, make_vec, still
+from test_envs import drawn, every_task, make, make_vec, still
 
 from clothgym.envs.episode import DIVERGED
-from clothgym.registration import ENVIRONMENTS
 
 PICTURES = ("heightmap", "pointcloud", "rgb", "depth", "rgbd")
 SHAPES = {"heightmap": (64, 64), "pointcloud": (256, 3), "rgb": (64, 64, 3), "depth": (64, 64, 1), "rgbd": (64, 64, 4)}
 DRAPE, GRIPPER = "ClothDrape-v0", "ClothDrapeGripper-v0"
-every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 every_mode = pytest.mark.parametrize("mode", PICTURES)
 
 
@@ -31,7 +29,7 @@ def end_soon(task, env):
 # --- what there is --------------------------------------------------------------------------------------------------------
 
 
-@every_id
+@every_task
 @every_mode
 def test_every_task_has_every_mode_and_a_batch_the_pictures_of_its_single_environments(env_id, mode):
     """To the bit, in batches of 1 and 3, on 1 and 2 threads, fresh arrays within their space."""

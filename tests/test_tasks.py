@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from test_envs import every_task
 
 import clothgym.envs
 from clothgym import Gripper, Material, Plane, grid
@@ -21,7 +22,6 @@ from clothgym.registration import ENVIRONMENTS, checked_id
 from clothgym.state import Layout
 
 TOWEL = "hang_towel:HangTowel-v0"
-every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 SILK = {"density": 0.083, "stretch_stiffness": 102.6, "shear_stiffness": 51.3, "bend_rigidity": 2.77e-7}
 
 
@@ -142,7 +142,7 @@ def test_other_ids_are_refused(env_id, message):
         checked_id(env_id)
 
 
-@every_id
+@every_task
 def test_our_ids_are_taken_with_and_without_their_namespace(env_id):
     assert checked_id(env_id) == checked_id(f"clothgym:{env_id}") == env_id
 
@@ -268,7 +268,7 @@ def test_a_task_s_own_keywords_are_among_the_right_ones():
         gym.make_vec("clothgym:ClothStrain-v0", num_envs=2, treshold=1)
 
 
-@every_id
+@every_task
 def test_a_fabric_by_name_has_the_preset_s_measured_properties_and_the_task_s_air(env_id):
     env = gym.make(f"clothgym:{env_id}", fabric="silk").unwrapped
     own, silk = type(env.task).physics.material, env.task.simulation.material
@@ -292,7 +292,7 @@ def test_another_fabric_has_automatic_substeps_and_its_own_name_the_task_s():
     assert given.material == double
 
 
-@every_id
+@every_task
 @pytest.mark.filterwarnings("ignore:.*substeps")
 def test_a_fabric_by_name_for_one_episode(env_id):
     env = gym.make(f"clothgym:{env_id}").unwrapped
@@ -336,7 +336,7 @@ def rows(env_id, heading):
     return [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines if line.startswith("|")][2:]
 
 
-@every_id
+@every_task
 def test_the_page_s_table_says_where_each_observation_lies_and_its_bound(env_id):
     env = gym.make(f"clothgym:{env_id}").unwrapped
     table, space = rows(env_id, "Observation Space"), env.observation_space
@@ -357,7 +357,7 @@ def test_the_page_s_table_says_where_each_observation_lies_and_its_bound(env_id)
     )
 
 
-@every_id
+@every_task
 def test_the_page_s_table_has_every_keyword_and_its_default(env_id):
     env = gym.make(f"clothgym:{env_id}").unwrapped
     table = {row[0].strip("`"): row[1:] for row in rows(env_id, "Arguments")}

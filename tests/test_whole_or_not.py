@@ -8,7 +8,7 @@ from dataclasses import fields
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_envs import drawn, every_id, make, make_vec, still
+from test_envs import drawn, every_task, make, make_vec, still
 
 import clothgym
 from clothgym.envs import episode
@@ -63,7 +63,7 @@ def advanced(env, steps=3):
     return env
 
 
-@every_id
+@every_task
 def test_a_refused_reset_of_one_changes_nothing(env_id):
     env = advanced(make(env_id).unwrapped)
     before, generator = digest(env), env.np_random
@@ -80,7 +80,7 @@ def test_a_refused_reset_of_one_changes_nothing(env_id):
     assert digest(env) != before and env.np_random is generator
 
 
-@every_id
+@every_task
 def test_a_refused_reset_of_many_changes_nothing(env_id):
     env = advanced(make_vec(env_id, 3, autoreset_mode="Disabled").unwrapped)
     before = digest(env)
@@ -136,7 +136,7 @@ PLACES = [("before_step", False), ("after_step", False), ("_score_and_observe", 
 OF_PHYSICS = [("_advance", True), ("_advance", False)]
 
 
-@every_id
+@every_task
 @pytest.mark.parametrize(("place", "after"), PLACES + OF_PHYSICS)
 def test_an_interrupted_step_is_not_gone_on_from(env_id, place, after, monkeypatch):
     for env in (make(env_id).unwrapped, make_vec(env_id, 2).unwrapped):
@@ -239,7 +239,7 @@ def test_a_failure_that_is_only_reported_leaves_whole_steps():
 # --- threads ----------------------------------------------------------------------------------------------------------------------
 
 
-@every_id
+@every_task
 def test_a_second_thread_is_refused(env_id):
     for env in (make(env_id).unwrapped, make_vec(env_id, 2).unwrapped):
         env.reset(seed=0)
@@ -274,7 +274,7 @@ def test_failures_have_their_names_in_the_metadata():
     assert (episode.DIVERGED, episode.TORN, episode.OUT_OF_BOUNDS) == (1, 2, 3)
 
 
-@every_id
+@every_task
 @pytest.mark.parametrize("kwargs", [{}, {"self_collision": "fast", "strain_limit": 0.2}])
 def test_infos_are_numbers_with_the_same_keys_at_reset_and_at_each_step(env_id, kwargs):
     if env_id == "ClothStrain-v0":
@@ -298,7 +298,7 @@ def test_infos_are_numbers_with_the_same_keys_at_reset_and_at_each_step(env_id, 
             assert infos[key][0] == value, key
 
 
-@every_id
+@every_task
 def test_the_spec_knows_the_longest_episode_and_a_shorter_one_is_truncated(env_id):
     task = make(env_id).unwrapped.task
     longest = task.acting_steps + task.settling_steps
@@ -316,7 +316,7 @@ def test_the_spec_knows_the_longest_episode_and_a_shorter_one_is_truncated(env_i
         make_vec(env_id, 2, max_episode_steps=0)
 
 
-@every_id
+@every_task
 def test_one_state_goes_on_in_many_environments(env_id):
     one, many = advanced(make(env_id).unwrapped, 5), make_vec(env_id, 3, autoreset_mode="Disabled").unwrapped
     state = one.get_state()

@@ -3,13 +3,12 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from test_envs import every_task
 
 from clothgym import INTEGRATORS, Material, Simulation, State, Wind, grid
 from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
-from clothgym.registration import ENVIRONMENTS
 
 NAMES = list(INTEGRATORS)
-every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 RHO, CD, CF = 1.2, 1.2, 0.02
 SHEET = grid(6, 7, 0.3, 0.25)
 AREA = 0.3 * 0.25
@@ -284,7 +283,7 @@ def winds(env, steps):
     return np.array(seen)
 
 
-@every_id
+@every_task
 def test_wind_blows_in_every_environment(env_id):
     windless, own, windy = (
         make_vec(env_id, 2, wind=wind) for wind in ({}, None, {"speed": [3, 3], "direction": [np.pi / 2, np.pi / 2]})
@@ -306,7 +305,7 @@ def test_wind_blows_in_every_environment(env_id):
     assert own.unwrapped.task.simulation.air_density == own.unwrapped.task.physics.air_density
 
 
-@every_id
+@every_task
 def test_winds_differ_within_a_batch_and_are_the_same_for_the_same_seed(env_id):
     env, single = make_vec(env_id, 4), gym.make(f"clothgym:{env_id}", wind=BREEZE).unwrapped
     env.reset(seed=7)
@@ -327,7 +326,7 @@ def test_winds_differ_within_a_batch_and_are_the_same_for_the_same_seed(env_id):
         assert np.array_equal(np.concatenate([state.wind, state.positions[:, 5]], axis=1)[0], first[step, 2])
 
 
-@every_id
+@every_task
 def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
     """Through the end of the episode into the next one, whose wind is drawn again."""
     env, other = make_vec(env_id, 2), make_vec(env_id, 2)
@@ -343,7 +342,7 @@ def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
     assert not np.array_equal(state.episode["wind"], env.get_state().episode["wind"])
 
 
-@every_id
+@every_task
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 def test_a_batch_with_wind_goes_on_after_an_episode_s_end(env_id, mode):
     env = make_vec(env_id, 2, autoreset_mode=mode, wind={"gust": 0.1})
@@ -355,7 +354,7 @@ def test_a_batch_with_wind_goes_on_after_an_episode_s_end(env_id, mode):
     assert ends
 
 
-@every_id
+@every_task
 @pytest.mark.parametrize(
     ("wind", "name"),
     [*BAD_WINDS, ({"force": 3}, "speed, direction, gust, gust_time"), (3.0, "wind=3.0"), ("strong", "wind='strong'")],
