@@ -14,7 +14,7 @@ from test_envs import drawn, every_task, length, make, make_vec, skip, still
 def run_to_an_end(env):
     """Still attachments until an episode ends, environment 1 three steps before the others: its step, and what that gave."""
     env.reset(seed=0)
-    for step in range(200):
+    for step in range(400):
         if step == 2:
             skip(env.unwrapped.task, 1, 3)
         result = env.step(still(env))
