@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined
 from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask
 from clothgym.envs.single import ClothEnv
@@ -19,31 +18,9 @@ from clothgym.envs.vector import ClothVectorEnv
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
-LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
-
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.3, 0.55, 0.25
 EXPERT_SPEED = 0.8  # share of the anchors' speed limit
-
-
-# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
-
-
-@inlined
-def _let_go(own, rules, sheet, move, free):
-    """Open the anchors that the action opens, or all when time is up."""
-    for k in range(free.shape[0]):
-        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
-            free[k], sheet.holds[k] = 1, 0
-
-
-@inlined
-def _holds_nothing(own, rules, sheet):
-    """Whether both anchors are open."""
-    for k in range(sheet.holds.shape[0]):
-        if sheet.holds[k] > 0:
-            return False
-    return True
 
 
 class DrapeTask(DrapingTask):
@@ -51,8 +28,8 @@ class DrapeTask(DrapingTask):
 
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
-        draping.covering, draping.evaluate_cover, draping.observe_target, act=_let_go, done=_holds_nothing,
-        account=draping.account_reference, stop=draping.stop_at_target,
+        draping.covering, draping.evaluate_cover, draping.observe_target, act=draping.let_go,
+        done=draping.holds_nothing, account=draping.account_reference, stop=draping.stop_at_target,
     )  # fmt: skip
     acting_steps = 60
     settling_steps = 85
@@ -104,39 +81,28 @@ class ClothDrapeEnv(ClothEnv):
     """Lay a hanging sheet over a target and let go of it.
 
     ## Description
-    True physics: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves through air.
-
     A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.75 to 0.9 L in front of a target
     that stands on the floor: a sphere (radius 0.2 to 0.3 L), a box (side 0.3 to 0.5 L) or a round-topped post (radius 0.1 to
     0.15 L, height 0.4 to 0.6 L).  The agent moves both corners and may let go of each.  When it holds none, or after 60
     steps, the sheet settles for 85 steps, in which actions are ignored; then it is evaluated.
 
-    The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), whole-sheet contact with friction
-    0.5, strict self-collision, quadratic bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; solids stop
-    the corners; 30 Hz control, ``semi_implicit_euler`` with 50 substeps.  A corner that hangs from a thin post swings for two
-    seconds, which is why the sheet settles for so long.
+    $physics
 
-    ``physics="fast"`` has short cuts: contact of particles alone, none of the sheet with itself, skip springs without rigidity,
-    hands that go through solids, a cotton in a linear drag of 4.8 per second and no other air.
+    The fabric is the median of 618 measured ones, its linear drag that of filmed cloth.  A corner that hangs from a thin post
+    swings for two seconds, which is why the sheet settles for so long.
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each corner:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | let go for good, if above 0.8 | [-1, 1] | |
+    $actions corner
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure,
-    plus 0.25 for a success.
-    While the episode runs the potential is the mean of how near the sheet is to 32 points of the target's upper surface,
-    ``1/(1 + (d/0.15 L)^2)``, and of how central its center of area is, ``1/(1 + (e/0.2 L)^2)``.  At the end it is the
-    normalized performance, at a failure 0: the return is the score, less the start's potential and the small terms.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is the mean of how near the sheet is to 32 points of the target's upper surface,
+    ``1/(1 + (d/0.15 L)^2)``, and of how central its center of area is, ``1/(1 + (e/0.2 L)^2)``.  So the return is the score, less
+    the start's potential and the small terms.
 
     ## Evaluation
     The judge looks along the outward normals of 256 points, spread evenly over that part of the target's surface which slopes by at
@@ -157,16 +123,12 @@ class ClothDrapeEnv(ClothEnv):
     millimeter; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
-    goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
-    rest is drawn), and ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Vectorized environment
     ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded

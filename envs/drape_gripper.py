@@ -209,36 +209,24 @@ class ClothDrapeGripperEnv(ClothEnv):
     """Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves
-    through air.
-
     The sheet and the targets are those of ``ClothDrape-v0``, and so is the evaluation.  But the sheet lies on the floor, flat or
-    rumpled, and two grippers hover above the corners of its edge at the target.  A gripper is a kinematic body with two fingers:
-    when these have closed it holds the particles within 3 cm of its tip, and when they begin to open it lets go; it may take
-    hold as often as it likes.  The fingers do not push the cloth; the target stops a gripper's tip, the floor what it holds, and
-    while they move it does not sink.  After 100 steps they open, and the sheet settles for 60 steps, in which actions are
-    ignored; then it is evaluated.  To hold it in the right place until then is as good as to let go.
+    rumpled, and two grippers hover above the corners of its edge at the target, which stops their tips.  After 100 steps they open,
+    and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until
+    then is as good as to let go.
 
-    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
+    $physics
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L in the place of its
-    0.15 L), plus 0.3 times the mean over both
-    corners of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At
-    the end it is the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L in the place of its 0.15 L), plus 0.3 times the mean
+    over both corners of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     As in ``ClothDrape-v0``, with the same ``info``.
@@ -249,16 +237,12 @@ class ClothDrapeGripperEnv(ClothEnv):
     and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
-    goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"target"``, a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw`` (the
-    rest is drawn), ``"rumpled"``, True or False, and ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

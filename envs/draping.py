@@ -41,6 +41,7 @@ SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
 # of the reference's coverage; of the covered points under one layer; in sides; [m/s]
 ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.02
 
+LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
 BOX, POST = SHAPES.index("box"), SHAPES.index("post")
 HAND = 0.005  # distance from the target at which it stops a hand [m]
 TARGET_SLOT = 1  # the target's place among ``colliders``
@@ -69,6 +70,26 @@ def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
 def upper_corners(mesh: ClothMesh) -> tuple[int, ...]:
     """The particles at the ends of the edge that goes over the target first."""
     return mesh.corners[2:]
+
+
+# --- anchors that may be opened -----------------------------------------------------------------------------------------------
+
+
+@inlined
+def let_go(own, rules, sheet, move, free):
+    """Open the anchors that the action opens, or all when time is up."""
+    for k in range(free.shape[0]):
+        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
+            free[k], sheet.holds[k] = 1, 0
+
+
+@inlined
+def holds_nothing(own, rules, sheet):
+    """Whether all anchors are open."""
+    for k in range(sheet.holds.shape[0]):
+        if sheet.holds[k] > 0:
+            return False
+    return True
 
 
 # --- the target of an episode -------------------------------------------------------------------------------------------------

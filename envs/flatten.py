@@ -93,32 +93,22 @@ class ClothFlattenEnv(ClothEnv):
     """Spread a crumpled sheet on the floor with two grippers, and let go.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
+    A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers take hold of it, of other layers too.  After 300 steps they
+    open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
-    A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers, as in ``ClothDrapeGripper-v0``, take the particles within
-    3 cm of their tips when their fingers have closed, other layers too.  After 300 steps they open, and the sheet settles for 40
-    steps, in which actions are ignored; then it is evaluated.
-
-    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
+    $physics
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
-    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
-    is the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one that holds cloth,
+    else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
 
     ## Evaluation
     The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1: on a
@@ -139,15 +129,12 @@ class ClothFlattenEnv(ClothEnv):
     open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation
-    goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version
@@ -166,64 +153,38 @@ class ClothFlattenHardEnv(ClothEnv):
     """Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
+    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers take hold of it, of other layers
+    too.  After 320 steps they open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
-    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers, as in
-    ``ClothDrapeGripper-v0``, take the particles within
-    3 cm of their tips when their fingers have closed, other layers too.  After 320 steps they open, and the sheet settles for 40
-    steps, in which actions are ignored; then it is evaluated.
+    $physics
 
-    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``; but the fabric is the tropical
-    wool of ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity.
+    The tropical wool has half the rigidity of the median fabric of ``ClothFlatten-v0``.
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
-    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
-    is the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    As in ``ClothFlatten-v0``.
 
     ## Evaluation
-    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1: on a
-    grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The normalized performance is the
-    normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.
-    A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and held by nothing.
-
-    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``best``, the best normalized improvement so far;
-    ``first_success``, the first step with enough coverage, or -1; and ``success_held``, whether it has been enough ever since.  At
-    the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and ``softgym_coverage``, SoftGym's
-    measure: of 100 x 100 cells of the particles' bounding box those within a particle's spacing of a particle, over the flat
-    sheet's area.  This one depends on how the sheet is turned, and may exceed 1.
+    As in ``ClothFlatten-v0``, with the same ``info``.
 
     ## Starting State
-    One of 96 crumpled sheets that cover 0.12 to 0.42 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a
-    random particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by
-    up to 0.2 L along x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the
-    sheet.  The grippers are
-    open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
+    One of 96 crumpled sheets that cover 0.12 to 0.42 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a random
+    particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
+    y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are open, 0.3
+    to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged" (not finite; the last finite observation
-    goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

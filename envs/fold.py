@@ -352,31 +352,24 @@ class ClothFoldEnv(ClothEnv):
     """Fold a sheet that lies on the floor in half, along its diagonal, or twice.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
+    A sheet of 0.6 m lies flat on the floor, turned and aside.  Two grippers hover above the corners of one edge.  ``fold`` says how
+    it is to be folded: in half, over the diagonal, or in half twice.  When the time is up the fingers open, and the sheet settles
+    for two seconds, in which actions are ignored; then it is evaluated.  To hold the fold in its place until then is as good as to
+    let go.
 
-    A sheet of 0.6 m lies flat on the floor, turned and aside.  Two grippers hover above the corners of one edge; they are those of
-    ``ClothDrapeGripper-v0``.  ``fold`` says how it is to be folded: in half, over the diagonal, or in half twice.  When the time is
-    up the fingers open, and the sheet settles for two seconds, in which actions are ignored; then it is evaluated.  To hold the
-    fold in its place until then is as good as to let go.
+    $physics
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.7 times ``1 - e/e0``, see below, plus 0.3 times the mean over the corners
-    that are meant to be taken first of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At
-    the end it is the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is 0.7 times ``1 - e/e0``, see below, plus 0.3 times the mean over the corners that are meant to be
+    taken first of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     Seen from above, each point of the sheet has a place in the ideal fold, which is thin and flat.  The ideal lies where it is
@@ -398,15 +391,12 @@ class ClothFoldEnv(ClothEnv):
     up to 0.1 L beside and 0.2 to 0.35 L above their corners.
 
     ## Episode End
-    Terminated when evaluated, after 80 steps ("half"), 90 ("diagonal") or 150 ("quarter") and 60 of settling; or at a failure,
-    which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation goes
-    out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

@@ -231,9 +231,6 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     """Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
-
     The sheet and both grippers are those of ``ClothFold-v0``.  Each episode draws one fold and asks for it by where the four
     corners are to be: those of one edge are carried over the sheet, at least half the way to the opposite edge, and the others stay
     where they lie.  When the time is up the fingers open, and the sheet settles, in which actions are ignored.
@@ -242,13 +239,10 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     can put other goals in the place of those that were asked for: SB3's ``HerReplayBuffer`` takes the single environment, and a
     batch from ``clothgym.adapters.sb3.make_sb3_vec_env``.
 
-    ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
+    $physics
 
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    ## Action Space
+    $actions
 
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
@@ -259,10 +253,9 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     ## Rewards
     ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: what
     ``compute_reward(achieved_goal, desired_goal, info)`` says, of one goal, (12,), or of many, (..., 12).
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is ``1 - d/d0``, see below; at the end it is the normalized performance, at a
-    failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is ``1 - d/d0``, see below.
 
     ## Evaluation
     ``info["distance"]`` is the mean distance d of the corners from their goals, in sides, and ``distance_max`` the largest, after
@@ -282,15 +275,12 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     corners.
 
     ## Episode End
-    Terminated when evaluated, after 80 steps and 40 of settling; or at a failure, which ``env.metadata["failures"]`` names by the
-    code ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m
-    beyond the arena of 2.4 m), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit is
-    part of the task, and the time left is observed.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version
@@ -309,16 +299,15 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
     """Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.
 
     ## Description
-    True physics, as in ``ClothFoldGoal-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
-
     Everything is as in ``ClothFoldGoal-v0`` but for the sheet and its start, which are those of ``ClothFold-Hard-v0``: L = 0.8 m
     (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  And as often as not
     one corner is to be carried alone, at least half the way to the opposite one, while the other gripper, which begins above the
     next corner, has nothing to do.  The time is 100 steps, and 50 of settling.
 
+    $physics
+
     ## Action Space
-    As in ``ClothFoldGoal-v0``: ``Box(-1, 1, (8,))``, for each gripper a velocity, and what the fingers do.
+    $actions
 
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
@@ -333,12 +322,12 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
     As in ``ClothFoldGoal-v0``, with the same ``info``.
 
     ## Episode End
-    As in ``ClothFoldGoal-v0``, with an arena of 3.2 m.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

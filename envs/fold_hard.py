@@ -40,22 +40,14 @@ class ClothFoldHardEnv(ClothEnv):
     """Fold a large sheet of silk, turned by any angle on the floor, in half twice.
 
     ## Description
-    True physics, as in ``ClothFold-v0``: the whole sheet touches the floor and, strictly, itself, bends with its rigidity, and
-    moves through air.
-
     Everything is as in ``ClothFold-v0`` but for the sheet, L = 0.8 m (21 x 21 particles), its fabric, silk
     (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), its start, and the fold, which is the quarter unless ``fold`` says
     another: two folds after each other, the second of two layers.  The sheet settles for three seconds.
 
-    ``physics="fast"`` has the short cuts of ``ClothFold-v0``, but for the fabric, which stays, and no air but a linear drag.
+    $physics
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
@@ -71,15 +63,12 @@ class ClothFoldHardEnv(ClothEnv):
     0.1 L beside and 0.2 to 0.35 L above the corners of one edge.
 
     ## Episode End
-    Terminated when evaluated, after 190 steps ("quarter"), 100 ("half") or 120 ("diagonal") and 90 of settling; or at a failure,
-    which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged" (not finite; the last finite observation goes
-    out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

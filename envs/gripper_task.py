@@ -71,7 +71,8 @@ class GripperTask(Task):
     arguments: ClassVar = {
         "slip_force": "pull at which the cloth slips out of a gripper [N]",
         "action_mode": '"velocity", or "pick_place": an action is 60 control steps, and 5 numbers in [-1, 1] for each gripper: '
-        "where it picks, x and y, where it places, x and y, in a square about the origin, and how high it lifts, from 0 to 1 side",
+        "where it picks, x and y, where it places, x and y, in a square about the origin, and how high it lifts, from 0 to 1 side; "
+        "an episode has $picks of these, and $rests in which the sheet settles",
     }
 
     def __init__(self, num_envs: int, slip_force: float | None = None, action_mode: str = "velocity", **kwargs: Any) -> None:

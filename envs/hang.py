@@ -14,7 +14,8 @@ from clothgym.attachments import Gripper
 from clothgym.checks import shown
 from clothgym.envs import draping, hanging
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.drape import LETS_GO
+from clothgym.envs.draping import holds_nothing as _holds_nothing
+from clothgym.envs.draping import let_go as _let_go
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail, stop_at_rail
@@ -38,23 +39,6 @@ EXPERT_SPEED = 0.8  # share of the speed limit
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
-
-
-@inlined
-def _let_go(own, rules, sheet, move, free):
-    """Open the anchors that the action opens, or all when time is up."""
-    for k in range(free.shape[0]):
-        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
-            free[k], sheet.holds[k] = 1, 0
-
-
-@inlined
-def _holds_nothing(own, rules, sheet):
-    """Whether both anchors are open."""
-    for k in range(sheet.holds.shape[0]):
-        if sheet.holds[k] > 0:
-            return False
-    return True
 
 
 @inlined
@@ -282,39 +266,28 @@ class ClothHangEnv(ClothEnv):
     """Hang a sheet that is held by two corners over a rail, and let go of it.
 
     ## Description
-    True physics: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves through air.
-
     A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.5 to 0.7 L in front of a rail: a rod of
     radius 0.05 L and length 1.6 L, level, on two posts of the same radius, its axis 0.75 to 1 L above the floor.  The agent moves
     both corners and may let go of each.  When it holds none, or after 80 steps, at which both are let go, the sheet has five
     seconds, 150 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until then is as good as
     to let go.
 
-    The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), whole-sheet contact with friction
-    0.5, strict self-collision, quadratic bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; rail and
-    posts stop the corners; 30 Hz control, ``semi_implicit_euler`` with 50 substeps.  Cloth rests 6 mm from the rail's surface,
+    $physics
+
+    The fabric is the median of 618 measured ones, its linear drag that of filmed cloth.  Cloth rests 6 mm from the rail's surface,
     about the height of the rail's arc over a side of a triangle, so that particles carry it and it does not tremble.
 
-    ``physics="fast"`` has short cuts: contact of particles alone, none of the sheet with itself, skip springs without rigidity,
-    hands that go through solids, a cotton in a linear drag of 4.8 per second and no other air.
-
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each corner:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | let go for good, if above 0.8 | [-1, 1] | |
+    $actions corner
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance
-    d of the sheet's center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.  At
-    the end it is the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance d of the sheet's
+    center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.
 
     ## Evaluation
     The rail's vertical plane cuts the sheet.  Balance B is twice the smaller part's share of the area.  Support S is the length of
@@ -337,15 +310,12 @@ class ClothHangEnv(ClothEnv):
     45 degrees.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 2.4 m), "diverged"
-    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"rail"``, a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad] (the
-    rest is drawn), and ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version
@@ -364,36 +334,25 @@ class ClothHangHardEnv(ClothEnv):
     """Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.
 
     ## Description
-    True physics, as in ``ClothHang-v0``: the whole sheet touches solids and, strictly, itself, bends with its rigidity, and moves
-    through air.
-
     The rail and the evaluation are those of ``ClothHang-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles), of silk
-    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction 0.3, and cloth rests
-    7 mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail.
-    A gripper is a kinematic body with two fingers: when these have closed it holds the particles within 3 cm of its tip, and when
-    they begin to open it lets go; it may take hold as often as it likes.  The fingers do not push the cloth; the rail stops a
-    gripper's tip, the floor what it holds, and while they move it does not sink.  After 130 steps they open, and the sheet has five
-    seconds, 150 steps, in which actions are ignored; then it is evaluated.
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction 0.3, and cloth rests 7
+    mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail,
+    which stops their tips.  After 130 steps they open, and the sheet has five seconds, 150 steps, in which actions are ignored;
+    then it is evaluated.
 
-    ``physics="fast"`` has the short cuts of ``ClothHang-v0``, but for the fabric, which stays, and no air but a linear drag.
+    $physics
 
     ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 1 m/s; a vector longer than 1 is shortened | [-1, 1] | m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $actions
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners
-    of 1 for one that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.  At the end it is the
-    normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners of 1 for one that has
+    been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     As in ``ClothHang-v0``, with the same ``info``.
@@ -404,15 +363,12 @@ class ClothHangHardEnv(ClothEnv):
     beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m beyond the arena of 3.2 m), "diverged"
-    (not finite; the last finite observation goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"rail"``, as in ``ClothHang-v0``, ``"rumpled"``, True or False, and ``"material"``, a preset's
-    name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version

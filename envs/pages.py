@@ -1,20 +1,23 @@
 """What an environment's page says of its task's observations and keywords, and the refusal of keywords that there are not.
 
-A class's docstring is its page.  Two lines in it are replaced when the class is made: ``$observations`` by the table of the task's
-observations, ``$arguments`` by that of its keywords.
+A class's docstring is its page.  Lines in it that begin with a mark are replaced when the class is made, by what follows from the
+task: ``$observations`` by the table of its observations, ``$arguments`` by that of its keywords, and those of ``MARKS``, some with
+words of their own, by what ``sections`` says.
 """
 
 from __future__ import annotations
 
 import difflib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from clothgym.envs import sections
 from clothgym.envs.definition import Observation, points_observed
 from clothgym.envs.measures import key_particles
+from clothgym.envs.pick_place import STEPS
 from clothgym.envs.task import Task
 
 if TYPE_CHECKING:
@@ -116,8 +119,12 @@ def completed(page: str | None, task_class: type[Task] | None) -> str | None:
     lines = []
     for line in page.split("\n"):
         indent = line[: len(line) - len(line.lstrip())]
-        table = {"$observations": observations_of, "$arguments": arguments_of}.get(line.strip())
-        lines += [line] if table is None else [(indent + row).rstrip() for row in table(task_class)]
+        mark, _, words = line.strip().partition(" ")
+        if mark not in MARKS:
+            lines.append(line)
+            continue
+        rows = MARKS[mark](task_class, words) if words else MARKS[mark](task_class)
+        lines += [(indent + row).rstrip() for row in rows]
     return "\n".join(lines)
 
 
@@ -161,6 +168,8 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$substeps": str(physics.substeps),
         "$air_density": f"{physics.air_density:g}",
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
+        "$picks": str(getattr(task_class, "picks", "")),
+        "$rests": str(-(-task_class.settling_steps // STEPS)),
     }
     defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
@@ -170,3 +179,14 @@ def arguments_of(task_class: type[Task]) -> list[str]:
             row = row.replace(mark, text)
         rows.append(row)
     return rows
+
+
+MARKS: dict[str, Callable[..., list[str]]] = {
+    "$observations": observations_of,
+    "$arguments": arguments_of,
+    "$physics": sections.physics_of,
+    "$actions": sections.actions_of,
+    "$rewards": sections.rewards_of,
+    "$episode_end": sections.episode_end_of,
+    "$options": sections.options_of,
+}

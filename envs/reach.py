@@ -206,29 +206,25 @@ class ClothReachEnv(ClothEnv):
     """Bring the free corner of a hanging sheet to a point where it can rest, and bring it to rest there.
 
     ## Description
-    True physics: the cloth touches itself strictly, bends with its rigidity, and moves through air.
-
     A square sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner, where three particles are pinched.  The agent
     moves that corner; the opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner,
     and at rest, when 40 steps are over.  The task is for teaching and for tests: any learner solves it in minutes.
 
-    The id fixes the physics: the median of 618 measured fabrics (``Material.preset("median")``), strict self-collision, quadratic
-    bending, quadratic air and a linear drag of 2 per second, as of filmed cloth; 15 Hz control, ``semi_implicit_euler`` with 50
-    substeps.  ``physics="fast"`` has short cuts: no self-collision, skip springs without rigidity, a cotton in a linear drag of
-    4.8 per second and no other air.
+    $physics
+
+    The fabric is the median of 618 measured ones, its linear drag that of filmed cloth.
 
     ## Action Space
-    ``Box(-1, 1, (3,))``: velocity x, y, z of the driven corner, scaled by 0.5 m/s; a vector longer than 1 is shortened.
+    $actions the driven corner
 
     ## Observation Space
     $observations
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  With the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the
-    potential on the way is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``; at the end it is
-    the normalized performance, at a failure 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way, with the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the potential is
+    the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``.
 
     ## Evaluation
     ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
@@ -243,16 +239,12 @@ class ClothReachEnv(ClothEnv):
     millimeter.
 
     ## Episode End
-    Terminated when evaluated, after 40 steps, or at a failure, which ``env.metadata["failures"]`` names by the code
-    ``info["failure"]``: "torn" (a structural spring at twice its rest length), "out_of_bounds" (the sheet's center 0.5 m outside
-    the room of the driven corner), "diverged" (not finite; the last finite observation goes out).  Never truncated: the time limit
-    is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"goal"``, three coordinates [m], and ``"material"``, a preset's name or a dict of properties, for
-    one episode.
+    $options
 
     ## Version History
     * v0: initial version

@@ -352,8 +352,6 @@ class ClothStrainEnv(ClothEnv):
     """Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.
 
     ## Description
-    True physics: the whole sheet touches the post and, strictly, itself, bends with its rigidity, and moves through wind.
-
     A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its
     upper corners, each 3 x 2 particles wide.  The agent moves both clips past a post, by two way-points, to a goal, within 150
     steps.  At rest the most stretched yarn is 4 % longer than it was made; a start from rest to full speed, clips that are
@@ -363,22 +361,23 @@ class ClothStrainEnv(ClothEnv):
     The strain is that of the springs as the integrator leaves them: nothing corrects it before it is scored.  Integrators that
     limit the strain would meet the threshold whatever the agent does; they are refused.
 
-    The id fixes the physics: whole-sheet contact, strict self-collision and quadratic bending (``physics="fast"``: none of the
-    three); 30 Hz control, ``semi_implicit_euler`` with 36 substeps, damping time 1 ms (not measured), drag and
-    lift per triangle, a steady wind of up to 1 m/s from any side with gusts of 0.3 m/s rms in each direction and 0.5 s.
+    $physics
+
+    The fabric's damping time is 1 ms (not measured).  Drag and lift are per triangle, of a steady wind of up to 1 m/s from any side
+    with gusts of 0.3 m/s rms in each direction and 0.5 s.
 
     ## Action Space
-    ``Box(-1, 1, (6,))``: velocity x, y, z of the left and then of the right clip, scaled by 1 m/s; a vector longer than 1 is
-    shortened.  Clips do not turn.  The post stops them.
+    $actions the left and then of the right clip
+    Clips do not turn.  The post stops them.
 
     ## Observation Space
     $observations
 
     ## Rewards and costs
-    ``reward_mode="delta"``: progress along the way, less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus 0.25 for
-    arriving.  Progress is the change of the share of the way that lies behind the clips: what is left is their mean distance
-    from the next way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is the share of the way that lies behind the clips: what is left is their mean distance from the next
+    way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.  A success is to arrive.
 
     ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  ``info["episode_cost"]`` adds them
     up; a failure adds all the steps that were left, or tearing the sheet would be the cheap way out.  ``cost_penalty`` takes that
@@ -413,15 +412,12 @@ class ClothStrainEnv(ClothEnv):
     0.2 rad.
 
     ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m outside the room of the clips), "diverged" (not finite; the last finite observation
-    goes out).  Never truncated: the time limit is part of the task.
+    $episode_end
 
     ## Arguments
     $arguments
 
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+    $options
 
     ## Version History
     * v0: initial version
