@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask
+from clothgym.envs.experts import as_actions
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.vector import ClothVectorEnv
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.3, 0.55, 0.25
-EXPERT_SPEED = 0.8  # share of the anchors' speed limit
 
 
 class DrapeTask(DrapingTask):
@@ -61,15 +61,10 @@ class DrapeTask(DrapingTask):
         arrived = np.abs(middle[:, 1] - beyond) < 0.02
         low = np.maximum(tops[:, 2] - EXPERT_DROP * side, 0.02)
         goal = np.stack([tops[:, 0], beyond, np.where(arrived, low, tops[:, 2] + EXPERT_LIFT * side)], axis=1)
-        # half of the way in each step, as far as the speed goes
-        move = (goal - middle) / (2 * self.physics.time_step * self.physics.attachment_speed)
-        length = np.sqrt(move[:, 0] ** 2 + move[:, 1] ** 2 + move[:, 2] ** 2)
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length, 1e-9))[:, None]
-        release = arrived & (np.abs(middle[:, 2] - low) < 0.02)
-        actions = np.empty((self.num_envs, self.num_attachments, 4))
-        actions[:, :, :3] = move[:, None]
-        actions[:, :, 3] = np.where(release, 1.0, -1.0)[:, None]
-        return actions.reshape(self.num_envs, -1)
+        release = np.where(arrived & (np.abs(middle[:, 2] - low) < 0.02), 1.0, -1.0)
+        # half of the way in each step, both alike
+        each = np.ones((1, self.num_attachments))
+        return as_actions(self, (goal - middle)[:, None] / 2 * each[..., None], release[:, None] * each)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

@@ -15,7 +15,8 @@ from clothgym.checks import shown
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target, stop_at_target
-from clothgym.envs.episode import Fields, length
+from clothgym.envs.episode import Fields
+from clothgym.envs.experts import carry_by_places
 from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.measures import distance
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
@@ -34,7 +35,6 @@ PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its pl
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
 # above it before it sets out
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
-EXPERT_SPEED = 0.8  # share of the grippers' speed limit
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -170,34 +170,19 @@ class DrapeGripperTask(DrapingTask, GripperTask):
 
         Without memory: where the grippers are, and what they hold, says which part of the way they are on.
         """
-        episode, grippers, places, side = self.episode, self.simulation.grippers, self.places, self.physics.side
-        attachments, tops = grippers.positions.astype(np.float64), episode["top"][:, None]
-        to_place = self.simulation.positions[:, places] - attachments
-        own = grippers.holder[:, places] >= 0
-        ready = np.logical_and.reduce(own, axis=1, keepdims=True)
-        begun = np.logical_and.reduce(episode["picked"], axis=1, keepdims=True)
-
+        tips, tops, side = self.simulation.grippers.positions.astype(np.float64), self.episode["top"][:, None], self.physics.side
         # over the target, both at the height of the lower one's way, as far apart as the corners are at rest
         beyond = tops[..., 1] + EXPERT_BEYOND * side
         low = np.maximum(tops[..., 2] - EXPERT_DROP * side, 0.02)
-        arrived = np.abs(attachments[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
+        arrived = np.abs(tips[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
         lift = tops[..., 2] + EXPERT_LIFT * side
-        high = attachments[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * side
-        goal = np.empty_like(attachments)
-        goal[..., 0] = tops[..., 0] + self.physics.mesh.rest_positions[places, 0]
-        goal[..., 1] = np.where(high | arrived, beyond, attachments[..., 1])
+        high = tips[..., 2].min(axis=1, keepdims=True) > tops[..., 2] + EXPERT_CLEARS * side
+        goal = np.empty_like(tips)
+        goal[..., 0] = tops[..., 0] + self.physics.mesh.rest_positions[self.places, 0]
+        goal[..., 1] = np.where(high | arrived, beyond, tips[..., 1])
         goal[..., 2] = np.where(arrived, low, lift)
-        carry = (goal - attachments) / 2
-        down = arrived & (np.abs(attachments[..., 2] - low) < 0.03)
-
-        # half of the way in each step, as far as the speed goes
-        move = np.where(ready[..., None], carry, np.where((begun & ~ready)[..., None], (0.0, 0.0, 0.1), to_place / 2))
-        move = np.where((own & ~ready)[..., None], 0.0, move)
-        move /= self.physics.time_step * self.physics.attachment_speed
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
-        near = length(to_place) < REACH / 2
-        grip = np.where(begun & (down | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
-        return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
+        down = arrived & (np.abs(tips[..., 2] - low) < 0.03)
+        return carry_by_places(self, (goal - tips) / 2, down, np.array([0.0, 0.0, 0.1]))
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

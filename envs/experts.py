@@ -23,12 +23,11 @@ def as_actions(task: Any, ways: NDArray, last: NDArray) -> NDArray:
 
 
 def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray) -> NDArray:
-    """Actions of grippers that go to their places, close, carry the sheet when all hold theirs, open where it is there, and go away.
+    """Actions of grippers that go to their places, close, carry the sheet when all hold theirs, open where it is there, and leave.
 
     Without memory: what is held, and what has been, says which part of the way they are on.
-    task: a ``GripperTask`` with ``places``, whose episodes remember what has been ``picked``.  carry, away: ways of this step [m], of
-    those that carry and of those that have let go, (num_envs, grippers, 3).  there: whether to open, (num_envs, grippers) or
-    (num_envs, 1).
+    task: a ``GripperTask`` with ``places``, whose episodes remember what has been ``picked``.  carry, away: ways of this step [m]
+    of those that carry, and of those that leave, (num_envs, grippers, 3).  there: whether to open, (num_envs, grippers or 1).
     """
     grippers, places = task.simulation.grippers, task.places
     to_place = task.simulation.positions[:, places] - grippers.positions.astype(np.float64)
@@ -38,6 +37,6 @@ def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray) ->
     # half of the way to a place in each step; who holds it waits for the other
     ways = np.where(ready[..., None], carry, np.where((begun & ~ready)[..., None], away, to_place / 2))
     ways = np.where((own & ~ready)[..., None], 0.0, ways)
-    near = length(to_place) < grippers_reach(task) / 2
+    near = length(to_place) < task.physics.grippers[0].reach / 2
     grip = np.where(begun & (there | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
     return as_actions(task, ways, grip)

@@ -14,6 +14,7 @@ from clothgym.envs import pick_place
 from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
+from clothgym.envs.experts import as_actions
 from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
 from clothgym.envs.measures import SPEED2, distance
@@ -34,9 +35,9 @@ PICKING = 0.3  # share of the potential that is for taking hold
 PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
 
 # the scripted expert: height of its arc over that of a half circle; how near the end it opens, and how near points have met, in
-# sides; its share of the speed limit; how far it looks ahead on the arc, and the arc's lowest height in each fold [m]: what is
-# pressed on the layers below jumps when it is let go
-EXPERT_ARC, EXPERT_NEAR, EXPERT_MET, EXPERT_SPEED = 0.9, 0.03, 0.1, 0.8
+# sides; how far it looks ahead on the arc, and the arc's lowest height in each fold [m]: what is pressed on the layers below jumps
+# when it is let go
+EXPERT_ARC, EXPERT_NEAR, EXPERT_MET = 0.9, 0.03, 0.1
 EXPERT_STEP, EXPERT_LOW = 0.03, (0.015, 0.018)
 EXPERT_DONE = 0.9  # best score of an episode from which on it lets well alone
 
@@ -320,10 +321,7 @@ class FoldTask(ManipulationTask):
             away = met & ~held
             move[now, :count] = np.where(away[..., None], (0.0, 0.0, 0.1), going)[now]
             closed[now, :count] = (((length(to_place) < REACH / 2) & ~away | held) & ~all_there)[now]
-        move /= self.physics.time_step * self.physics.attachment_speed
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
-        grip = np.where(closed, -1.0, 1.0)[..., None]
-        return np.concatenate([move, grip], axis=2).reshape(self.num_envs, -1)
+        return as_actions(self, move, np.where(closed, -1.0, 1.0))
 
     def expert_picks(self) -> NDArray:
         """The corners of the first fold that is not done to those that they are to meet; else nothing, beside the sheet."""

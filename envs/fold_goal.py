@@ -12,7 +12,8 @@ from clothgym._jit import inlined
 from clothgym.checks import one_of
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import FINE, Fields, length
-from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, EXPERT_SPEED, FoldTask, along_arc
+from clothgym.envs.experts import as_actions
+from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
 from clothgym.envs.fold_hard import LARGE_SILK
 from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
@@ -197,9 +198,7 @@ class FoldGoalTask(ManipulationTask):
         away = ~used | (met & ~held) | brought[:, None]
         move = np.where(away[..., None], (0.0, 0.0, 0.1), going)
         closed = used & ((((length(to_place) < REACH / 2) & ~away) | held) & ~all_there)
-        move /= self.physics.time_step * self.physics.attachment_speed
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
-        return np.concatenate([move, np.where(closed, -1.0, 1.0)[..., None]], axis=2).reshape(self.num_envs, -1)
+        return as_actions(self, move, np.where(closed, -1.0, 1.0))
 
     def camera(self) -> Any:
         return FoldTask.camera(self)  # type: ignore[arg-type]

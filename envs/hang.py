@@ -16,7 +16,8 @@ from clothgym.envs import draping, hanging
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.draping import holds_nothing as _holds_nothing
 from clothgym.envs.draping import let_go as _let_go
-from clothgym.envs.episode import Fields, length
+from clothgym.envs.episode import Fields
+from clothgym.envs.experts import as_actions, carry_by_places
 from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail, stop_at_rail
 from clothgym.envs.measures import distance
@@ -35,7 +36,6 @@ REACH = 0.03  # of the fingers [m]
 # the scripted expert's ways, in sides: how far above the rail on the way and how far beyond it; where it lets go, beyond the rail
 # and below it; and how far above the rail it sets out
 EXPERT_LIFT, EXPERT_BEYOND, EXPERT_AT, EXPERT_DROP, EXPERT_CLEARS = 0.42, 0.32, 0.14, 0.39, 0.15
-EXPERT_SPEED = 0.8  # share of the speed limit
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -155,10 +155,7 @@ class HangTask(HangingTask):
         """
         hands = self.episode["targets"]
         goal, there = ways_over(self, self.in_frame(hands), self.physics.mesh.rest_positions[list(self.physics.held), 0])
-        move = self.out_of_frame(goal) / (2 * self.physics.time_step * self.physics.attachment_speed)
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
-        release = np.where(there, 1.0, -1.0)[..., None] * np.ones((1, 2, 1))
-        return np.concatenate([move, release], axis=2).reshape(self.num_envs, -1)
+        return as_actions(self, self.out_of_frame(goal) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)))
 
 
 class HangHardTask(HangingTask, GripperTask):
@@ -243,23 +240,11 @@ class HangHardTask(HangingTask, GripperTask):
 
         Without memory: where the grippers are, and what they hold, says which part of the way they are on.
         """
-        grippers, places = self.simulation.grippers, self.places
-        tips = grippers.positions.astype(np.float64)
-        to_place = self.simulation.positions[:, places] - tips
-        own = grippers.holder[:, places] >= 0
-        ready = np.logical_and.reduce(own, axis=1, keepdims=True)
-        begun = np.logical_and.reduce(self.episode["picked"], axis=1, keepdims=True)
-        hands = self.in_frame(tips)
-        goal, there = ways_over(self, hands, self.physics.mesh.rest_positions[places, 0])
+        hands = self.in_frame(self.simulation.grippers.positions.astype(np.float64))
+        goal, there = ways_over(self, hands, self.physics.mesh.rest_positions[self.places, 0])
         # when it hangs, out of its way
         away = self.out_of_frame(np.where((hands[..., 1] > 0)[..., None], (0.0, 0.1, 0.0), (0.0, 0.0, 0.1)))
-        move = np.where(ready[..., None], self.out_of_frame(goal) / 2, np.where((begun & ~ready)[..., None], away, to_place / 2))
-        move = np.where((own & ~ready)[..., None], 0.0, move)
-        move /= self.physics.time_step * self.physics.attachment_speed
-        move *= np.minimum(1, EXPERT_SPEED / np.maximum(length(move), 1e-9))[..., None]
-        near = length(to_place) < REACH / 2
-        grip = np.where(begun & (there | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
-        return np.concatenate([move, grip[..., None]], axis=2).reshape(self.num_envs, -1)
+        return carry_by_places(self, self.out_of_frame(goal) / 2, there, away)
 
 
 class ClothHangEnv(ClothEnv):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import json
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -171,9 +172,13 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$picks": str(getattr(task_class, "picks", "")),
         "$rests": str(-(-task_class.settling_steps // STEPS)),
     }
+    inherited = keywords_of(Task)
     defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
-        shown, meaning = COMMON.get(name, (f"``{default!r}``", ""))
+        shown, meaning = COMMON.get(name, ("", ""))
+        if name in inherited and default != inherited[name]:
+            shown = ""  # the task has another default than all others
+        shown = shown or f"``{json.dumps(default) if isinstance(default, str) else repr(default)}``"
         row = f"| ``{name}`` | {shown} | {task_class.arguments.get(name, meaning)} |"
         for mark, text in own.items():
             row = row.replace(mark, text)
