@@ -217,7 +217,7 @@ def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
     samples = demonstrations(model.env, options.pop("episodes"), options.pop("noise"), config["seed"])  # type: ignore[arg-type]
     torch.set_num_threads(config["threads"])
     error = clone(model, *samples, **options)
-    print(f"cloned the expert from {len(samples[0]):,} samples: mean squared error {error:.4f}")
+    print(f"cloned the expert from {len(samples[1]):,} samples: mean squared error {error:.4f}")
     return time.perf_counter() - begun
 
 
