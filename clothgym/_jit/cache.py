@@ -117,7 +117,7 @@ class CacheFolder:
             self.writable = False
             warnings.warn(
                 f"clothgym cannot use its kernel cache {str(root or self.path.parent)!r} ({error}): kernels that it lacks are "
-                "compiled again in each process, which takes a minute or two. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
+                "compiled again in each process, for a minute or two. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
                 "be written.",
                 stacklevel=2,
             )
