@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart
+from clothgym._jit import apart, inlined
 
 CELL, FINE_CELL = 0.01, 0.0025  # of the grid after each step, and at an episode's start and end [m]
 MOST_CELLS = 2000  # along a side of what is looked at, from the sheet's lowest x and y
@@ -31,6 +31,12 @@ def window(x, cell, first, count):
         first[c], count[c] = low, min(high - low + 1, MOST_CELLS)
 
 
+@inlined
+def _slope(u, v, low, high):
+    """How far an edge goes along u while it goes 1 along v; the same for both triangles at it."""
+    return (u[high] - u[low]) / (v[high] - v[low]) if v[high] > v[low] else 0.0
+
+
 @apart
 def cover(x, triangles, cell, first, covered):
     """Mark the cells whose centers are in the projection of a triangle, in ``covered``, (rows, columns), uint8.
@@ -51,11 +57,15 @@ def cover(x, triangles, cell, first, covered):
             b, c = c, b
             if v[b] < v[a] or (v[b] == v[a] and b < a):
                 a, b = b, a
-        # each row of centers between them, from one edge to the other: the lower end belongs to the triangle, the upper does not
-        for row in range(max(int(np.ceil(v[a])), 0), min(int(np.ceil(v[c])), covered.shape[0])):
-            low, high = (a, b) if row < v[b] else (b, c)
-            one = u[low] + (u[high] - u[low]) * ((row - v[low]) / (v[high] - v[low]))
-            other = u[a] + (u[c] - u[a]) * ((row - v[a]) / (v[c] - v[a]))
+        # the rows of centers between them, and how far each edge goes along u in a row
+        bottom, top = max(int(np.ceil(v[a])), 0), min(int(np.ceil(v[c])), covered.shape[0])
+        if bottom >= top:
+            continue
+        lower, upper, whole = _slope(u, v, a, b), _slope(u, v, b, c), _slope(u, v, a, c)
+        # each from one edge to the other: the lower end belongs to the triangle, the upper does not
+        for row in range(bottom, top):
+            one = u[a] + lower * (row - v[a]) if row < v[b] else u[b] + upper * (row - v[b])
+            other = u[a] + whole * (row - v[a])
             for column in range(max(int(np.ceil(min(one, other))), 0), min(int(np.ceil(max(one, other))), covered.shape[1])):
                 covered[row, column] = 1
 
