@@ -29,10 +29,16 @@ def _distance2(p, q):
 
 
 @kernel
-def distance(p, q):
+def squared_distance(p, q):
     """Of two points, in float64."""
     x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
-    return np.sqrt(x * x + y * y + z * z)
+    return x * x + y * y + z * z
+
+
+@kernel
+def distance(p, q):
+    """Of two points, in float64."""
+    return np.sqrt(squared_distance(p, q))
 
 
 @kernel
