@@ -303,7 +303,7 @@ class ClothFlingEnv(ClothEnv):
 
     ## Starting State
     One of the crumpled sheets of ``ClothFlatten-v0``, with an edge whose corners the grippers can take without any other
-    cloth, at least 0.15 L apart: 122 of such edges, of 78 sheets.  It is mirrored or not, and turned so that this line is
+    cloth, at least 0.15 L apart: 78 such edges, of 53 sheets.  It is mirrored or not, and turned so that this line is
     within 0.3 rad of the x axis, one gripper on either side; its middle is up to 0.1 L from the origin along x and y, or as near to
     that as both corners are within reach.  Held-out seeds draw from the same sheets: what is new in them is the combination, not
     the sheet.
@@ -361,7 +361,7 @@ class ClothFlingHardEnv(ClothEnv):
     As in ``ClothFling-v0``, with the same ``info``.
 
     ## Starting State
-    As in ``ClothFling-v0``, but one of the crumpled sheets of ``ClothFlatten-Hard-v0``, dropped three times: 76 edges of 51 sheets;
+    As in ``ClothFling-v0``, but one of the crumpled sheets of ``ClothFlatten-Hard-v0``, dropped three times: 55 edges of 41 sheets;
     and the line of both corners is within 0.6 rad of the x axis.
 
     ## Episode End
