@@ -233,7 +233,7 @@ class FlingTask(SpreadingTask):
         from clothgym.render import Camera
 
         far = self.physics.side / 0.6
-        return Camera(eye=(1.5 * far, -1.1 * far, 1.0 * far), target=(0.0, 0.08 * far, 0.25 * far), vertical_fov=40.0)
+        return Camera(eye=(1.25 * far, -0.9 * far, 0.85 * far), target=(0.0, 0.06 * far, 0.31 * far), vertical_fov=38.0)
 
 
 class FlingHardTask(FlingTask):

@@ -12,8 +12,8 @@ SEEDS = [1_000_000, 1_000_001, 1_000_002, 1_000_003, 7, 8]
 LOW, HIGH = np.array([-0.54, -0.18, 0.01]), np.array([0.54, 0.18, 0.75])  # of the box [m]
 
 
-def batch(num_envs=len(SEEDS), **kwargs):
-    return gym.make_vec(ID, num_envs=num_envs, autoreset_mode="Disabled", **kwargs).unwrapped
+def batch(**kwargs):
+    return gym.make_vec(ID, **({"num_envs": len(SEEDS)} | kwargs), autoreset_mode="Disabled").unwrapped
 
 
 def shadow(mesh, x, cell=0.005):
@@ -93,10 +93,9 @@ def test_the_tips_stay_in_the_box():
 
 
 def test_a_gripper_takes_hold_once_in_a_throw_and_there_is_no_fourth_throw():
-    env = batch(1)
+    env = batch(num_envs=1)
     env.reset(seed=0)
     task = env.task
-    held, throws, thrown = [], 0, False
 
     def do(left, right, steps=5):
         for _ in range(steps):
@@ -181,7 +180,7 @@ def test_macro_actions_are_refused_and_the_hard_tier_is_larger():
 
 
 def test_a_state_in_which_throws_and_coverages_do_not_fit_is_refused():
-    env = batch(1)
+    env = batch(num_envs=1)
     env.reset(seed=0)
     env.step(np.zeros((1, 8)))
     state = env.get_state()
