@@ -60,12 +60,21 @@ ENVIRONMENTS = {
         "ClothFlattenHard",
         "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.",
     ),
+    "ClothFling-v0": (
+        "ClothFling",
+        "Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.",
+    ),
+    "ClothFling-Hard-v0": (
+        "ClothFlingHard",
+        "Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
     "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
     "ClothFoldGoal-Hard-v0": 150, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
+    "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 

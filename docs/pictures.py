@@ -70,6 +70,10 @@ def draw_strips() -> None:
             strip("ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
             strip("ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_003),
         ],
+        "fling.png": [
+            strip("ClothFling-v0", (0, 40, 72, 78), 1_000_000),
+            strip("ClothFling-Hard-v0", (0, 44, 82, 90), 1_000_001),
+        ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
         "fold.png": fold_strips(),
     }

@@ -24,7 +24,7 @@ from clothgym.registration import ENVIRONMENTS
 HERE = Path(__file__).parent
 FILMS = {
     "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif", "ClothHang-v0": "hang.png",
-    "ClothHang-Hard-v0": "hang.gif",
+    "ClothHang-Hard-v0": "hang.gif", "ClothFling-v0": "fling.gif", "ClothFling-Hard-v0": "fling.png",
 }  # fmt: skip
 ROOT, PAGES = HERE.parent, HERE / "tasks"
 RESULTS = ROOT / "benchmarks" / "results" / "suite.json"

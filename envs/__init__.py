@@ -9,6 +9,7 @@ from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv, ClothFlattenHardVectorEnv, ClothFlattenVectorEnv
+from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv, ClothFlingHardVectorEnv, ClothFlingVectorEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldVectorEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv, ClothFoldGoalHardVectorEnv, ClothFoldGoalVectorEnv
 from clothgym.envs.fold_hard import ClothFoldHardEnv, ClothFoldHardVectorEnv
@@ -32,6 +33,10 @@ __all__ = [
     "ClothFlattenHardEnv",
     "ClothFlattenHardVectorEnv",
     "ClothFlattenVectorEnv",
+    "ClothFlingEnv",
+    "ClothFlingHardEnv",
+    "ClothFlingHardVectorEnv",
+    "ClothFlingVectorEnv",
     "ClothFoldEnv",
     "ClothFoldGoalEnv",
     "ClothFoldGoalHardEnv",

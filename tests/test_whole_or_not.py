@@ -40,6 +40,7 @@ OPTIONS = {
     "ClothStrain-v0": [{"target": {}}],
     "ClothFold-v0": [{"target": {}}],
     "ClothFlatten-v0": [{"rumpled": True}],
+    "ClothFling-v0": [{"rumpled": True}],
 }
 SEEDS = [-1, 1.5, "1", True]
 BATCH_SEEDS = [*SEEDS, [5, -1, 5], [5, 6, 7.5], [5, 6], [1, 2, 3, 4]]
