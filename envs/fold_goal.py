@@ -73,10 +73,12 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The grippers, and where the corners are and are to be."""
+    """The grippers and their ways to the corners, and where these are and are to be."""
     observe_grippers(own, rules, sheet, seen)
     for k in range(CORNERS):
         for c in range(3):
+            for tip in range(sheet.holds.shape[0]):
+                seen.ways[tip, k, c] = (sheet.x[c, rules.corners[k]] - sheet.attachments[tip, c]) * (10 / rules.side)
             seen.achieved_goal[k, c] = (sheet.x[c, rules.corners[k]] - own.origin[c]) / rules.side
             seen.desired_goal[k, c] = (own.goal[k, c] - own.origin[c]) / rules.side
 
@@ -113,6 +115,7 @@ class FoldGoalTask(ManipulationTask):
     # the goals at the end, from where ``as_dict`` takes them
     observations = (
         *ManipulationTask.observations,
+        Observation("ways", "for each gripper the ways from its tip to the corners", (2, CORNERS, 3), "L/10", 20 * POSITION_BOUND),
         Observation(GOALS[0], "where the four corners are", (CORNERS, 3), "L", POSITION_BOUND),
         Observation(GOALS[1], "where they are to be", (CORNERS, 3), "L", POSITION_BOUND),
     )
