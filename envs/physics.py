@@ -82,6 +82,9 @@ class Physics:
         Raises:
             ValueError: no such sheet, or the mesh is no grid, or its anchors are given as particles of this mesh alone.
         """
+        # both are numbers before they are compared: an array has no truth value
+        rows = None if rows is None else count("rows", rows, least=1)
+        side = None if side is None else positive("side", side)
         if rows in (None, *(self.mesh.shape or ())[:1]) and side in (None, self.side):
             return self
         if self.mesh.shape is None or (self.anchors and not callable(self.anchors)):
