@@ -129,12 +129,14 @@ class MainLoop:
         # by the first block that a thread takes
         self.rooms: dict[int, Any] = {}
 
-    def __call__(self, first: int, last: int, motion: Motion, weave: Any, fabric: Any, solids: Solid, *rest: Any) -> None:
-        """One control step of blocks ``first`` to ``last``; rest: the sheet's contact, the schedule, the outcome."""
+    def __call__(
+        self, first: int, last: int, motion: Motion, weave: Any, fabric: Any, solids: Solid, sheet: Any, schedule: Schedule,
+        outcome: Outcome,
+    ) -> None:  # fmt: skip
+        """One control step of blocks ``first`` to ``last``."""
         if first not in self.rooms:
-            room = rest[1].room
-            self.rooms[first] = self.make_room(motion.x[first], weave.offset, room, weave.triangles, solids.shapes)
-        self.kernel(first, last, motion, weave, fabric, solids, *rest, self.rooms[first])
+            self.rooms[first] = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
+        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms[first])
 
 
 @cache

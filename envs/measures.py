@@ -22,12 +22,6 @@ LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
 GROUP = 4  # triangles that share a box in ``count_layers``
 
 
-@inlined
-def _distance2(p, q):
-    """Squared distance of two points."""
-    return (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
-
-
 @kernel
 def squared_distance(p, q):
     """Of two points, in float64."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import inspect
+import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -162,9 +163,12 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$air_density": f"{physics.air_density:g}",
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
     }
+    inherited = keywords_of(Task)
     defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
-        shown, meaning = COMMON.get(name, (f"``{default!r}``", ""))
+        shown, meaning = COMMON.get(name, ("", ""))
+        if not shown or (name in inherited and default != inherited[name]):  # a task may have another default than all others
+            shown = f"``{json.dumps(default) if isinstance(default, str) else repr(default)}``"
         row = f"| ``{name}`` | {shown} | {task_class.arguments.get(name, meaning)} |"
         for mark, text in own.items():
             row = row.replace(mark, text)

@@ -70,6 +70,17 @@ def test_the_expert_brings_the_corners_and_each_step_s_reward_is_compute_reward(
     assert np.all(returns[success] > -80) and np.all(returns >= -120)
 
 
+def test_each_gripper_sees_its_ways_to_the_corners():
+    env, _ = batch(4)
+    for _ in range(10):
+        seen, *_ = env.step(env.expert_actions())
+    state = env.get_state().simulation
+    x, tips = state.positions.astype(float)[:, CORNERS], state.attachment_positions.astype(float)
+    ways = seen["observation"][:, env.observation_slices["ways"]].reshape(4, 2, 4, 3)
+    # in tenths of a side
+    assert ways == pytest.approx((x[:, None] - tips[:, :, None]) / (SIDE / 10), abs=1e-4)
+
+
 def test_doing_nothing_scores_nothing():
     env, _ = batch(8)
     over, total = np.zeros(8, bool), np.zeros(8)
