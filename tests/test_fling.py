@@ -125,11 +125,15 @@ def test_the_expert_flings_and_the_coverage_after_each_throw_is_that_of_the_tria
     over, after = np.zeros(len(SEEDS), bool), np.full((len(SEEDS), 3), -1.0)
     start = np.array([shadow(mesh, x) for x in task.simulation.positions])
     assert task.infos()["coverage_start"] == pytest.approx(start, abs=0.02)
-    fastest = np.zeros(len(SEEDS))
+    fastest, held, left = np.zeros(len(SEEDS)), np.zeros(len(SEEDS)), env.observation_slices["throws_left"].start
     while not over.all():
         actions = env.expert_actions()
         actions[-1] = 0.0  # one does nothing
-        _, _, terminated, _, info = env.step(actions)
+        seen, _, terminated, _, info = env.step(actions)
+        assert seen[:, left] == pytest.approx(1 - info["throws"] / 3)
+        # what is held does not lie spread, however much it covers
+        assert not info["best"][info["throws"] == 0].any()
+        held = np.maximum(held, np.where(info["throws"] == 0, info["coverage"], 0))
         fastest = np.maximum(fastest, np.linalg.norm(task.simulation.velocities, axis=2).max(axis=1))
         over |= terminated
         free = ~(task.simulation.grippers.held > 0).any(axis=1)
@@ -146,6 +150,7 @@ def test_the_expert_flings_and_the_coverage_after_each_throw_is_that_of_the_tria
     # what does nothing holds the sheet until its time is up: one throw, and no gain
     assert info["throws"][-1] == 1 and info["normalized_performance"][-1] < 0.05 and info["first_success"][-1] == -1
     assert np.all(info["coverage_after_2"][info["throws"] < 2] == -1)
+    assert held.max() > start.max()
 
 
 def test_slow_hands_do_not_lay_the_sheet_down():

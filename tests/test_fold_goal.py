@@ -92,6 +92,7 @@ def test_doing_nothing_scores_nothing():
 
 def test_the_single_environment_and_the_batch_s_last_observations_are_dictionaries():
     env, one = batch(2, seed=5, autoreset_mode="SameStep")[0], gym.make(ID)
+    env.action_space.seed(5)
     seen = one.reset(seed=5)[0]
     assert seen in one.observation_space
     for _ in range(120):
