@@ -15,6 +15,7 @@ from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv, Clot
 from clothgym.envs.fold_hard import ClothFoldHardEnv, ClothFoldHardVectorEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv, ClothHangHardVectorEnv, ClothHangVectorEnv
+from clothgym.envs.hook import ClothHookEnv, ClothHookHardEnv, ClothHookHardVectorEnv, ClothHookVectorEnv
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
@@ -49,6 +50,10 @@ __all__ = [
     "ClothHangHardEnv",
     "ClothHangHardVectorEnv",
     "ClothHangVectorEnv",
+    "ClothHookEnv",
+    "ClothHookHardEnv",
+    "ClothHookHardVectorEnv",
+    "ClothHookVectorEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
     "ClothStrainEnv",

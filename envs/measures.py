@@ -54,6 +54,23 @@ def _from_bits(bits):
     return np.int32(bits).view(np.float32)
 
 
+@inlined
+def share_above(a, b, c):
+    """Share of a triangle on which a linear function is positive that is a, b and c at the corners."""
+    count = (a > 0) + (b > 0) + (c > 0)
+    if count == 0 or count == 3:
+        return count / 3
+    # the one corner whose sign is its own: a triangle is cut off there, a^2 / ((a - b) (a - c)) of the whole
+    if (b > 0) == (c > 0):
+        alone, one, other = a, b, c
+    elif (a > 0) == (c > 0):
+        alone, one, other = b, a, c
+    else:
+        alone, one, other = c, a, b
+    cut = (alone / (alone - one)) * (alone / (alone - other))
+    return cut if count == 1 else 1 - cut
+
+
 @uncounted
 def summarize(x, v, share, ends, inverse2, out):
     """Summary of a sheet: (SUMMARY,).

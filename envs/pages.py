@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from clothgym.envs.definition import Observation, points_observed
-from clothgym.envs.measures import key_particles
 from clothgym.envs.task import Task
 
 if TYPE_CHECKING:
@@ -125,7 +124,7 @@ def completed(page: str | None, task_class: type[Task] | None) -> str | None:
 def observations_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of observations, under a sentence on their number."""
     mesh = task_class.physics.mesh
-    points = len(key_particles(mesh))
+    points = len(task_class.observed_particles(mesh))
     declared = [*points_observed(task_class, "keypoints", points), *task_class.observations]
     ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
     rows = [
@@ -156,7 +155,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of keywords: the task's own, then those of all tasks."""
     physics, rows = task_class.physics, ["| Argument | Default | Meaning |", "| --- | --- | --- |"]
     own = {
-        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "",
+        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "–",
         "$side": f"{physics.side:g}",
         "$integrator": f'"{physics.integrator}"',
         "$substeps": str(physics.substeps),

@@ -199,6 +199,8 @@ def checked_material_option(
     """
     if isinstance(material, str):
         material = preset_properties(material)
+        if physics.mesh.shape is None:
+            del material["shear_stiffness"]  # which a triangle mesh has from its edges
     if not isinstance(material, Mapping):
         raise ValueError(
             f"reset option material={shown(material)}: must be a preset's name ({', '.join(PRESETS)}) or a dict of properties"
