@@ -198,7 +198,7 @@ def drape_end(substeps: int, dtype: str) -> NDArray:
     """The task's sheet, flat and held at two corners, after half a second of its own control steps [m], (particles, 3)."""
     p = DrapeTask.physics
     s = Simulation(
-        p.mesh, p.material, 1, EULER, p.time_step, substeps, air_density=p.air_density, anchors=p.anchors, dtype=dtype, threads=1
+        p.mesh, p.material, 1, EULER, p.time_step, substeps, air_density=p.air_density, anchors=p.held, dtype=dtype, threads=1
     )
     s.step(round(0.5 / p.time_step))
     return s.positions[0]

@@ -25,6 +25,7 @@ from clothgym.registration import ENVIRONMENTS
 
 RESULTS = Path(__file__).parent / "results" / "short_cuts.json"
 EPISODES, RANDOM_STEPS, SEED = 100, 20_000, 1_000_000
+ACTORS = ("expert", "random")
 AT_ONCE = 20  # environments in a batch
 
 
@@ -50,10 +51,16 @@ def watched(env_id: str, physics: str, actor: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", choices=tuple(ENVIRONMENTS), nargs="+", default=tuple(ENVIRONMENTS))
-    wanted = parser.parse_args().env
+    parser.add_argument("--physics", choices=PHYSICS, nargs="+", default=PHYSICS)
+    parser.add_argument("--actor", choices=ACTORS, nargs="+", default=ACTORS)
+    wanted = parser.parse_args()
     known = json.loads(RESULTS.read_text())["rows"] if RESULTS.exists() else []
-    rows = [row for row in known if row["env"] not in wanted]
-    cases = [(env, physics, actor) for env in wanted for physics in PHYSICS for actor in ("expert", "random")]
+    rows = [
+        row
+        for row in known
+        if row["env"] not in wanted.env or row["physics"] not in wanted.physics or row["actor"] not in wanted.actor
+    ]
+    cases = [(env, physics, actor) for env in wanted.env for physics in wanted.physics for actor in wanted.actor]
     for env_id, physics, actor in tqdm(cases, unit="row"):
         rows.append({"env": env_id, "physics": physics, "actor": actor, **watched(env_id, physics, actor)})
         RESULTS.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")

@@ -1,8 +1,8 @@
 """Floor 5: the main loop, which is all that happens in a control step.
 
-``advance`` takes blocks one after the other, and ``advance_block`` takes one through all its substeps.  The kernels that they call
-are the placeholders below, bound when a simulation is made (``compiled``), by its integrator, bending model, layout, limiter and
-contact.
+``advance`` takes blocks one after the other, each through all its substeps.  The kernels that it calls are the placeholders below,
+bound when a simulation is made (``compiled``), by its integrator, bending model, layout, limiter and contact.  Its scratch, which
+it cannot make itself (see ``_jit.uncounted``), is made by ``room_for_block``.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ resolve = placeholder(
     "resolve", "of (x, v, w, triangles, shapes, colliders, h, carried, look, room): moves solids on, and the sheet out of them"
 )
 room_for_contact = placeholder("room_for_contact", "of (x, triangles, shapes): makes the scratch of ``resolve``")
-# ``advance_block`` as it is compiled for all this
-take_block = placeholder("take_block", "``advance_block``, with all kernels bound: takes a block through its substeps")
 
 
 class Motion(NamedTuple):
@@ -85,55 +83,73 @@ class Outcome(NamedTuple):
     diverged: NDArray
 
 
-def advance_block(
-    x, v, w, weave, elastic, drag_rate, resistance, gravity, wind, schedule, shapes, colliders, sheet, block, push, work, room,
-    limited,
-):  # fmt: skip
-    """All substeps of one block."""
-    h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
-    for step in range(substeps):
-        # the air's force is slow beside the springs': until it is computed again it is a constant push
-        if air_every > 0 and step % air_every == 0:
-            push[:] = 0
-            add_air_forces(x, v, push, weave.air, resistance, wind, x.dtype.type(air_every) * h, work.scratch)
-        # the integrator: springs, bending, gravity, drag and that push move the particles on
-        substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
-        # springs that are stretched beyond the limit are pulled back to it
-        restrain(x, v, w, weave, limit, limited)
-        # contacts of the sheet with itself press as before, so that solids bear what lies on them
-        press(x, v, w, sheet, block, step, h, carried)
-        # solids move on, and push out what is in them
-        resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, step, look_every, room)
-        # the contacts' impulses are corrected, and no vertex leaves its displacement bound
-        keep_apart(x, v, w, sheet, block, h, carried)
-    remeasure(x, weave, limited)
+def room_for_block(x, offset, room, triangles, shapes):
+    """Scratch of ``advance``, which its blocks share one after the other: the integrator's, the air's force [N], and contact's.
+
+    x: positions of a block.  offset: see ``elements.room_for_forces``.  room: see ``Integrator.room``.
+    """
+    return room_for_work(x, offset, room), np.zeros(x.shape, x.dtype), room_for_contact(x, triangles, shapes)
 
 
-def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome):
+def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, room):
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
-    x, v, w = motion
-    # scratch, which the blocks share one after the other
-    work, push = room_for_work(x[first], weave.offset, schedule.room), np.zeros(x.shape[1:], x.dtype)
-    room = room_for_contact(x[first], weave.triangles, solids.shapes)
+    h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
+    work, push, touches = room
+    shapes = solids.shapes
     for b in range(first, last):
-        push[:] = 0
-        outcome.limited[b] = 0
+        x, v, w, colliders, limited = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.limited[b]
         elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b])
-        take_block(
-            x[b], v[b], w[b], weave, elastic, fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b],
-            schedule, solids.shapes, solids.rows[b], sheet, b, push, work, room, outcome.limited[b],
-        )  # fmt: skip
-        mark_diverged(x[b], v[b], outcome.diverged[b])
+        drag_rate, resistance, gravity, wind = fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b]
+        push[:] = 0
+        limited[:] = 0
+        for step in range(substeps):
+            # the air's force is slow beside the springs': until it is computed again it is a constant push
+            if air_every > 0 and step % air_every == 0:
+                push[:] = 0
+                add_air_forces(x, v, push, weave.air, resistance, wind, x.dtype.type(air_every) * h, work.scratch)
+            # the integrator: springs, bending, gravity, drag and that push move the particles on
+            substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
+            # springs that are stretched beyond the limit are pulled back to it
+            restrain(x, v, w, weave, limit, limited)
+            # contacts of the sheet with itself press as before, so that solids bear what lies on them
+            press(x, v, w, sheet, b, step, h, carried)
+            # solids move on, and push out what is in them
+            resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, step, look_every, touches)
+            # the contacts' impulses are corrected, and no vertex leaves its displacement bound
+            keep_apart(x, v, w, sheet, b, h, carried)
+        remeasure(x, weave, limited)
+        mark_diverged(x, v, outcome.diverged[b])
+
+
+class MainLoop:
+    """``advance`` of one simulation, with the scratch of each of its threads."""
+
+    def __init__(self, kernel: Any, make_room: Any) -> None:
+        self.kernel, self.make_room = kernel, make_room
+        # by the first block that a thread takes
+        self.rooms: dict[int, Any] = {}
+
+    def __call__(
+        self, first: int, last: int, motion: Motion, weave: Any, fabric: Any, solids: Solid, sheet: Any, schedule: Schedule,
+        outcome: Outcome,
+    ) -> None:  # fmt: skip
+        """One control step of blocks ``first`` to ``last``."""
+        if first not in self.rooms:
+            self.rooms[first] = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
+        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms[first])
 
 
 @cache
-def compiled(substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str) -> Any:
+def compiled(
+    substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str
+) -> tuple[Any, Any]:
     """``advance`` around an integrator's substep: with the forces of a bending model and a layout, with a limiter or none, with
-    contact of the sheet with itself or none, and with contact with solids (see ``particle_contact.needed``)."""
+    contact of the sheet with itself or none, and with contact with solids (see ``particle_contact.needed``); and its
+    ``room_for_block``."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     touching = contact_kernels(contact, by_particle)
-    parts = limiting.kernels_of(limits, by_particle) | SELF_CONTACT[collides] | used(advance_block, forces | touching)
+    parts = limiting.kernels_of(limits, by_particle) | SELF_CONTACT[collides] | used(advance, forces | touching)
     parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **used(substep, forces))
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
-    block = specialize(uncounted(advance_block), f"advance_block_{which}", apart=True, **parts)
-    return specialize(advance, f"advance_{which}", take_block=block, **used(advance, touching))
+    room = specialize(room_for_block, f"room_for_block_{layout}", **used(room_for_block, touching))
+    return specialize(uncounted(advance), f"advance_{which}", apart=True, **parts), room

@@ -32,6 +32,14 @@ ENVIRONMENTS = {
         "ClothHangHard",
         "Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.",
     ),
+    "ClothHook-v0": (
+        "ClothHook",
+        "Hang a sheet that is held by two corners by its hole on a hook, and let go of it.",
+    ),
+    "ClothHook-Hard-v0": (
+        "ClothHookHard",
+        "Pick up a silk sheet from the floor, flat or rumpled, hang it by its small hole on a hook, and let go.",
+    ),
     "ClothStrain-v0": (
         "ClothStrain",
         "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
@@ -60,12 +68,22 @@ ENVIRONMENTS = {
         "ClothFlattenHard",
         "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.",
     ),
+    "ClothFling-v0": (
+        "ClothFling",
+        "Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.",
+    ),
+    "ClothFling-Hard-v0": (
+        "ClothFlingHard",
+        "Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.",
+    ),
 }
 # steps after which an episode of an id has ended by itself, at the latest
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
     "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
     "ClothFoldGoal-Hard-v0": 150, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
+    "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
+    "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
 

@@ -19,7 +19,7 @@ from clothgym.exclusive import Turn, exclusive
 from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
 from clothgym.limiting import checked_limit
-from clothgym.main_loop import Motion, Outcome, Schedule, Solid, compiled
+from clothgym.main_loop import MainLoop, Motion, Outcome, Schedule, Solid, compiled
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.observed import Observed
@@ -164,10 +164,10 @@ class Simulation(Observed):
         """The main loop with the kernels of all that there is."""
         touched = needed(self.contact, self._solids.shapes.kinds)
         parts = self.bending, self.layout.by_particle, self.strain_limit is not None, self._contact.options is not None, touched
-        self._advance = compiled(self.integrator.substep, self.integrator.name, *parts)
+        self._advance = MainLoop(*compiled(self.integrator.substep, self.integrator.name, *parts))
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle holds: all but compiled code."""
+        """What a copy or a pickle holds: all but compiled code and its scratch."""
         return {name: value for name, value in vars(self).items() if name != "_advance"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

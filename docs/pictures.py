@@ -66,9 +66,17 @@ def draw_strips() -> None:
             strip("ClothHang-v0", (0, 12, 18, 30), 7),
             strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
         ],
+        "hook.png": [
+            strip("ClothHook-v0", (0, 24, 46, 60), 7),
+            strip("ClothHook-Hard-v0", (0, 30, 80, 112), 9, {"rumpled": True}),
+        ],
         "flatten.png": [
             strip("ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
             strip("ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_003),
+        ],
+        "fling.png": [
+            strip("ClothFling-v0", (0, 40, 72, 78), 1_000_000),
+            strip("ClothFling-Hard-v0", (0, 44, 82, 90), 1_000_001),
         ],
         "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
         "fold.png": fold_strips(),

@@ -24,7 +24,8 @@ from clothgym.registration import ENVIRONMENTS
 HERE = Path(__file__).parent
 FILMS = {
     "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif", "ClothHang-v0": "hang.png",
-    "ClothHang-Hard-v0": "hang.gif",
+    "ClothHang-Hard-v0": "hang.gif", "ClothFling-v0": "fling.gif", "ClothFling-Hard-v0": "fling.png",
+    "ClothHook-v0": "hook.png", "ClothHook-Hard-v0": "hook.gif",
 }  # fmt: skip
 ROOT, PAGES = HERE.parent, HERE / "tasks"
 RESULTS = ROOT / "benchmarks" / "results" / "suite.json"
@@ -81,8 +82,9 @@ def _picture(env_id: str) -> str:
 
 
 def _sheet(task: Any) -> str:
-    rows, columns = task.physics.mesh.grid_shape
-    return f"{task.physics.side:g} m, {rows} x {columns} particles"
+    mesh = task.physics.mesh
+    particles = " x ".join(map(str, mesh.shape)) if mesh.shape else str(mesh.num_particles)
+    return f"{task.physics.side:g} m, {particles} particles"
 
 
 def _time(task: Any) -> str:

@@ -9,11 +9,13 @@ from clothgym.envs.drape import ClothDrapeEnv, ClothDrapeVectorEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv, ClothDrapeGripperVectorEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv, ClothFlattenHardVectorEnv, ClothFlattenVectorEnv
+from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv, ClothFlingHardVectorEnv, ClothFlingVectorEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldVectorEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv, ClothFoldGoalHardVectorEnv, ClothFoldGoalVectorEnv
 from clothgym.envs.fold_hard import ClothFoldHardEnv, ClothFoldHardVectorEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv, ClothHangHardVectorEnv, ClothHangVectorEnv
+from clothgym.envs.hook import ClothHookEnv, ClothHookHardEnv, ClothHookHardVectorEnv, ClothHookVectorEnv
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv, ClothReachVectorEnv
 from clothgym.envs.single import ClothEnv
@@ -32,6 +34,10 @@ __all__ = [
     "ClothFlattenHardEnv",
     "ClothFlattenHardVectorEnv",
     "ClothFlattenVectorEnv",
+    "ClothFlingEnv",
+    "ClothFlingHardEnv",
+    "ClothFlingHardVectorEnv",
+    "ClothFlingVectorEnv",
     "ClothFoldEnv",
     "ClothFoldGoalEnv",
     "ClothFoldGoalHardEnv",
@@ -44,6 +50,10 @@ __all__ = [
     "ClothHangHardEnv",
     "ClothHangHardVectorEnv",
     "ClothHangVectorEnv",
+    "ClothHookEnv",
+    "ClothHookHardEnv",
+    "ClothHookHardVectorEnv",
+    "ClothHookVectorEnv",
     "ClothReachEnv",
     "ClothReachVectorEnv",
     "ClothStrainEnv",

@@ -19,6 +19,7 @@ from clothgym.envs.episode import Fields
 from clothgym.envs.measures import centers_of_area, key_particles
 from clothgym.envs.physics import Physics
 from clothgym.envs.stepping import IN_NUMPY, Kernels
+from clothgym.mesh import ClothMesh
 from clothgym.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class TaskDefinition:
         actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
         observations: what is observed beside the points of the sheet, in that order.
         goals: names of the last of these, which are given apart, in a dictionary, as goal environments have it.
+        key_points: what the observed points of the sheet are with obs_mode="keypoints", for the page.
         points_relative_to: what the observed points of the sheet are relative to, ``episode["origin"]``, for the page.
         position_bound: of these points, in sides.
         evaluation: fields of info that an evaluation writes, zero until then, beside performance and success.
@@ -78,6 +80,7 @@ class TaskDefinition:
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles", "heightmap", "pointcloud", "rgb", "depth", "rgbd")
     observations: ClassVar[tuple[Observation, ...]] = (Observation("time_left", "share of the time left", function=time_left),)
     goals: ClassVar[tuple[str, ...]] = ()
+    key_points: ClassVar[str] = "3 x 3 points of the sheet (corners, edge middles, center)"
     points_relative_to: ClassVar[str] = "the origin"
     position_bound: ClassVar[float] = POSITION_BOUND
     evaluation: ClassVar[Fields] = ()
@@ -178,9 +181,10 @@ class TaskDefinition:
 
     # --- picture --------------------------------------------------------------------------------------------------------
 
-    def observed_particles(self) -> NDArray:
+    @classmethod
+    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
         """The particles that are observed with ``obs_mode="keypoints"``."""
-        return key_particles(self.physics.mesh)
+        return key_particles(mesh)
 
     def solids(self, env: int) -> list[Drawable]:
         """What the renderer draws beside the sheet and the floor: by default all solids but planes, where they are now."""
@@ -221,7 +225,7 @@ class TaskDefinition:
 
 def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, count: int) -> list[Observation]:
     """What is observed of so many points of the sheet, "particles" or "keypoints": where they are, and their velocities."""
-    what = "3 x 3 points of the sheet (corners, edge middles, center)" if obs_mode == "keypoints" else "all particles, row by row"
+    what = task.key_points if obs_mode == "keypoints" else "all particles, row by row"
     return [
         Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
         Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),

@@ -12,22 +12,24 @@ from clothgym.envs.episode import length
 SPEED = 0.8  # of the attachments, as a share of their limit
 
 
-def as_actions(task: Any, ways: NDArray, last: NDArray) -> NDArray:
+def as_actions(task: Any, ways: NDArray, last: NDArray, speed: float | NDArray = SPEED) -> NDArray:
     """Actions that take each attachment along its way, as far as the speed goes, (num_envs, numbers).
 
     ways: of this step [m], (num_envs, attachments, 3).  last: what comes after the velocity, (num_envs, attachments).
+    speed: the largest, as a share of the limit, for all or (num_envs, 1).
     """
     move = ways / (task.physics.time_step * task.physics.attachment_speed)
-    move *= np.minimum(1, SPEED / np.maximum(length(move), 1e-9))[..., None]
+    move *= np.minimum(1, speed / np.maximum(length(move), 1e-9))[..., None]
     return np.concatenate([move, last[..., None]], axis=2).reshape(task.num_envs, -1)
 
 
-def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray) -> NDArray:
+def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray, speed: float | NDArray = SPEED) -> NDArray:
     """Actions of grippers that go to their places, close, carry the sheet when all hold theirs, open where it is there, and leave.
 
     Without memory: what is held, and what has been, says which part of the way they are on.
     task: a ``GripperTask`` with ``places``, whose episodes remember what has been ``picked``.  carry, away: ways of this step [m]
     of those that carry, and of those that leave, (num_envs, grippers, 3).  there: whether to open, (num_envs, grippers or 1).
+    speed: as of ``as_actions``.
     """
     grippers, places = task.simulation.grippers, task.places
     to_place = task.simulation.positions[:, places] - grippers.positions.astype(np.float64)
@@ -39,4 +41,4 @@ def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray) ->
     ways = np.where((own & ~ready)[..., None], 0.0, ways)
     near = length(to_place) < task.physics.grippers[0].reach / 2
     grip = np.where(begun & (there | ~ready), 1.0, np.where(near | own, -1.0, 1.0))
-    return as_actions(task, ways, grip)
+    return as_actions(task, ways, grip, speed)

@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym._jit import kernel
 from clothgym.envs.episode import length
 from clothgym.envs.manipulation import REACH
+from clothgym.envs.measures import distance
 
 # corners of each edge, and of the opposite one, as places in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
@@ -39,6 +41,19 @@ def _directions() -> NDArray:
     return np.array(rings)
 
 
+@kernel
+def _count_others(x, corners, allowed, tips, others):
+    """Count the particles within reach of each place for a tip, (sheets, 4, directions), beside those that may be taken along."""
+    for sheet in range(x.shape[0]):
+        for c in range(4):
+            for p in range(x.shape[1]):
+                # those near the corner alone can be
+                if allowed[c, p] or distance(x[sheet, p], x[sheet, corners[c]]) >= AWAY + CLEAR:
+                    continue
+                for d in range(tips.shape[2]):
+                    others[sheet, c, d] += distance(tips[sheet, c, d], x[sheet, p]) < CLEAR
+
+
 def places_to_take(x: NDArray, corners: NDArray, allowed: NDArray) -> tuple[NDArray, NDArray]:
     """Where tips take each corner [m], (sheets, 4, 3), and how many other particles they would take, (sheets, 4).
 
@@ -46,12 +61,8 @@ def places_to_take(x: NDArray, corners: NDArray, allowed: NDArray) -> tuple[NDAr
     """
     tips = x[:, corners][:, :, None] + AWAY * _directions()
     tips[..., 2] = np.maximum(tips[..., 2], 0.012)
-    # other particles within reach; of each sheet in turn, so that no sum depends on how many there are
-    others = np.empty(tips.shape[:3], np.int64)
-    for sheet, at, count in zip(x, tips, others):
-        for c in range(4):
-            near = sheet[~allowed[c] & (length(sheet - sheet[corners[c]]) < AWAY + CLEAR)]
-            count[c] = (length(at[c][:, None] - near) < CLEAR).sum(axis=1)
+    others = np.zeros(tips.shape[:3], np.int64)
+    _count_others(x, corners, allowed, tips, others)
     reached = length(tips - x[:, corners][:, :, None]) < 0.95 * REACH
     # straight up is best, where it is as good
     worth = others + np.where(reached, 0, 1000) + 0.02 * np.arange(tips.shape[2])

@@ -12,7 +12,7 @@ from clothgym.envs.definition import Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.gripper_task import measure_grips
 from clothgym.envs.manipulation import ManipulationTask, follow, observe_grippers
-from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, distance
+from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
 
 HOLDING = 0.1  # share of the potential that is for holding the sheet
 HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
@@ -48,10 +48,13 @@ def spread_potential(own, rules, sheet):
     """Coverage, and for each gripper 1 if it holds cloth, else at most a half as it nears it."""
     held = 0.0
     for k in range(sheet.holds.shape[0]):
+        if sheet.holds[k] > 0:
+            held += 1.0
+            continue
         nearest = np.inf
         for p in range(sheet.x.shape[1]):
-            nearest = min(nearest, distance(sheet.x[:, p], sheet.attachments[k]))
-        held += 1.0 if sheet.holds[k] > 0 else 0.5 / (1 + (nearest / (HOLD_SCALE * rules.side)) ** 2)
+            nearest = min(nearest, squared_distance(sheet.x[:, p], sheet.attachments[k]))
+        held += 0.5 / (1 + (np.sqrt(nearest) / (HOLD_SCALE * rules.side)) ** 2)
     return HOLDING * held / sheet.holds.shape[0] + (1 - HOLDING) * own.coverage
 
 

@@ -16,7 +16,7 @@ from clothgym.envs.experts import as_actions
 from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
 from clothgym.envs.fold_hard import LARGE_SILK
 from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
-from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
+from clothgym.envs.manipulation import CORNERS, REACH, WAYS, ManipulationTask, follow, observe_grippers, observe_ways
 from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
@@ -24,7 +24,6 @@ from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.task import REWARD_MODES
 from clothgym.envs.vector import ClothVectorEnv
 
-CORNERS = 4
 # largest distance of a corner from its goal, in sides; rms speed [m/s]
 ENOUGH_NEAR, ENOUGH_REST = 0.075, 0.02
 SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
@@ -74,8 +73,9 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The grippers, and where the corners are and are to be."""
+    """The grippers and their ways to the corners, and where these are and are to be."""
     observe_grippers(own, rules, sheet, seen)
+    observe_ways(rules, sheet, seen)
     for k in range(CORNERS):
         for c in range(3):
             seen.achieved_goal[k, c] = (sheet.x[c, rules.corners[k]] - own.origin[c]) / rules.side
@@ -114,6 +114,7 @@ class FoldGoalTask(ManipulationTask):
     # the goals at the end, from where ``as_dict`` takes them
     observations = (
         *ManipulationTask.observations,
+        WAYS,
         Observation(GOALS[0], "where the four corners are", (CORNERS, 3), "L", POSITION_BOUND),
         Observation(GOALS[1], "where they are to be", (CORNERS, 3), "L", POSITION_BOUND),
     )

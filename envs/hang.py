@@ -11,27 +11,22 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
-from clothgym.checks import shown
 from clothgym.envs import draping, hanging
-from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import holds_nothing as _holds_nothing
-from clothgym.envs.draping import let_go as _let_go
-from clothgym.envs.episode import Fields
+from clothgym.envs.definition import Observation
+from clothgym.envs.draping import holds_nothing, let_go
 from clothgym.envs.experts import as_actions, carry_by_places
-from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.from_floor import REACH, FromFloorTask, grippers_seen, observe_picking, take, taken
+from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
 from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail, stop_at_rail
-from clothgym.envs.measures import distance
 from clothgym.envs.physics import MEDIAN, chosen_fabric
-from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
+from clothgym.envs.rumpled import rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 GUIDING = 0.5  # share of the potential that is for bringing the sheet to the rail
-PICKING, PICK_SCALE = 0.2, 0.15  # share of it that is for taking hold; in sides, how it rises as a gripper nears its corner
-REACH = 0.03  # of the fingers [m]
+PICKING = 0.2  # share of it that is for taking hold
 
 # the scripted expert's ways, in sides: how far above the rail on the way and how far beyond it; where it lets go, beyond the rail
 # and below it; and how far above the rail it sets out
@@ -56,14 +51,6 @@ def _observe_held(own, rules, sheet, seen):
 
 
 @inlined
-def _take(own, rules, sheet, move, free):
-    """Remember which corners have been taken."""
-    for k in range(rules.places.shape[0]):
-        if sheet.holder[rules.places[k]] >= 0:
-            own.picked[k] = 1
-
-
-@inlined
 def _measure_both(own, rules, sheet):
     """How the sheet hangs, and how far the tips must stay above the floor."""
     measure_hang(own, rules, sheet)
@@ -80,25 +67,14 @@ def _stop_at_solids(own, rules, k):
 @inlined
 def _picking_and_hanging(own, rules, sheet):
     """How far the taking hold is along, and the hanging."""
-    # 1 for a corner that has been taken, at most a half for one that its gripper is near
-    taken = 0.0
-    for k in range(rules.places.shape[0]):
-        place = rules.places[k]
-        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
-        taken += 1.0 if own.picked[k] else 0.5 / (1 + away**2)
-    return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * _hanging(own, rules, sheet)
+    return PICKING * taken(own, rules, sheet) + (1 - PICKING) * _hanging(own, rules, sheet)
 
 
 @inlined
 def _observe_grippers(own, rules, sheet, seen):
-    """What is observed in both tasks, and each gripper: its tip, the way to its corner, its fingers, whether it holds anything."""
+    """What is observed in both tasks, and each gripper."""
     observe_rail(own, rules, sheet, seen)
-    for k in range(rules.places.shape[0]):
-        attachment, place = sheet.attachments[k], rules.places[k]
-        for c in range(3):
-            seen.grippers[k, c] = (attachment[c] - own.origin[c]) / rules.side
-            seen.grippers[k, 3 + c] = (sheet.x[c, place] - attachment[c]) * (10 / rules.side)
-        seen.grippers[k, 6], seen.grippers[k, 7] = sheet.openings[k], sheet.holds[k] > 0
+    observe_picking(own, rules, sheet, seen)
 
 
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
@@ -130,7 +106,7 @@ class HangTask(HangingTask):
 
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
-        _hanging, hanging.evaluate_hang, _observe_held, act=_let_go, measure=measure_hang, done=_holds_nothing,
+        _hanging, hanging.evaluate_hang, _observe_held, act=let_go, measure=measure_hang, done=holds_nothing,
         account=hanging.account_hang, stop=stop_at_rail,
     )  # fmt: skip
     acting_steps = 80
@@ -158,7 +134,7 @@ class HangTask(HangingTask):
         return as_actions(self, self.out_of_frame(goal) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)))
 
 
-class HangHardTask(HangingTask, GripperTask):
+class HangHardTask(HangingTask, FromFloorTask):
     """The task of ``ClothHang-Hard-v0``, see ``ClothHangHardEnv``."""
 
     physics = replace(
@@ -170,77 +146,30 @@ class HangHardTask(HangingTask, GripperTask):
     )
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=_take, measure=_measure_both,
+        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=take, measure=_measure_both,
         account=hanging.account_hang, fingers=close_or_open, stop=_stop_at_solids,
     )  # fmt: skip
     acting_steps = 130
     radius = 0.035
     rail_friction = 0.3
     rail_thickness = 0.007
-    observations = (
-        *hanging.OBSERVATIONS,
-        Observation(
-            "grippers",
-            "for each gripper its tip relative to the middle of the rail [L], the way from its tip to the corner that it is meant "
-            "to take [L/10], how far open its fingers are, and whether it holds anything",
-            (2, 8),
-            "",
-            (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0, 1.0),
-        ),
-    )
-    ranges: ClassVar = {**HangingTask.ranges, **GripperTask.ranges, "picked": (0, 1)}
+    observations = (*hanging.OBSERVATIONS, grippers_seen("the middle of the rail"))
+    ranges: ClassVar = {**HangingTask.ranges, **FromFloorTask.ranges}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "rail", "rumpled")
-    arguments: ClassVar = {
-        **GripperTask.arguments,
-        "action_mode": '"velocity" alone: what is picked and placed ends on the floor',
-    }
-
-    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
-        if action_mode != "velocity":
-            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed ends on the floor")
-        super().__init__(num_envs, **kwargs)
 
     @property
-    def places(self) -> NDArray:
-        """The particles that each gripper is to take: both corners of the edge at the rail."""
+    def places(self) -> NDArray:  # type: ignore[override]
+        """Both corners of the edge at the rail."""
         return np.array(self.physics.mesh.corners[2:])
-
-    def remembers(self) -> Fields:
-        # whether each corner has ever been held
-        return [*super().remembers(), ("picked", np.uint8, len(self.places))]
-
-    def constants(self) -> dict[str, Any]:
-        return super().constants() | {"places": self.places}
-
-    def check_options(self, options: Mapping[str, Any]) -> None:
-        super().check_options(options)
-        if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
-            raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         self.draw_rail(env, rng, options.get("rail", {}))
-        mesh, side = self.physics.mesh, self.physics.side
-        gap, sideways, yaw = side * rng.uniform(0.1, 0.2), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
-        sheets = rumpled_sheets(*mesh.grid_shape, side)
-        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(sheets)))
-        flat = mesh.rest_positions + (0, 0, ON_FLOOR)
-        x = sheets[number].copy() if options.get("rumpled", rumpled) else flat
-        c, s = np.cos(yaw), np.sin(yaw)
-        x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
-        # beside the rail, all of it
-        x = self.before(env, x, -x[:, 1].max() - (self.radius * side + gap), sideways)
-        x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
-        away = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
-        self.gripper_starts[env] = x[self.places] + side * away
-        self.episode["picked"][env] = False
-        return x
+        side = self.physics.side
+        return self.lie(env, rng, options, rumpled_sheets(*self.physics.mesh.grid_shape, side), self.radius * side)
 
     def expert_actions(self) -> NDArray:
-        """To the corners, close, up, over the rail, and down on its other side until half of the sheet is there; open, and away.
-
-        Without memory: where the grippers are, and what they hold, says which part of the way they are on.
-        """
-        hands = self.in_frame(self.simulation.grippers.positions.astype(np.float64))
+        """Up with both corners, over the rail, and down on its other side until half of the sheet is there."""
+        hands = self.hands()
         goal, there = ways_over(self, hands, self.physics.mesh.rest_positions[self.places, 0])
         # when it hangs, out of its way
         away = self.out_of_frame(np.where((hands[..., 1] > 0)[..., None], (0.0, 0.1, 0.0), (0.0, 0.0, 0.1)))

@@ -16,10 +16,10 @@ from clothgym.checks import finite, number, shown
 from clothgym.collisions import Capsule, Collider, Plane
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
+from clothgym.envs.framed import FramedTask
 from clothgym.envs.manipulation import follow
-from clothgym.envs.measures import CENTROID, SPEED2
+from clothgym.envs.measures import CENTROID, SPEED2, share_above
 from clothgym.envs.targets import FRICTION, ON_FLOOR
-from clothgym.envs.task import Task
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
@@ -39,23 +39,6 @@ ENOUGH_BALANCE, ENOUGH_SUPPORT, MOST_LYING, ENOUGH_REST = 0.6, 0.9, 0.02, 0.02
 
 
 # --- how a sheet hangs --------------------------------------------------------------------------------------------------------
-
-
-@inlined
-def _share_above(a, b, c):
-    """Share of a triangle on which a linear function is positive that is a, b and c at the corners."""
-    count = (a > 0) + (b > 0) + (c > 0)
-    if count == 0 or count == 3:
-        return count / 3
-    # the one corner whose sign is its own: a triangle is cut off there, a^2 / ((a - b) (a - c)) of the whole
-    if (b > 0) == (c > 0):
-        alone, one, other = a, b, c
-    elif (a > 0) == (c > 0):
-        alone, one, other = b, a, c
-    else:
-        alone, one, other = c, a, b
-    cut = (alone / (alone - one)) * (alone / (alone - other))
-    return cut if count == 1 else 1 - cut
 
 
 @apart
@@ -78,9 +61,9 @@ def hang_of(x, triangles, rest, areas, side, rail, turn, ends, low, high, out):
             p = triangles[t, m]
             v[m] = turn[0] * (np.float64(x[1, p]) - rail[1]) - turn[1] * (np.float64(x[0, p]) - rail[0])
             d[m] = LYING - np.float64(x[2, p])
-        share = _share_above(v[0], v[1], v[2])
+        share = share_above(v[0], v[1], v[2])
         beyond += areas[t] * share
-        lying += areas[t] * _share_above(d[0], d[1], d[2])
+        lying += areas[t] * share_above(d[0], d[1], d[2])
         if share == 0 or share == 1:
             continue
         # the ends of the cut: along the rail, above it, and in the flat sheet
@@ -212,7 +195,7 @@ OBSERVATIONS = (
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
 
 
-class HangingTask(Task):
+class HangingTask(FramedTask):
     """Base of the hanging tasks.
 
     Attributes:
@@ -220,6 +203,7 @@ class HangingTask(Task):
             the cloth rests on them [m]: about the height of the arc over a side of a triangle, so that particles carry the sheet.
     """
 
+    frame_at = "rail"
     radius: ClassVar[float] = 0.05
     rail_friction: ClassVar[float] = FRICTION
     rail_thickness: ClassVar[float] = 0.006
@@ -305,30 +289,6 @@ class HangingTask(Task):
         yaw = float(wanted.get("yaw", yaw))
         own["rail"] = own["origin"] = x, y, wanted.get("height", height)
         own["turn"] = np.cos(yaw), np.sin(yaw)
-
-    # --- the rail's frame -----------------------------------------------------------------------------------------------
-
-    def in_frame(self, points: NDArray) -> NDArray:
-        """World points as along, across and above the rails [m], (num_envs, points, 3)."""
-        d, (c, s) = points - self.episode["rail"][:, None], self.turns
-        return np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0], d[..., 2]], axis=2)
-
-    def out_of_frame(self, ways: NDArray) -> NDArray:
-        """Ways along, across and above the rails as ways in the world, (num_envs, ways, 3)."""
-        c, s = self.turns
-        return np.stack([c * ways[..., 0] - s * ways[..., 1], s * ways[..., 0] + c * ways[..., 1], ways[..., 2]], axis=2)
-
-    @property
-    def turns(self) -> tuple[NDArray, NDArray]:
-        """Cosines and sines of the rails' yaws, each (num_envs, 1)."""
-        return self.episode["turn"][:, :1], self.episode["turn"][:, 1:]
-
-    def before(self, env: int, x: NDArray, across: float, along: float) -> NDArray:
-        """A sheet about the origin [m], (particles, 3), turned with the rail and put before it."""
-        own = self.episode[env]
-        c, s = own["turn"]
-        u, v = x[:, 0] + along, x[:, 1] + across
-        return np.stack([own["rail"][0] + c * u - s * v, own["rail"][1] + s * u + c * v, x[:, 2]], axis=1)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing

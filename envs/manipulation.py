@@ -22,6 +22,7 @@ from clothgym.envs.episode import FINE, Fields
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.targets import FRICTION, ON_FLOOR
 
+CORNERS = 4
 REACH = 0.03  # of the fingers [m]
 # what the ids fix, see ``draping.PHYSICS``
 PHYSICS = replace(draping.PHYSICS, grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2)
@@ -42,6 +43,15 @@ def observe_grippers(own, rules, sheet, seen):
 
 
 @inlined
+def observe_ways(rules, sheet, seen):
+    """The ways from each gripper's tip to the corners."""
+    for tip in range(sheet.holds.shape[0]):
+        for k in range(CORNERS):
+            for c in range(3):
+                seen.ways[tip, k, c] = (sheet.x[c, rules.corners[k]] - sheet.attachments[tip, c]) * (10 / rules.side)
+
+
+@inlined
 def follow(own, info, score, reached, running, failure):
     """Keep the episode's best score, the step of its first success, and whether that has lasted.
 
@@ -57,6 +67,10 @@ def follow(own, info, score, reached, running, failure):
             own.lost = 1
     info.best, info.first_success = own.best, own.first_success
     info.success_held = own.first_success >= 0 and own.lost == 0
+
+
+# what ``observe_ways`` writes, of tasks whose ``rules`` have the corners
+WAYS = Observation("ways", "for each gripper the ways from its tip to the corners", (2, CORNERS, 3), "L/10", 20 * POSITION_BOUND)
 
 
 class ManipulationTask(GripperTask):

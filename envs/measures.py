@@ -22,17 +22,17 @@ LARGEST_BITS = 0x7F7FFFFF  # of the largest float32
 GROUP = 4  # triangles that share a box in ``count_layers``
 
 
-@inlined
-def _distance2(p, q):
-    """Squared distance of two points."""
-    return (p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2
+@kernel
+def squared_distance(p, q):
+    """Of two points, in float64."""
+    x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
+    return x * x + y * y + z * z
 
 
 @kernel
 def distance(p, q):
     """Of two points, in float64."""
-    x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
-    return np.sqrt(x * x + y * y + z * z)
+    return np.sqrt(squared_distance(p, q))
 
 
 @kernel
@@ -52,6 +52,23 @@ def _bits(value):
 def _from_bits(bits):
     """The float32 of these bits."""
     return np.int32(bits).view(np.float32)
+
+
+@inlined
+def share_above(a, b, c):
+    """Share of a triangle on which a linear function is positive that is a, b and c at the corners."""
+    count = (a > 0) + (b > 0) + (c > 0)
+    if count == 0 or count == 3:
+        return count / 3
+    # the one corner whose sign is its own: a triangle is cut off there, a^2 / ((a - b) (a - c)) of the whole
+    if (b > 0) == (c > 0):
+        alone, one, other = a, b, c
+    elif (a > 0) == (c > 0):
+        alone, one, other = b, a, c
+    else:
+        alone, one, other = c, a, b
+    cut = (alone / (alone - one)) * (alone / (alone - other))
+    return cut if count == 1 else 1 - cut
 
 
 @uncounted

@@ -45,7 +45,7 @@ class StateVector:
 
     def __init__(self, task: TaskDefinition, mode: str) -> None:
         mesh = task.physics.mesh
-        self.particles = np.arange(mesh.num_particles) if mode == "particles" else task.observed_particles()
+        self.particles = np.arange(mesh.num_particles) if mode == "particles" else task.observed_particles(mesh)
         declared = [*points_observed(task, mode, len(self.particles)), *task.observations]
         ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
         self.slices = {one.name: slice(first, end) for one, first, end in zip(declared, [0, *ends], ends)}

@@ -17,7 +17,6 @@ import numpy as np
 
 from clothgym.envs import sections
 from clothgym.envs.definition import Observation, points_observed
-from clothgym.envs.measures import key_particles
 from clothgym.envs.pick_place import STEPS
 from clothgym.envs.task import Task
 
@@ -132,7 +131,7 @@ def completed(page: str | None, task_class: type[Task] | None) -> str | None:
 def observations_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of observations, under a sentence on their number."""
     mesh = task_class.physics.mesh
-    points = len(key_particles(mesh))
+    points = len(task_class.observed_particles(mesh))
     declared = [*points_observed(task_class, "keypoints", points), *task_class.observations]
     ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
     rows = [
@@ -163,7 +162,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of keywords: the task's own, then those of all tasks."""
     physics, rows = task_class.physics, ["| Argument | Default | Meaning |", "| --- | --- | --- |"]
     own = {
-        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "",
+        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "–",
         "$side": f"{physics.side:g}",
         "$integrator": f'"{physics.integrator}"',
         "$substeps": str(physics.substeps),
@@ -176,9 +175,8 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
         shown, meaning = COMMON.get(name, ("", ""))
-        if name in inherited and default != inherited[name]:
-            shown = ""  # the task has another default than all others
-        shown = shown or f"``{json.dumps(default) if isinstance(default, str) else repr(default)}``"
+        if not shown or (name in inherited and default != inherited[name]):  # a task may have another default than all others
+            shown = f"``{json.dumps(default) if isinstance(default, str) else repr(default)}``"
         row = f"| ``{name}`` | {shown} | {task_class.arguments.get(name, meaning)} |"
         for mark, text in own.items():
             row = row.replace(mark, text)

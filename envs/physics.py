@@ -82,6 +82,9 @@ class Physics:
         Raises:
             ValueError: no such sheet, or the mesh is no grid, or its anchors are given as particles of this mesh alone.
         """
+        # both are numbers before they are compared: an array has no truth value
+        rows = None if rows is None else count("rows", rows, least=1)
+        side = None if side is None else positive("side", side)
         if rows in (None, *(self.mesh.shape or ())[:1]) and side in (None, self.side):
             return self
         if self.mesh.shape is None or (self.anchors and not callable(self.anchors)):
@@ -196,6 +199,8 @@ def checked_material_option(
     """
     if isinstance(material, str):
         material = preset_properties(material)
+        if physics.mesh.shape is None:
+            del material["shear_stiffness"]  # which a triangle mesh has from its edges
     if not isinstance(material, Mapping):
         raise ValueError(
             f"reset option material={shown(material)}: must be a preset's name ({', '.join(PRESETS)}) or a dict of properties"

@@ -32,6 +32,7 @@ OPTIONS = {
     "material": "a preset's name or a dict of properties",
     "target": "a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw``",
     "rail": "a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad]",
+    "hook": "a dict with any of ``height`` (of the arm's root) [m], ``center`` (of the post) [m], ``yaw`` [rad]",
     "rumpled": "True or False",
     "goal": "three coordinates [m]",
 }

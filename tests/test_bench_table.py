@@ -92,7 +92,7 @@ def test_an_unknown_group_is_refused(capsys):
     assert "springs" in capsys.readouterr().err
 
 
-def test_episodes_take_options_that_a_task_may_not_know():
+def test_episodes_have_the_physics_that_is_asked_for():
     us = bench_episodes.play({"as it is": {}, "sheet": bench_episodes.SHEET}, expert=True, num_envs=2, steps=2, rounds=1)
     assert us.keys() == {"as it is", "sheet"} and all(0 < one < np.inf for one in us.values())
     env = bench_episodes.make("ClothDrape-v0", contact="sheet", physics="fast")

@@ -14,6 +14,7 @@ from clothgym.registration import ENVIRONMENTS
 every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 # a harder tier differs in its sheet and its start alone, and a goal environment gives parts of its state vector
 TASKS = [env_id for env_id in ENVIRONMENTS if "-Hard" not in env_id and "Goal" not in env_id]
+TRIANGLES = [env_id for env_id in ENVIRONMENTS if "Hook" in env_id]  # tasks whose sheet is no grid
 every_task = pytest.mark.parametrize("env_id", TASKS)
 
 
@@ -194,6 +195,8 @@ def test_the_human_window_comes_from_gymnasium_s_wrapper(env_id, monkeypatch):
 )
 @pytest.mark.filterwarnings("ignore:.*render_mode")
 def test_bad_keywords_are_named(env_id, kwargs, name):
+    if name == "no springs" and env_id in TRIANGLES:
+        pytest.skip("a triangle mesh bends by its hinges, whatever its springs")
     with pytest.raises(ValueError, match=name):
         make(env_id, **kwargs)
 
@@ -244,6 +247,8 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
     ],
 )
 def test_bad_reset_options_are_named_and_leave_nothing_behind(env_id, options, name):
+    if name == "bend_rigidity" and env_id in TRIANGLES:
+        pytest.skip("a triangle mesh bends by its hinges, whatever its springs")
     env = make(env_id).unwrapped
     fresh, _ = env.reset(seed=0)
     properties = env.task.simulation.parameters

@@ -70,6 +70,17 @@ def test_the_expert_brings_the_corners_and_each_step_s_reward_is_compute_reward(
     assert np.all(returns[success] > -80) and np.all(returns >= -120)
 
 
+def test_each_gripper_sees_its_ways_to_the_corners():
+    env, _ = batch(4)
+    for _ in range(10):
+        seen, *_ = env.step(env.expert_actions())
+    state = env.get_state().simulation
+    x, tips = state.positions.astype(float)[:, CORNERS], state.attachment_positions.astype(float)
+    ways = seen["observation"][:, env.observation_slices["ways"]].reshape(4, 2, 4, 3)
+    # in tenths of a side
+    assert ways == pytest.approx((x[:, None] - tips[:, :, None]) / (SIDE / 10), abs=1e-4)
+
+
 def test_doing_nothing_scores_nothing():
     env, _ = batch(8)
     over, total = np.zeros(8, bool), np.zeros(8)
@@ -81,6 +92,7 @@ def test_doing_nothing_scores_nothing():
 
 def test_the_single_environment_and_the_batch_s_last_observations_are_dictionaries():
     env, one = batch(2, seed=5, autoreset_mode="SameStep")[0], gym.make(ID)
+    env.action_space.seed(5)
     seen = one.reset(seed=5)[0]
     assert seen in one.observation_space
     for _ in range(120):

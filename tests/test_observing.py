@@ -260,6 +260,7 @@ def test_a_macro_action_brings_the_picture_of_its_end():
     """One picture for each action of 60 steps, and of an episode that ends in it the picture of that end."""
     env = make(GRIPPER, action_mode="pick_place", obs_mode="depth", privileged=True).unwrapped
     env.reset(seed=0)
+    env.action_space.seed(0)
     seen, _, terminated, *_ = env.step(env.action_space.sample())
     fresh = copy.deepcopy(env)
     fresh.task.observed.begun(np.array([0]))

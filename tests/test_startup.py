@@ -14,7 +14,7 @@ from clothgym import Simulation, grid
 import clothgym.simulation as simulation
 s = Simulation(grid(3, 3, 0.1, 0.1), anchors=[0], contact="particles")
 s.step(3)
-compiled = s._advance.stats.cache_misses
+compiled = s._advance.kernel.stats.cache_misses
 print(sum(compiled.values()), s.positions.sum())
 """
 

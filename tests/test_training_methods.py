@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from training_runs import run
 
+import clothgym
 from clothgym import files
 
 CONSTRAINED = """
@@ -170,6 +171,38 @@ def test_what_is_done_while_the_sheet_settles_is_not_demonstrated(scripts):
     observations, actions = demonstrations(make_sb3_vec_env("ClothDrapeGripper-v0", 2, seed=0), 1, 0.3, seed=0)
     assert observations.shape == (200, 82) and actions.shape == (200, 8)
     assert not observations[:, 65].any() and np.abs(actions).max() <= 1
+
+
+def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts, tmp_path):
+    from clone import clone, demonstrations
+    from policies import save_checkpoint
+    from stable_baselines3 import PPO
+
+    from clothgym.adapters.runs import BEST, learned
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    env = make_sb3_vec_env("ClothFoldGoal-v0", 4, seed=0)
+    seen, actions = demonstrations(env, 1, 0.2, seed=0)
+    assert {name: part.shape for name, part in seen.items() if name != "observation"} == {
+        "achieved_goal": (4 * 80, 12), "desired_goal": (4 * 80, 12),
+    }  # fmt: skip
+    assert len(seen["observation"]) == len(actions) == 4 * 80
+    # a goal is the same throughout an episode, and four environments have four
+    assert len(np.unique(seen["desired_goal"], axis=0)) == 4
+    kwargs = {"net_arch": [64]}
+    model = PPO("MultiInputPolicy", env, n_steps=10, batch_size=40, policy_kwargs=kwargs, seed=0, device="cpu")
+    error = clone(model, seen, actions, epochs=100, batch_size=320, learning_rate=0.01)
+    # it tells moments apart: a policy that always does the mean of the actions has their variance as its error
+    assert error < 0.25 * actions.var(axis=0).mean()
+    config = {
+        "env": "ClothFoldGoal-v0", "algo": "bc_ppo", "lagrange": {}, "clone": {}, "env_kwargs": {}, "num_envs": 4, "timesteps": 1,
+        "hyperparameters": {"policy_kwargs": kwargs}, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
+    }  # fmt: skip
+    files.write_json(tmp_path / "config.json", config)
+    save_checkpoint(tmp_path, model)
+    save_checkpoint(tmp_path, model, BEST)
+    few = {name: part[:7] for name, part in seen.items()}
+    assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 
 
 def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(tmp_path):

@@ -1,7 +1,8 @@
 """Behavior cloning: teach a policy what the scripted expert does, before PPO, or instead of it.
 
 The expert is disturbed while it shows its way, each episode by a noise of its own strength, and what is learned is what it would
-do undisturbed (Laskey et al. 2017, DART): so the learner also sees how to come back.
+do undisturbed (Laskey et al. 2017, DART): so the learner also sees how to come back.  In further rounds the learner acts, and the
+expert says what it would have done (Ross et al. 2011, DAgger).
 """
 
 from __future__ import annotations
@@ -16,11 +17,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
+Observations = NDArray | dict[str, NDArray]
 
-def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int) -> tuple[NDArray, NDArray]:
-    """Observations and the expert's actions, (samples, size) each, from some episodes of each environment of a batch.
+
+def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner: PPO | None = None) -> tuple[Observations, NDArray]:
+    """Observations and the expert's actions, (samples, size) each, from some episodes of each environment of a batch; of a goal
+    task a dictionary of observations.
 
     noise: largest standard deviation of the disturbance; each environment draws its own for each of the rounds.
+    learner: who acts in the expert's place, if anyone; what is noted is what the expert would do.
     """
     rng = np.random.default_rng(seed)
     task = env.unwrapped.env.task  # type: ignore[attr-defined]
@@ -33,24 +38,37 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int) -> tuple
             wanted = np.clip(task.expert_actions(), -1, 1).astype(np.float32)
             # what is done while the sheet settles does not matter, and would only blur what does
             acting = task.episode["settling_since"] < 0
-            observations.append(seen[acting])
+            observations.append({key: part[acting] for key, part in seen.items()} if isinstance(seen, dict) else seen[acting])
             actions.append(wanted[acting])
-            disturbed = wanted + strength * rng.standard_normal(wanted.shape)
+            done = wanted if learner is None else learner.predict(seen, deterministic=True)[0]
+            disturbed = done + strength * rng.standard_normal(wanted.shape)
             seen, *_ = env.step(np.clip(disturbed, -1, 1).astype(np.float32))
+    if isinstance(seen, dict):
+        return {key: np.concatenate([part[key] for part in observations]) for key in seen}, np.concatenate(actions)
     return np.concatenate(observations), np.concatenate(actions)
 
 
-def clone(model: PPO, observations: NDArray, actions: NDArray, epochs: int, batch_size: int, learning_rate: float) -> float:
+def joined(one: tuple[Observations, NDArray], other: tuple[Observations, NDArray]) -> tuple[Observations, NDArray]:
+    """Both samples as one."""
+    (seen, actions), (more, others) = one, other
+    if isinstance(seen, dict):
+        return {key: np.concatenate([part, more[key]]) for key, part in seen.items()}, np.concatenate([actions, others])
+    return np.concatenate([seen, more]), np.concatenate([actions, others])
+
+
+def clone(model: PPO, observations: Observations, actions: NDArray, epochs: int, batch_size: int, learning_rate: float) -> float:
     """Fit the mean of the policy to the actions by least squares; the mean squared error over the last tenth of the fit."""
     policy = model.policy
-    x, y = torch.as_tensor(observations), torch.as_tensor(actions)
+    parts = observations if isinstance(observations, dict) else {"": observations}
+    x, y = {key: torch.as_tensor(part) for key, part in parts.items()}, torch.as_tensor(actions)
     fitted = [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()]
     optimizer = torch.optim.Adam(fitted, learning_rate)
-    steps = max(1, epochs * len(x) // batch_size)
+    steps = max(1, epochs * len(y) // batch_size)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
     errors = []
-    for batch in tqdm(_batches(len(x), batch_size, steps, model.seed or 0), total=steps, desc="cloning", leave=False, disable=None):
-        error = torch.mean((policy.get_distribution(x[batch]).distribution.mean - y[batch]) ** 2)
+    for batch in tqdm(_batches(len(y), batch_size, steps, model.seed or 0), total=steps, desc="cloning", leave=False, disable=None):
+        seen: Any = {key: part[batch] for key, part in x.items()} if isinstance(observations, dict) else x[""][batch]
+        error = torch.mean((policy.get_distribution(seen).distribution.mean - y[batch]) ** 2)
         optimizer.zero_grad()
         error.backward()
         optimizer.step()

@@ -14,7 +14,7 @@ import lagrange
 import numpy as np
 import policies
 import torch
-from clone import clone, demonstrations
+from clone import clone, demonstrations, joined
 from endings import refused
 from lagrange import LagrangeMultiplier
 from report import draw_learning_curve, film
@@ -214,10 +214,15 @@ def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
     """Clone the scripted expert into the policy; the time it took [s]."""
     begun = time.perf_counter()
     options = dict(config["clone"])
-    samples = demonstrations(model.env, options.pop("episodes"), options.pop("noise"), config["seed"])  # type: ignore[arg-type]
+    env: Any = model.env
+    episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
+    samples = demonstrations(env, episodes, noise, config["seed"])
     torch.set_num_threads(config["threads"])
-    error = clone(model, *samples, **options)
-    print(f"cloned the expert from {len(samples[0]):,} samples: mean squared error {error:.4f}")
+    for number in range(rounds + 1):
+        if number:
+            samples = joined(samples, demonstrations(env, 1, noise, config["seed"] + number, model))
+        error = clone(model, *samples, **options)
+        print(f"cloned the expert from {len(samples[1]):,} samples: mean squared error {error:.4f}")
     return time.perf_counter() - begun
 
 

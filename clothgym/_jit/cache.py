@@ -117,7 +117,7 @@ class CacheFolder:
             self.writable = False
             warnings.warn(
                 f"clothgym cannot use its kernel cache {str(root or self.path.parent)!r} ({error}): kernels that it lacks are "
-                "compiled again in each process, which takes some seconds. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
+                "compiled again in each process, for a minute or two. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
                 "be written.",
                 stacklevel=2,
             )
@@ -183,7 +183,9 @@ class CacheFolder:
             self._announced = True
             where = f", kept in {self.path.parent}" if self.writable else ""
             print(
-                f"clothgym: compiling kernels (once after an install or a change, some seconds){where}", file=sys.stderr, flush=True
+                f"clothgym: compiling kernels (once after an install or a change, a minute or two){where}",
+                file=sys.stderr,
+                flush=True,
             )
 
 

@@ -142,7 +142,7 @@ def learned(folder: Path, env_id: str) -> Policy:
     folder = _folder(folder)
     config = read_config(folder, env_id)
     try:
-        from stable_baselines3.common.policies import ActorCriticPolicy
+        from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
     except ImportError as error:
         raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
     best = folder / BEST
@@ -154,7 +154,9 @@ def learned(folder: Path, env_id: str) -> Policy:
         widths = list(_numbers(kwargs))
         if len(widths) > 100 or max(widths, default=0) > max(max(tensor.shape, default=1) for tensor in tensors.values()):
             raise ValueError("policy_kwargs describe a larger one than the checkpoint holds")
-        policy = ActorCriticPolicy(env.single_observation_space, env.single_action_space, lambda _: 0.0, **kwargs)
+        space = env.single_observation_space
+        made: Any = MultiInputActorCriticPolicy if isinstance(space, gym.spaces.Dict) else ActorCriticPolicy
+        policy = made(space, env.single_action_space, lambda _: 0.0, **kwargs)
         policy.load_state_dict(tensors)
     env.close()
     policy.set_training_mode(False)

@@ -1,6 +1,6 @@
 """The table of speeds: the cost of each case, beside its goal and the limits of the machine.
 
-    python -m clothgym bench --table                                    # all of it, about a quarter of an hour
+    python -m clothgym bench --table                                    # all of it, about half an hour
     python -m clothgym bench --table --select springs bending           # some groups; --json FILE writes the rows too
 
 All cases run on one thread and are timed by its processor time ("start": by that of whole processes).  Cases that take

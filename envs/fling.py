@@ -1,0 +1,385 @@
+"""ClothFling-v0 and ClothFling-Hard-v0: swing a rumpled sheet that two grippers hold, and lay it flat, in three throws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import inlined
+from clothgym.attachments import Gripper
+from clothgym.checks import shown
+from clothgym.envs.definition import Observation
+from clothgym.envs.episode import Fields
+from clothgym.envs.flattening import (
+    SpreadingTask,
+    evaluate_spread,
+    improvement,
+    measure_coverage,
+    observe_spread,
+    spread_potential,
+)
+from clothgym.envs.fling_expert import Throw, fling_actions
+from clothgym.envs.fling_starts import held_sheets
+from clothgym.envs.gripper_task import GripperTask, close_or_open, stop_at_floor
+from clothgym.envs.manipulation import PHYSICS, REACH, follow
+from clothgym.envs.measures import distance
+from clothgym.envs.physics import chosen_fabric
+from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.stepping import Kernels
+from clothgym.envs.vector import ClothVectorEnv
+from clothgym.mesh import grid
+
+if TYPE_CHECKING:
+    from clothgym.render import Camera
+
+SPEED = 2.0  # of the grippers [m/s]
+THROWS = 3
+CLOSING = 4  # steps in which the fingers close on the corners as an episode begins
+STILL = 1e-4  # by which a tip that stands still may move in a step [m]
+NOT_MADE = -1.0  # coverage after a throw that has not been made
+# the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
+BOX = (0.9, 0.3, 1.25)
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _measure_throws(own, rules, sheet):
+    """Coverage; how many throws have been made, and what the sheet covers since each; and which grippers may not close."""
+    measure_coverage(own, rules, sheet)
+    count = sheet.holds.shape[0]
+    if own.step == 0:
+        own.throws, own.throwing, own.moving, own.rested = 0, 0, 0, 0.0
+        for i in range(THROWS):
+            own.after[i] = NOT_MADE
+        for k in range(count):
+            own.took[k], own.barred[k] = 0, 0
+            for c in range(3):
+                own.tips[k, c] = sheet.attachments[k, c]
+    if own.over:
+        return
+    # since when the tips have been moving, and how high they were as they rested
+    farthest, lowest = 0.0, np.inf
+    for k in range(count):
+        farthest, lowest = max(farthest, distance(sheet.attachments[k], own.tips[k])), min(lowest, sheet.attachments[k, 2])
+        for c in range(3):
+            own.tips[k, c] = sheet.attachments[k, c]
+    own.moving = own.moving + 1 if farthest > STILL else 0
+    own.rested = lowest if own.moving == 0 else own.rested
+    # a throw begins as the first gripper takes hold, and ends when nothing is held any more
+    holding = 0
+    for k in range(count):
+        if sheet.holds[k] > 0:
+            own.took[k], holding = 1, 1
+    if own.throwing and not holding:
+        own.throws += 1
+        for k in range(count):
+            own.took[k] = 0
+    own.throwing = holding
+    if not holding and own.throws > 0:
+        own.after[own.throws - 1] = own.coverage
+    # a gripper takes hold once in a throw
+    for k in range(count):
+        own.barred[k] = own.throws >= THROWS or (own.took[k] == 1 and sheet.holds[k] == 0)
+
+
+@inlined
+def _stop_in_reach(own, rules, k):
+    """While its fingers close on its corner a tip stays there; the floor stops what it holds.  (The arena is the box.)"""
+    if own.step < CLOSING:
+        for c in range(3):
+            own.targets[k, c] = own.tips[k, c]
+    stop_at_floor(own, rules, k)
+
+
+@inlined
+def _tell(own, info):
+    """Throws, and the coverage after each."""
+    info.throws = own.throws
+    info.coverage_after_1, info.coverage_after_2, info.coverage_after_3 = own.after[0], own.after[1], own.after[2]
+
+
+@inlined
+def _evaluate_fling(own, rules, sheet, info):
+    """The evaluation of a spread sheet; what it covers after the last throw is what it covers now."""
+    score = evaluate_spread(own, rules, sheet, info)
+    if own.throws > 0:
+        own.after[own.throws - 1] = info.coverage
+    _tell(own, info)
+    return score
+
+
+@inlined
+def _account_fling(own, rules, sheet, info, terms, running, failure):
+    """Coverage now, at the start and after each throw, and what has become of a success: only what nothing holds counts."""
+    info.coverage, info.coverage_start = own.coverage, own.coverage_start
+    _tell(own, info)
+    free = own.throws > 0 and own.throwing == 0
+    score = improvement(own.coverage, own.coverage_start) if free else 0.0
+    follow(own, info, score, free and own.coverage >= rules.enough, running, failure)
+    return 0.0
+
+
+@inlined
+def _observe_fling(own, rules, sheet, seen):
+    """Grippers, time, coverage, and the throws that are left."""
+    observe_spread(own, rules, sheet, seen)
+    seen.throws_left = 1 - own.throws / THROWS
+
+
+class FlingTask(SpreadingTask):
+    """The task of ``ClothFling-v0``, see ``ClothFlingEnv``."""
+
+    physics = replace(PHYSICS, attachment_speed=SPEED, grippers=(Gripper(speed=2 * SPEED, reach=REACH),) * 2)
+    kernels = Kernels(
+        spread_potential, _evaluate_fling, _observe_fling, measure=_measure_throws, account=_account_fling, fingers=close_or_open,
+        stop=_stop_in_reach,
+    )  # fmt: skip
+    acting_steps = 300
+    # the expert's, see ``fling_expert``
+    throw: ClassVar[Throw] = Throw(
+        (10.7, 20.0, 21.8, 29.2, 33.7), (0.05, -0.29, 0.29, 0.254, -0.108, -0.17), (1.2, 1.212, 1.064, 1.24, 0.515, 0.02)
+    )
+    settling_steps = 40
+    enough = 0.9
+    bank: ClassVar[Bank] = CRUMPLED
+    turned: ClassVar[float] = 0.3  # by which the line of the held corners is turned at most [rad]
+    accounts: ClassVar[Fields] = (
+        *SpreadingTask.accounts,
+        ("throws", np.int64),
+        *[(f"coverage_after_{i + 1}", float) for i in range(THROWS)],
+    )
+    observations = (*SpreadingTask.observations, Observation("throws_left", "share of the throws that is left"))
+    ranges: ClassVar = {
+        **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
+        "barred": (0, 1), "moving": (0, 10_000), "rested": (0.0, 10.0),
+    }  # fmt: skip
+    arguments: ClassVar = {
+        **GripperTask.arguments, "action_mode": '"velocity" alone: what is picked and placed is not thrown',
+    }  # fmt: skip
+
+    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
+        if action_mode != "velocity":
+            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed is not thrown")
+        super().__init__(num_envs, **kwargs)
+        # the sheets of this resolution, before the first reset asks for them
+        held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+
+    def arena(self) -> tuple[NDArray, NDArray]:
+        half = self.physics.side * np.array(BOX)
+        return half * (-1, -1, 0) + (0, 0, 0.01), half
+
+    def remembers(self) -> Fields:
+        grippers = len(self.physics.grippers)
+        return [
+            *super().remembers(), ("throws", np.int64), ("throwing", np.uint8), ("after", float, THROWS),
+            ("took", np.uint8, grippers), ("barred", np.uint8, grippers), ("tips", float, (grippers, 3)), ("moving", np.int64),
+            ("rested", float),
+        ]  # fmt: skip
+
+    def check_episode(self, env: int, own: Any) -> None:
+        super().check_episode(env, own)
+        if not np.array_equal(own["after"] > NOT_MADE, np.arange(THROWS) < own["throws"]):
+            raise ValueError(
+                f"the state's episode {env} has {int(own['throws'])} throws and coverages {own['after'].tolist()} after them: give "
+                "what get_state() gave"
+            )
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        side, (low, high) = self.physics.side, self.arena()
+        sheets, starts = held_sheets(*self.physics.mesh.grid_shape, side, self.bank)
+        start = starts[int(rng.integers(len(starts)))]
+        x, tips = sheets[start.sheet].copy(), start.tips.copy()
+        # mirrored; turned so that the corners lie one on either side; and moved, so that both are within reach
+        if rng.uniform() < 0.5:
+            x[:, 0] *= -1
+            tips[:, 0] *= -1
+        if rng.uniform() < 0.5:
+            tips = tips[::-1]
+        yaw = rng.uniform(-self.turned, self.turned)
+        along = tips[1, :2] - tips[0, :2]
+        c, s = along / np.sqrt(along[0] ** 2 + along[1] ** 2)
+        turn = np.array([[c, -s], [s, c]]) @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+        x[:, :2], tips[:, :2] = x[:, :2] @ turn, tips[:, :2] @ turn
+        away = side * rng.uniform(-0.1, 0.1, 2) - tips[:, :2].mean(axis=0)
+        away += np.maximum(low[:2] - (tips[:, :2] + away).min(axis=0), 0) - np.maximum(
+            (tips[:, :2] + away).max(axis=0) - high[:2], 0
+        )
+        x[:, :2] += away
+        tips[:, :2] += away
+        self.gripper_starts[env] = tips
+        self.episode["origin"][env] = 0.0
+        return self.uneven(x, rng)
+
+    def before_step(self, actions: NDArray) -> None:
+        """Fingers that close on the corners at the start, and those that may not close."""
+        block, lane = self._place
+        wanted = self.simulation.orders.openings
+        ordered = wanted[block, :, lane]
+        ordered[self.episode["step"] <= CLOSING] = 0
+        ordered[self.episode["barred"] == 1] = 1
+        wanted[block, :, lane] = ordered
+
+    def expert_actions(self) -> NDArray:
+        return fling_actions(self)
+
+    def camera(self) -> Camera:
+        from clothgym.render import Camera
+
+        far = self.physics.side / 0.6
+        return Camera(eye=(1.25 * far, -0.9 * far, 0.85 * far), target=(0.0, 0.06 * far, 0.31 * far), vertical_fov=38.0)
+
+
+class FlingHardTask(FlingTask):
+    """The task of ``ClothFling-Hard-v0``, see ``ClothFlingHardEnv``."""
+
+    physics = replace(
+        FlingTask.physics, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("wool_tropical", PHYSICS.material), substeps="auto"
+    )
+    acting_steps = 320
+    throw = Throw((11.9, 22.8, 25.6, 35.7, 41.7), (0.05, -0.29, 0.29, 0.278, -0.13, -0.2), (1.2, 1.231, 1.01, 1.24, 0.514, 0.02))
+    bank = CRUMPLED_LARGE
+    turned = 0.6
+
+
+class ClothFlingEnv(ClothEnv):
+    """Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.
+
+    ## Description
+    True physics, as in ``ClothDrape-v0``: the whole sheet touches the table and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    A square sheet, L = 0.6 m, lies crumpled on a table, the plane z = 0.  Two grippers are at two neighboring corners of it: in the
+    first four steps they stay there and close, whatever the action, and hold these corners.  They are those of
+    ``ClothDrapeGripper-v0``: they take the particles within 3 cm of their tips when their fingers have closed, other layers too.
+
+    The arms reach only so far: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L
+    high.  Along y, in which the sheet is thrown, this is not enough to lay a sheet down: slow hands, at 0.5 m/s, end with a
+    coverage of about 0.7.  Swung, the sheet goes on by its inertia, and the air carries it.
+
+    A throw begins as a gripper takes hold, and ends when nothing is held any more.  In it each gripper takes hold once: when it has
+    let go, it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps they
+    open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
+
+    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 2 m/s; a vector longer than 1 is shortened | [-1, 1] | 2 m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
+    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
+    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
+    is the normalized performance, at a failure 0.
+    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+
+    ## Evaluation
+    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1, as in
+    ``ClothFlatten-v0``.  The normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in
+    [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.  A success has a coverage of 0.9 or more, at rest (less than 0.02 m/s rms), and
+    held by nothing.  It is less than the 0.95 of ``ClothFlatten-v0``, as a throw cannot be corrected, and more than the 0.8 of
+    FlingBot's report.
+
+    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``throws``, those that have ended; ``coverage_after_1``,
+    ``coverage_after_2`` and ``coverage_after_3``, the coverage after each, as it was last before the sheet was taken again, -1 for
+    a throw that has not been made; ``best``, the best normalized improvement so far of a sheet that nothing held after a throw;
+    ``first_success``, the first step with enough coverage, held by nothing, or -1; and ``success_held``, whether it has been so
+    ever since.  At the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and
+    ``softgym_coverage``, see ``ClothFlatten-v0``.
+
+    ## Starting State
+    One of the crumpled sheets of ``ClothFlatten-v0``, with an edge whose corners the grippers can take without any other
+    cloth, at least 0.15 L apart: 78 such edges, of 53 sheets.  It is mirrored or not, and turned so that this line is
+    within 0.3 rad of the x axis, one gripper on either side; its middle is up to 0.1 L from the origin along x and y, or as near to
+    that as both corners are within reach.  Held-out seeds draw from the same sheets: what is new in them is the combination, not
+    the sheet.
+
+    ## Episode End
+    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
+    structural spring at twice its rest length),
+    "out_of_bounds" (the sheet's center 0.5 m beyond the box), "diverged" (not finite; the last finite observation goes out).  Never
+    truncated: the time limit is part of the task.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FlingTask
+
+
+class ClothFlingVectorEnv(ClothVectorEnv):
+    """``ClothFling-v0`` as a batch, see ``ClothFlingEnv``."""
+
+    task_class = FlingTask
+
+
+class ClothFlingHardEnv(ClothEnv):
+    """Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.
+
+    ## Description
+    True physics, as in ``ClothFling-v0``: the whole sheet touches the table and, strictly, itself, bends with its rigidity, and
+    moves through air.
+
+    Everything is as in ``ClothFling-v0`` but for the sheet, L = 0.8 m with 21 x 21 particles, its fabric, the tropical wool of
+    ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity, its start, and its time, 320 steps.  The grippers are
+    as fast, 2 m/s, which is less for a larger sheet, and the box has the same size in sides.
+
+    ## Action Space
+    ``Box(-1, 1, (8,))``; for each gripper:
+
+    | Num | Action | Range | Unit |
+    | --- | --- | --- | --- |
+    | 0-2, 4-6 | velocity x, y, z, scaled by 2 m/s; a vector longer than 1 is shortened | [-1, 1] | 2 m/s |
+    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    As in ``ClothFling-v0``.
+
+    ## Evaluation
+    As in ``ClothFling-v0``, with the same ``info``.
+
+    ## Starting State
+    As in ``ClothFling-v0``, but one of the crumpled sheets of ``ClothFlatten-Hard-v0``, dropped three times: 55 edges of 41 sheets;
+    and the line of both corners is within 0.6 rad of the x axis.
+
+    ## Episode End
+    As in ``ClothFling-v0``, after 320 steps and 40 of settling.
+
+    ## Arguments
+    $arguments
+
+    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
+
+    ## Version History
+    * v0: initial version
+    """
+
+    task_class = FlingHardTask
+
+
+class ClothFlingHardVectorEnv(ClothVectorEnv):
+    """``ClothFling-Hard-v0`` as a batch, see ``ClothFlingHardEnv``."""
+
+    task_class = FlingHardTask

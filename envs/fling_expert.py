@@ -1,0 +1,168 @@
+"""The scripted expert of ``ClothFling-v0``: take an edge by its corners, lift it, wait, swing, and lay the sheet down.
+
+It sees the whole state, and has no memory: how long its hands have been moving, since they rested above, says how far a throw is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.episode import length
+from clothgym.envs.flatten_expert import EDGES, OPPOSITE, places_to_take
+
+LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
+CALM = 0.12  # rms speed at which it throws [m/s]
+TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
+TEARING = 0.5  # strain at which it lets go
+NEAR = 0.006  # of a tip from its place, when the fingers close [m]
+REST = 0.1  # rms speed at which it judges what it has thrown [m/s]
+DONE = 0.903  # coverage with which it is content
+LONG = 45  # steps of a throw, at most: with less time left it throws without being calm
+AGAIN = 90  # steps that another throw takes
+FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corners are out of reach, and the tips' height [m/s], [m]
+
+
+class Throw(NamedTuple):
+    """The way of the hands in a throw, from where they rest before it.
+
+    steps: control steps after which they are at each further place, (places,).  along, above: that and where they begin, along y
+    from the origin and above the floor, in sides, (1 + places,).
+    """
+
+    steps: tuple[float, ...]
+    along: tuple[float, ...]
+    above: tuple[float, ...]
+
+
+def fling_actions(task: Any) -> NDArray:
+    """Actions of all environments, (num_envs, 8)."""
+    mesh, side, grippers, n = task.physics.mesh, task.physics.side, task.simulation.grippers, task.num_envs
+    corners, rest = np.array(mesh.corners), mesh.rest_positions
+    x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)
+    v = task.simulation.velocities.astype(np.float64)
+    speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
+    holder, held = grippers.holder, grippers.held
+    near_corner = np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)
+    takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
+    looking = (held[:, 0] == 0) | (held[:, 1] == 0)
+    takes[looking], others[looking] = places_to_take(x[looking], corners, near_corner)
+    low, high = task.arena()
+    move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
+    for e in range(n):
+        own = task.episode[e]
+        left = task.acting_steps - own["step"]
+        free = held[e] == 0
+        if free.all():
+            if own["throws"] == 0 and own["step"] < 6:
+                grip[e] = -1
+            elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < DONE and left > AGAIN:
+                move[e], grip[e] = _take(x[e], tips[e], takes[e], others[e], corners, low, high, mesh.grid_shape)
+            else:
+                move[e, :, 2] = np.where(tips[e, :, 2] < 0.25 * side, 0.4, 0)
+            continue
+        if free.any():
+            # the other gripper comes, if it may
+            k = int(np.argmax(free))
+            grip[e, 1 - k] = -1
+            mine = [i for i in range(4) if holder[e, corners[i]] == 1 - k]
+            if own["barred"][k] or not mine or own["step"] < 6:
+                grip[e] = 1 if own["step"] >= 6 else -1
+                continue
+            beside = [i for i in range(4) if i != mine[0] and i != 3 - mine[0]]
+            ways = np.array([np.linalg.norm(takes[e, i] - tips[e, k]) for i in beside])
+            best = int(ways.argmin())
+            move[e, k] = 15 * (takes[e, beside[best]] - tips[e, k])
+            grip[e, k] = -1 if ways[best] < NEAR else 1
+            continue
+        if not (holder[e, corners] >= 0).any():
+            # what was out of reach is carried there, and let go of
+            move[e] = np.stack([np.zeros(2), np.full(2, FETCHING), 12 * (CARRIED - tips[e, :, 2])], axis=1)
+            grip[e] = 1 if tips[e, :, 1].max() > high[1] - 0.02 else -1
+            continue
+        hands = [np.flatnonzero(holder[e] == k) for k in range(2)]
+        strain = float(task.info["strain_max"][e])
+        move[e], grip[e] = _throw(task.throw, tips[e], rest, hands, side, own, speed[e], left, high, strain)
+    # fingers that have closed on nothing open again
+    grip[(grippers.openings == 0) & (held == 0)] = 1
+    limit = task.physics.attachment_speed
+    move /= np.maximum(length(move) / limit, 1)[..., None]
+    return np.concatenate([move / limit, grip[..., None]], axis=2).reshape(n, -1)
+
+
+def _take(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: Any, high: Any, shape: Any) -> Any:
+    """Both corners of an edge that lie free and within reach; else, of the nearest edge, the sides where they are within reach."""
+    least, goal = np.inf, None
+    for edge, far in zip(EDGES, OPPOSITE):
+        order = slice(None) if x[corners[edge[0]], 0] < x[corners[edge[1]], 0] else slice(None, None, -1)
+        edge, far = edge[order], far[order]
+        at = takes[edge]
+        outside = np.maximum(np.maximum(low - at, at - high), 0).max()
+        if outside > 0.008:
+            at, outside = _within(x, corners[edge], corners[far], low, high, shape), 1.0
+        if at is None or at[1, 0] - at[0, 0] < 0.1:
+            continue
+        cost = others[edge].sum() + 10 * outside + np.linalg.norm(at - tips, axis=1).sum()
+        if cost < least:
+            least, goal = cost, np.clip(at, low, high)
+    if goal is None:
+        return np.zeros((2, 3)), np.ones(2)
+    way = goal - tips
+    move = 12 * way
+    # over the cloth, and then down
+    aside = np.linalg.norm(way[:, :2], axis=1)
+    move[:, 2] = np.where(aside > 0.05, 12 * (np.maximum(goal[:, 2], 0.06) - tips[:, 2]), move[:, 2])
+    move /= np.maximum(length(move) / LIFTING, 1)[..., None]
+    return move, -np.ones(2) if np.linalg.norm(way, axis=1).max() < NEAR else np.ones(2)
+
+
+def _within(x: Any, ends: Any, far: Any, low: Any, high: Any, shape: Any) -> Any:
+    """Where the sides that begin at both ends of an edge are first within reach [m], (2, 3), or None."""
+    places = []
+    for one, other in zip(ends, far):
+        count = shape[1] if abs(one - other) < shape[1] else shape[0]
+        line = x[np.linspace(one, other, count).astype(int)]
+        inside = np.flatnonzero(np.logical_and.reduce((line > low - (0, 0, 1)) & (line < high), axis=1))
+        if not len(inside):
+            return None
+        places.append(line[inside[0]] + (0, 0, 0.015))
+    return np.array(places)
+
+
+def _throw(
+    throw: Throw, tips: Any, rest: Any, held: Any, side: float, own: Any, speed: float, left: int, high: Any, strain: float
+) -> Any:
+    """Lift the edge, wait, swing it and lay the sheet down."""
+    between = rest[held[0]][:, None] - rest[held[1]]
+    taut = TAUT * np.linalg.norm(between, axis=2).min()
+    middle, grip = tips.mean(axis=0), -np.ones(2)
+    aside = float(np.clip(middle[0], -(high[0] - 0.55 * side), high[0] - 0.55 * side))
+    apart = np.array([[-taut / 2, 0, 0], [taut / 2, 0, 0]])
+    if strain > TEARING:
+        return np.zeros((2, 3)), -grip
+    top = throw.above[0] * side
+    if own["rested"] < top - 0.001:
+        goal = apart + (aside, throw.along[0] * side, top)
+        if np.abs(goal - tips).max() < 0.005:
+            return 30 * (goal - tips), grip
+        move = 12 * (goal - tips)
+        # upward before aside
+        move[:, :2] *= 0.6
+        move /= np.maximum(length(move) / LIFTING, 1)[:, None]
+        # never farther apart than the cloth between them is long
+        way = tips[1] + move[1] / 30 - tips[0] - move[0] / 30
+        beyond = max(np.linalg.norm(way) - max(taut, 0.01), 0.0)
+        pull = 15 * beyond * way / max(np.linalg.norm(way), 1e-9)
+        return (move + np.stack([pull, -pull])) * np.clip(1.3 - 2 * strain, 0, 1), grip
+    # it rests until the sheet is calm
+    now = int(own["moving"])
+    if now == 0 and speed > CALM and left > LONG:
+        return np.zeros((2, 3)), grip
+    steps = (0.0, *throw.steps)
+    if now >= steps[-1]:
+        return np.zeros((2, 3)), -grip
+    y, z = (side * np.interp(now + 1, steps, way) for way in (throw.along, throw.above))
+    goal = np.stack([tips[:, 0], [y, y], [z, z]], axis=1)
+    return 30 * (goal - tips), grip
