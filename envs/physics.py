@@ -172,6 +172,8 @@ def checked_wind(properties: Mapping[str, Any]) -> Wind:
 
 def check_ranges(physics: Physics, ranges: Mapping[str, tuple[float, float]], integrator: Integrator) -> None:
     """Refuse ranges that the integrator or the sheet cannot have."""
+    if physics.mesh.shape is None and "shear_stiffness" in ranges:
+        raise ValueError("randomize: shear_stiffness has no effect on a sheet of triangles; give a range of stretch_stiffness")
     for name in ranges:
         if name in integrator.shared | integrator.ignored:
             raise ValueError(f"randomize: {refusal(integrator, name)}")

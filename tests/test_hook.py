@@ -303,6 +303,8 @@ def test_hooks_that_there_cannot_be_are_refused(options):
         env.reset(options=options)
 
 
-def test_another_resolution_is_refused():
+def test_what_a_sheet_of_triangles_does_not_have_is_refused():
     with pytest.raises(ValueError, match="one mesh"):
         gym.make(HOOK, rows=25)
+    with pytest.raises(ValueError, match="shear_stiffness has no effect"):
+        gym.make(HOOK, randomize={"shear_stiffness": [10, 20]})
