@@ -110,6 +110,117 @@ def test_doing_nothing_improves_nothing_and_the_expert_flattens():
     assert np.all(info["best"][:3] >= 0.9) and info["first_success"][3] == -1
 
 
+# --- potential, observation, accounts and judge, of sheets made here ----------------------------------------------------------
+
+
+def start(seed=3):
+    env = gym.make(ID).unwrapped
+    env.reset(seed=seed)
+    return env
+
+
+def on_floor(mesh, at=None):
+    """Flat, or folded over a crease with the layers apart [m]: it covers 1/2 + at of its area."""
+    x = mesh.rest_positions if at is None else folded(mesh, at)
+    over = np.zeros(len(x)) if at is None else np.clip((mesh.rest_positions[:, 0] - at * SIDE) / 0.04, 0, 1)
+    return x + np.stack([0 * over, 0 * over, 0.003 + 0.012 * over], axis=1)
+
+
+def put(env, x):
+    """The next step, in which nothing moves, from this sheet."""
+    env.task.simulation.reset(positions=x)
+    return env.step(np.zeros(8))
+
+
+@pytest.mark.parametrize(("at", "covered"), [(None, 1.0), (0.0, 0.5), (0.25, 0.75)])
+def test_the_potential_is_what_is_covered_and_how_near_the_grippers_are(at, covered):
+    env = start()
+    observation, *_ = put(env, on_floor(env.task.physics.mesh, at))
+    x, tips = env.task.simulation.positions[0].astype(float), env.task.simulation.grippers.positions[0].astype(float)
+    near = [0.5 / (1 + (np.linalg.norm(x - tip, axis=1).min() / (0.15 * SIDE)) ** 2) for tip in tips]
+    assert env.task.episode["potential"][0] == pytest.approx(0.9 * covered + 0.1 * np.mean(near), abs=0.015)
+    assert observation[env.observation_slices["coverage"]] == pytest.approx(covered, abs=0.015)
+
+
+def test_the_observation_says_where_grippers_are_what_they_hold_and_how_high():
+    env = start()
+    task, mesh = env.task, env.task.physics.mesh
+    task.simulation.reset(positions=on_floor(mesh))
+    corners = np.array(mesh.corners)
+    tips = task.simulation.positions[:, corners[[1, 2]]].astype(float) + (0, 0, 0.01)
+    task.simulation.grippers.place(tips, np.array([0]))
+    task.episode["targets"][:] = tips
+    close, up, down = (np.tile([0, 0, way, -1.0], 2) for way in (0, 0.5, -1))
+    for action in [close] * 5 + [up] * 6 + [down] * 2:
+        observation, *_ = env.step(action)
+        if action is close:
+            low = task.simulation.grippers.positions[0, :, 2].max()
+    seen = {name: observation[where] for name, where in env.observation_slices.items()}
+    x, tips = task.simulation.positions[0].astype(float), task.simulation.grippers.positions[0].astype(float)
+    grippers = seen["grippers"].reshape(2, 5)
+    assert grippers[:, :3] == pytest.approx(tips / SIDE, abs=1e-5) and grippers[:, 3:].tolist() == [[0, 1], [0, 1]]
+    assert seen["ways"].reshape(2, 4, 3) == pytest.approx((x[corners] - tips[:, None]) * 10 / SIDE, abs=1e-4)
+    assert seen["corners_held"].reshape(2, 4).tolist() == [[0, 1, 0, 0], [0, 0, 1, 0]]
+    # a tenth of a meter up, and a third of it down again
+    assert seen["raised"] * SIDE == pytest.approx([low + 0.1] * 2, abs=2e-3) and tips[:, 2].max() < low + 0.05
+    held = 0.1 + 0.9 * seen["coverage"].item()
+    assert task.episode["potential"][0] == pytest.approx(held, abs=1e-6)
+
+
+def test_the_best_stays_the_first_success_is_remembered_and_what_is_lost_is_lost():
+    env = start()
+    mesh, begun = env.task.physics.mesh, env.task.infos()["coverage_start"][0]
+    *_, info = put(env, on_floor(mesh, 0.42))  # 0.92 is not enough
+    assert info["first_success"] == -1 and not info["success_held"]
+    assert info["best"] == pytest.approx((0.92 - begun) / (1 - begun), abs=0.02)
+    *_, info = put(env, on_floor(mesh))
+    assert info["first_success"] == 2 and info["success_held"] and info["best"] == 1
+    *_, info = put(env, on_floor(mesh, 0.0))
+    assert info["first_success"] == 2 and not info["success_held"] and info["best"] == 1
+    *_, info = put(env, on_floor(mesh))
+    assert not info["success_held"]
+
+
+@pytest.mark.parametrize(("at", "speed", "success"), [(None, 0.0, True), (None, 1.0, False), (0.42, 0.0, False)])
+def test_success_asks_for_a_flat_sheet_at_rest(at, speed, success):
+    env = start()
+    task, own = env.task, env.task.episode[0]
+    task.simulation.reset(positions=on_floor(task.physics.mesh, at))
+    own["step"] = own["settling_since"] = 300
+    for _ in range(39):
+        env.step(np.zeros(8))
+    state = env.get_state()
+    state.simulation.velocities[0, :, 2] += speed
+    env.set_state(state)
+    *_, terminated, _, info = env.step(np.zeros(8))
+    assert terminated and info["coverage"] == pytest.approx(1.0 if at is None else 0.9, abs=0.04)
+    assert info["is_success"] == success
+
+
+def test_starts_are_sheets_of_the_bank_mirrored_or_not_turned_and_moved():
+    env = gym.make_vec(ID, num_envs=48, autoreset_mode="Disabled").unwrapped
+    env.reset(seed=0)
+    bank, x = rumpled_sheets(17, 17, SIDE, CRUMPLED), env.task.simulation.positions.astype(float)
+    mirrored, yaws, shifts = [], [], []
+    for one in x:
+        # heights tell which sheet it is
+        raised = one[:, 2] - bank[:, :, 2]
+        own = np.abs(raised).max(axis=1).argmin()
+        assert 0 < np.abs(raised[own]).max() < 1e-3 and raised[own].min() > -1e-6
+        a, b = bank[own, :, :2], one[:, :2]
+        fit = np.linalg.lstsq(np.column_stack([a, np.ones(len(a))]), b, rcond=None)[0]
+        turn = fit[:2].T
+        mirrored.append(np.linalg.det(turn) < 0)
+        yaws.append(np.arctan2(turn[1, 0], turn[0, 0]))
+        shifts.append(fit[2])
+        assert turn @ turn.T == pytest.approx(np.eye(2), abs=1e-4)
+    assert 12 < sum(mirrored) < 36 and np.ptp(yaws) > 5
+    shifts = np.array(shifts)
+    assert np.abs(shifts).max() <= 0.2 * SIDE + 1e-5 and np.abs(shifts).max() > 0.18 * SIDE
+    starts = env.task.simulation.grippers.positions.astype(float) / SIDE - [[-0.4, 0, 0.5], [0.4, 0, 0.5]]
+    assert np.abs(starts).max() <= 0.1 + 1e-5 and np.abs(starts).max() > 0.09
+
+
 def test_the_hard_tier_is_larger_and_of_another_fabric():
     hard = gym.make("clothgym:ClothFlatten-Hard-v0").unwrapped
     hard.reset(seed=0)
