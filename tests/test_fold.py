@@ -128,6 +128,90 @@ def test_the_expert_folds_a_large_sheet_of_silk_twice():
     assert np.allclose(info["fold_error_mm"], 800 * info["fold_error"])
 
 
+# --- potential, observation and judge, of sheets made here --------------------------------------------------------------------
+
+
+def start(seed=3):
+    env = gym.make(ID).unwrapped
+    env.reset(seed=seed)
+    return env
+
+
+def half(env, aside):
+    """The sheet folded in half, its crease so far from its middle line [m], the upper layer 8 mm over the lower."""
+    rest = env.task.physics.mesh.rest_positions
+    over = rest[:, 1] - aside
+    return np.stack([rest[:, 0], aside - abs(over), 0.004 + 0.008 * np.clip(over / 0.04, 0, 1)], axis=1)
+
+
+def errors(env):
+    """Mean and largest distance from the nearest half fold, seen from above, in sides: by Kabsch's rotation."""
+    mesh, x = env.task.physics.mesh, env.task.simulation.positions[0].astype(float)
+    weights, (u, v) = mesh.area / mesh.area.sum(), mesh.rest_positions[:, :2].T
+    found = []
+    for ideal in ((u, -abs(v)), (u, abs(v)), (-abs(u), v), (abs(u), v)):
+        a, b = np.stack(ideal, axis=1), x[:, :2]
+        a, b = a - weights @ a, b - weights @ b
+        left, _, right = np.linalg.svd((weights[:, None] * b).T @ a)
+        turn = left @ np.diag([1, np.linalg.det(left @ right)]) @ right
+        away = np.linalg.norm(b - a @ turn.T, axis=1) / SIDE
+        found.append((weights @ away, away.max()))
+    return min(found), weights @ x[:, 2] / SIDE
+
+
+@pytest.mark.parametrize(
+    ("aside", "raised", "speed", "success"),
+    [(0.0, 0.0, 0.0, True), (0.09, 0.0, 0.0, False), (0.0, 0.0, 0.6, False), (0.0, 0.1, 0.338, False)],
+)
+def test_success_asks_for_a_fold_that_is_near_flat_and_at_rest(aside, raised, speed, success):
+    """The last two go up: one lies flat and moves, the other rests for a moment in the air."""
+    env = start()
+    task, own = env.task, env.task.episode[0]
+    # how far a flat sheet's points are from a fold
+    task.simulation.reset(positions=task.physics.mesh.rest_positions + (0, 0, 0.004))
+    env.step(np.zeros(8))
+    unfolded = errors(env)[0][0]
+    task.simulation.reset(positions=half(env, aside))
+    own["step"] = own["settling_since"] = task.acting_steps
+    for _ in range(task.settling_steps - 1):
+        env.step(np.zeros(8))
+    state = env.get_state()
+    state.simulation.positions[0, :, 2] += raised
+    state.simulation.velocities[0] = (0, 0, speed)
+    env.set_state(state)
+    *_, terminated, _, info = env.step(np.zeros(8))
+    (error, worst), high = errors(env)
+    v = task.simulation.velocities[0].astype(float)
+    rms = np.sqrt(task.physics.mesh.area / SIDE**2 @ np.sum(v**2, axis=1))
+    assert terminated and info["fold_error"] == pytest.approx(error, abs=1e-4)
+    assert info["fold_error_max"] == pytest.approx(worst, abs=1e-3) and info["height"] == pytest.approx(high, abs=1e-5)
+    assert [worst <= 0.1, high <= 0.05, rms < 0.02] == [aside == 0, raised == 0, speed != 0.6]
+    performance = (1 - error / unfolded) / (1 + (high / 0.05) ** 4) / (1 + (rms / 0.1) ** 2)
+    assert info["normalized_performance"] == pytest.approx(performance, abs=5e-3) and info["is_success"] == success
+    assert info["overlap"] > 0.97 if aside == 0 else info["overlap"] < 0.9
+
+
+def test_the_potential_and_the_ways_of_grippers_that_hold_their_places():
+    env = start()
+    task = env.task
+    places = task.rules["places"].ravel().tolist()
+    tips = task.simulation.positions[:, places].astype(float) + (0, 0, 0.01)
+    # near their places, and when they hold them
+    task.simulation.grippers.place(tips + (0, 0, 0.05), np.array([0]))
+    task.episode["targets"][:] = tips + (0, 0, 0.05)
+    observation, *_ = env.step(np.zeros(8))
+    x, at = task.simulation.positions[0].astype(float), task.simulation.grippers.positions[0].astype(float)
+    away = np.linalg.norm(x[places] - at, axis=1) / (0.15 * SIDE)
+    assert task.episode["potential"][0] == pytest.approx(0.3 * np.mean(0.5 / (1 + away**2)), abs=2e-3)
+    ways = observation[env.observation_slices["ways"]].reshape(-1, 3)
+    assert ways == pytest.approx((x[places] - at) * 10 / SIDE, abs=1e-4)
+    task.simulation.grippers.place(tips, np.array([0]))
+    task.episode["targets"][:] = tips
+    for _ in range(5):
+        env.step(np.tile([0, 0, 0, -1.0], 2))
+    assert task.episode["potential"][0] == pytest.approx(0.3, abs=5e-3)
+
+
 def test_doing_nothing_scores_nothing():
     info, _ = episodes(2, still=True)
     assert not info["is_success"].any() and info["normalized_performance"].max() < 0.02

@@ -81,6 +81,29 @@ def test_each_gripper_sees_its_ways_to_the_corners():
     assert ways == pytest.approx((x[:, None] - tips[:, :, None]) / (SIDE / 10), abs=1e-4)
 
 
+def test_the_potential_is_how_far_corners_have_come_on_the_average_and_success_asks_for_rest():
+    env = gym.make(ID).unwrapped
+    seen, _ = env.reset(seed=1_000_003)
+    task = env.task
+
+    def mean(seen):
+        return np.linalg.norm((seen["achieved_goal"] - seen["desired_goal"]).reshape(4, 3), axis=1).mean()
+
+    began = mean(seen)
+    for step in range(task.acting_steps + task.settling_steps - 1):
+        seen, *_, info = env.step(env.expert_action())
+        if step % 10 == 0:
+            assert task.episode["potential"][0] == pytest.approx(1 - mean(seen) / began, abs=1e-5)
+    state = env.get_state()
+    for speed in (0.0, 0.6):
+        state.simulation.velocities[0] = (0, 0, speed)
+        env.set_state(state)
+        seen, _, terminated, _, info = env.step(np.zeros(8))
+        # as near either way
+        assert terminated and far(seen["achieved_goal"], seen["desired_goal"]) < NEAR
+        assert info["is_success"] == (speed == 0)
+
+
 def test_doing_nothing_scores_nothing():
     env, _ = batch(8)
     over, total = np.zeros(8, bool), np.zeros(8)
