@@ -223,9 +223,10 @@ class Attachments:
             work(block, block + 1)
         return out
 
-    def slip(self, pull: NDArray, w: NDArray, free_w: NDArray) -> None:
-        """Release particles of grippers on which the cloth pulls with more than their slip force, see ``let_slip``."""
-        let_slip(pull, self.holder, w, free_w, self.limits)
+    def slip(self, pull: NDArray, blocks: slice, w: NDArray, free_w: NDArray) -> None:
+        """In these blocks release particles of grippers on which the cloth pulls with more than their slip force, see
+        ``let_slip``; pull: of these blocks [N]."""
+        let_slip(pull, self.holder[blocks], w[blocks], free_w[blocks], self.limits)
 
 
 class Grippers:

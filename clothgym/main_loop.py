@@ -8,6 +8,7 @@ it cannot make itself (see ``_jit.uncounted``), is made by ``room_for_block``.
 from __future__ import annotations
 
 from functools import cache
+from threading import get_ident
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,7 +127,7 @@ class MainLoop:
 
     def __init__(self, kernel: Any, make_room: Any) -> None:
         self.kernel, self.make_room = kernel, make_room
-        # by the first block that a thread takes
+        # by thread
         self.rooms: dict[int, Any] = {}
 
     def __call__(
@@ -134,9 +135,10 @@ class MainLoop:
         outcome: Outcome,
     ) -> None:  # fmt: skip
         """One control step of blocks ``first`` to ``last``."""
-        if first not in self.rooms:
-            self.rooms[first] = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
-        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms[first])
+        thread = get_ident()
+        if thread not in self.rooms:
+            self.rooms[thread] = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
+        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms[thread])
 
 
 @cache

@@ -177,14 +177,18 @@ class Simulation(Observed):
     # --- time -----------------------------------------------------------------------------------------------------------
 
     @exclusive
-    def step(self, n: int = 1) -> None:
-        """Advance all environments by ``n`` control steps; attachments move towards their targets at a bounded speed.
+    def step(self, n: int = 1, envs: ArrayLike | None = None) -> None:
+        """Advance environments, all of them or those that are named, by ``n`` control steps; the others stay as they are.
+
+        Attachments move towards their targets at a bounded speed.
 
         Raises:
             RuntimeError: a step was interrupted, and not all environments have been reset since; or another thread is in a call.
+            ValueError: environments that share their memory with others, see ``state.Layout``, cannot be advanced alone.
         """
         count("n", n)
         self.turn.check_whole()
+        chosen = None if envs is None else self._apart(envs)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
         motion, solids = Motion(self._x, self._v, self._w), Solid(self._solids.shapes, self._solids.rows)
@@ -201,22 +205,43 @@ class Simulation(Observed):
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
+        def work_on_chosen(first: int, last: int) -> None:
+            for block in chosen[first:last]:  # type: ignore[index]
+                work(block, block + 1)
+
+        # where one lies in each block, environments and blocks have the same numbers
+        stepped: Any = slice(None) if chosen is None else chosen
         for _ in range(n):
-            self.turn.unfinished = range(self.num_envs)
-            _jit.run_spans(work, self.layout.blocks, self.threads)
+            self.turn.unfinished = range(self.num_envs) if chosen is None else chosen
+            if chosen is None:
+                _jit.run_spans(work, self.layout.blocks, self.threads)
+            else:
+                _jit.run_spans(work_on_chosen, len(chosen), self.threads)
             if self.colliders:
-                self._solids.end_step()
+                self._solids.end_step(stepped)
             if self._attachments.can_slip:
                 held = self._attachments.holder.copy()
-                self._attachments.slip(self._pulls(), self._w, self._free_w)
+                pulls = self._pulls(None if chosen is None else np.array(chosen, np.int64))
+                for blocks in [slice(None)] if chosen is None else [slice(block, block + 1) for block in chosen]:
+                    self._attachments.slip(pulls[blocks], blocks, self._w, self._free_w)
                 self._contact.let_go(held, self._attachments.holder)
-            self._steps += 1
+            self._steps[stepped] += 1
             self.turn.unfinished = ()
             self._contact.warn(self._steps)
             if self.on_divergence != "ignore" and self._diverged.any():
                 new = self.diverged & ~self._reported
                 self._reported |= new
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
+
+    def _apart(self, envs: ArrayLike) -> list[int]:
+        """Environments that are to be advanced alone."""
+        chosen = self.layout.chosen(envs).tolist()
+        if not self.layout.by_particle:
+            raise ValueError(
+                f"step(envs=...): with {self.integrator.name} on this mesh environments lie side by side in memory and advance "
+                "together; leave envs out, or take a grid with an integrator in which the order of the springs does not matter"
+            )
+        return chosen
 
     def _prepare(self) -> None:
         """Renew the integrator's plan and the main loop's schedule where properties or substeps have changed."""

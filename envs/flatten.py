@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.flatten_expert import flatten_actions
+from clothgym.envs.flatten_expert import flatten_actions, flatten_picks
 from clothgym.envs.flattening import (
     SpreadingTask,
     account_spread,
@@ -93,6 +93,9 @@ class FlattenTask(SpreadingTask):
 
     def expert_actions(self) -> NDArray:
         return flatten_actions(self)
+
+    def expert_picks(self) -> NDArray:
+        return flatten_picks(self)
 
     def camera(self) -> Camera:
         from clothgym.render import Camera

@@ -15,6 +15,7 @@ from clothgym._jit import kernel
 from clothgym.envs.episode import length
 from clothgym.envs.manipulation import REACH
 from clothgym.envs.measures import distance
+from clothgym.envs.pick_place import STEPS
 
 # corners of each edge, and of the opposite one, as places in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
@@ -29,6 +30,11 @@ SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sh
 DONE = 0.96  # coverage with which it is content
 TEARING = 0.5  # strain at which it lets go
 AGAIN = 95  # steps that another try takes
+# of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
+PULLS = ((0, 1, 2, 3), (2, 3, 0, 1), (0, 3, 1, 2), (1, 2, 0, 3), (0, 3, 1, 2), (1, 2, 0, 3))
+EDGES_FIRST = 2
+PULLED = 0.98  # share of their distance in the flat sheet to which corners are pulled apart
+LIFT_EDGE, LIFT_CORNER = 0.5, 0.2  # in sides
 
 
 def _directions() -> NDArray:
@@ -110,6 +116,35 @@ def flatten_actions(task: Any) -> NDArray:
     grip[(grippers.openings == 0) & (grippers.held == 0)] = 1
     move /= np.maximum(length(move) / SPEED, 1)[..., None]
     return np.concatenate([move / task.physics.attachment_speed, grip[..., None]], axis=2).reshape(n, -1)
+
+
+def flatten_picks(task: Any) -> NDArray:
+    """Actions of all environments with "pick_place", (num_envs, 10): corners by their numbers, in a fixed order, are pulled apart.
+
+    First both ends of an edge, and of the opposite one, to where the edge would lie were the sheet flat behind it; then the
+    diagonals, one across the other.  No choice among corners: what it does is a smooth function of where these are, and of time.
+    """
+    n, side, half = task.num_envs, task.physics.side, task.workspace * task.physics.side
+    p = task.simulation.positions[:, list(task.physics.mesh.corners), :2].astype(np.float64)
+    actions = np.ones((n, 2, 5))
+    number = task.episode["step"] // STEPS
+    for k, (a, b, c, d) in enumerate(PULLS):
+        # across: the direction in which the corners are pulled apart; out: from the others to them
+        on_edge = k < EDGES_FIRST
+        along = (p[:, b] - p[:, a]) + (p[:, d] - p[:, c]) if on_edge else p[:, d] - p[:, c]
+        along /= np.maximum(np.sqrt(along[:, 0] ** 2 + along[:, 1] ** 2), 1e-9)[:, None]
+        turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        ahead = (p[:, a] + p[:, b] - p[:, c] - p[:, d]) / 2 if on_edge else p[:, b] - p[:, a]
+        turned *= np.where(turned[:, 0] * ahead[:, 0] + turned[:, 1] * ahead[:, 1] < 0, -1.0, 1.0)[:, None]
+        middle, across, whole = (p[:, c] + p[:, d]) / 2, turned, np.sqrt(2) * side
+        if on_edge:
+            middle, across, whole = middle + side * turned, along, side
+        apart = PULLED * whole / 2 * across
+        now = (number == k) & (task.episode["coverage"] < DONE)
+        for gripper, (pick, place) in enumerate(((p[:, a], middle - apart), (p[:, b], middle + apart))):
+            actions[now, gripper, 0:2], actions[now, gripper, 2:4] = pick[now] / half, place[now] / half
+            actions[now, gripper, 4] = 2 * (LIFT_EDGE if on_edge else LIFT_CORNER) - 1
+    return np.clip(actions, -1, 1).reshape(n, -1)
 
 
 def _to(goal: NDArray, tip: NDArray) -> NDArray:

@@ -101,6 +101,7 @@ class GripperTask(Task):
             env, component = np.argwhere(~np.isfinite(actions))[0].tolist()
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         pick_place.perform(self, actions)
+        self.settle()
 
     def expert(self) -> NDArray:
         return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
@@ -116,8 +117,14 @@ class GripperTask(Task):
         )
 
     def steps_taken(self) -> NDArray:
-        step = self.episode["step"]
-        return step if self.action_mode == "velocity" else -(-step // pick_place.STEPS)
+        taken = super().steps_taken()
+        return taken if self.action_mode == "velocity" else -(-taken // pick_place.STEPS)
+
+    def most_steps(self) -> int:
+        if self.action_mode == "velocity":
+            return super().most_steps()
+        rests = -(-self.settling_steps // pick_place.STEPS) if self.settling == "steps" else 0
+        return self.acting_steps // pick_place.STEPS + rests
 
     def remembers(self) -> Fields:
         # how far each tip must stay above the floor [m]

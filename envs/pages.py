@@ -68,6 +68,11 @@ COMMON: dict[str, tuple[str, str]] = {
         "``False``", 'whether a picture comes with the state: ``Dict(observation=picture, state=the numbers of "keypoints")``',
     ),
     "reward_mode": ('``"delta"``', 'or ``"sparse"``'),
+    "settling": (
+        '``"steps"``',
+        'or ``"at_once"``: the step in which the agent is done goes on until the sheet has settled and is evaluated, and brings '
+        "the rewards of all of it, so that no action is ignored",
+    ),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
     "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
     "threads": ("1; in a batch all processors", "the outcome does not depend on it"),

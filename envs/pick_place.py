@@ -50,9 +50,10 @@ def path_of(actions: NDArray, tips: NDArray, cloth: NDArray, half: float, side: 
     near = across[..., 0] ** 2 + across[..., 1] ** 2 <= BESIDE**2
     tops = np.where(near, cloth[:, None, :, 2], 0).max(axis=2)
     pick[..., 2] = np.maximum(tops, LOWEST)
-    # the way to the place, an arc, has as much of the time as of the length; both ways have some of it
-    to_pick, to_place = length(pick - tips), length(place - pick) + 2 * lift
-    share = to_pick / np.maximum(to_pick + to_place, 1e-9)
+    # the way to the place, an arc, has as much of the time as of the length; both ways have some of it.  The grippers of one sheet
+    # close and open together, by the longest of their ways: one that lifts what the other still holds down tears it
+    to_pick, to_place = (way.max(axis=1, keepdims=True) for way in (length(pick - tips), length(place - pick) + 2 * lift))
+    share = np.broadcast_to(to_pick / np.maximum(to_pick + to_place, 1e-9), tips.shape[:2])
     approach = np.clip(np.rint(share * (MOVING - LEAVING)), 4, MOVING - LEAVING - 4).astype(np.int64)
     return Path(tips, pick, place, lift, approach)
 

@@ -186,19 +186,20 @@ class Sheet(NamedTuple):
 # --- before the physics -------------------------------------------------------------------------------------------------------
 
 
-def apply_actions(actions, block, lane, rules, episode, air, outcome, targets, wanted, wind):
-    """Set where attachments and fingers of all environments are to be after a control step, and how the air moves in it.
+def apply_actions(envs, actions, block, lane, rules, episode, air, outcome, targets, wanted, wind):
+    """Set where attachments and fingers of environments are to be after a control step, and how the air moves in it.
 
-    actions: (num_envs, numbers).  block, lane: of each environment, (num_envs,), see ``Layout.at``.  targets, wanted, wind: a
-    simulation's, see ``state.Orders``.  Returns the place of an action that is not finite, or -1; then nothing has been changed.
+    envs: those that take the step.  actions: (num_envs, numbers).  block, lane: of each environment, (num_envs,), see
+    ``Layout.at``.  targets, wanted, wind: a simulation's, see ``state.Orders``.  Returns the place of an action that is not finite,
+    or -1; then nothing has been changed.
     """
     rule = rules[0]
     # one action that is not finite stops the whole batch, before anything is changed
-    for e in range(episode.shape[0]):
+    for e in envs:
         for i in range(actions.shape[1]):
             if not np.isfinite(actions[e, i]):
                 return e * actions.shape[1] + i
-    for e in range(episode.shape[0]):
+    for e in envs:
         b, l = block[e], lane[e]
         own, moves = episode[e], outcome[e].moves
         acting = not own.over and own.settling_since < 0

@@ -31,6 +31,7 @@ from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
 from clothgym.simulation import Simulation
 
 REWARD_MODES = ("delta", "sparse")
+SETTLING = ("steps", "at_once")
 ROUNDING = 1e-6  # by which a share may leave [0, 1]
 ENVS_A_THREAD = 16  # fewer are not worth another thread
 
@@ -49,6 +50,7 @@ class Task(TaskDefinition):
         obs_mode, image_size, camera, num_points, privileged: what is returned of the state, see ``Observer``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
         randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
+        settling: "steps", or "at_once": the last step in which the agent acts goes on until its sheet has settled and is evaluated.
         wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
         threads: threads to use; all processors by default for a batch.
 
@@ -88,13 +90,15 @@ class Task(TaskDefinition):
         num_points: int = 256,
         privileged: bool = False,
         reward_mode: str = "delta",
+        settling: str = "steps",
         randomize: Mapping[str, Sequence[float]] | None = None,
         wind: Mapping[str, Any] | None = None,
         threads: int | None = None,
     ) -> None:
         one_of("obs_mode", obs_mode, *self.obs_modes)
         one_of("reward_mode", reward_mode, *REWARD_MODES)
-        self.obs_mode, self.reward_mode = obs_mode, reward_mode
+        one_of("settling", settling, *SETTLING)
+        self.obs_mode, self.reward_mode, self.settling = obs_mode, reward_mode, settling
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
         check_definition(self, self._in_numpy)
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
@@ -130,6 +134,11 @@ class Task(TaskDefinition):
             threads=threads,
             on_divergence="ignore",  # a step's outcome says so
         )
+        if settling == "at_once" and not self.simulation.layout.by_particle:
+            raise ValueError(
+                f"settling='at_once': with {method.name} on this sheet environments advance together; take settling='steps', or a "
+                "grid and an integrator in which the order of the springs does not matter"
+            )
         self.num_envs = num_envs
         self.threads = self.simulation.threads
         self.num_attachments = len(fixed.held) + len(fixed.grippers)
@@ -315,6 +324,25 @@ class Task(TaskDefinition):
         """The same as a part of a longer step: whoever calls it sets ``turn.unfinished`` to nothing at the end."""
         self.check_ready()
         self.move(self._checked(actions))
+        self.settle()
+
+    def settle(self) -> None:
+        """With ``settling="at_once"``, take the sheets whose agents are done to their ends; the step's reward is the sum of theirs.
+
+        The others stand still meanwhile: a batch goes on when all of its agents can act again.
+        """
+        if self.settling == "steps":
+            return
+        still = np.zeros((self.num_envs, *self.single_action_space.shape))
+        while True:
+            envs = np.flatnonzero((self.episode["settling_since"] >= 0) & ~self.episode["over"])
+            if not len(envs):
+                return
+            reward, terms = self.outcome["reward"][envs], self.terms[envs]
+            self.move(still, envs)
+            self.outcome["reward"][envs] += reward
+            for name in terms.dtype.names or ():
+                self.terms[name][envs] += terms[name]
 
     def check_ready(self) -> None:
         """Refuse a step of a batch that has not been reset, or was interrupted."""
@@ -323,28 +351,39 @@ class Task(TaskDefinition):
         self.turn.check_whole()
         self.simulation.turn.check_whole()
 
-    def move(self, actions: NDArray) -> None:
-        """One control step; actions: velocities of the attachments and what comes after them, (num_envs, numbers), float64."""
-        simulation = self.simulation
+    def move(self, actions: NDArray, envs: NDArray | None = None) -> None:
+        """One control step of all environments, or of some, beside which the others stand still.
+
+        actions: velocities of the attachments and what comes after them, (num_envs, numbers), float64.
+        """
+        simulation, chosen = self.simulation, self._everyone if envs is None else envs
         self.turn.unfinished = range(self.num_envs)
-        wrong = self._apply_actions(actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders)
+        wrong = self._apply_actions(
+            chosen, actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders
+        )
         if wrong >= 0:
             self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         self.before_step(actions)
-        simulation.step()
-        self.info = np.zeros(self.num_envs, self.info.dtype)
+        simulation.step(envs=envs)
+        self.info[chosen] = np.zeros((), self.info.dtype)
         self.after_step()
-        self._score_and_observe(self._everyone, begins=False)
+        self._score_and_observe(chosen, begins=False)
         # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
             simulation.release(*np.nonzero(self.outcome["free"]))
+            self.outcome["free"] = 0
         self.observed.stepped()
 
     def steps_taken(self) -> NDArray:
         """Calls of ``step`` since each episode's start, (num_envs,)."""
-        return self.episode["step"]
+        step, settling = self.episode["step"], self.episode["settling_since"]
+        return np.where(settling >= 0, settling, step) if self.settling == "at_once" else step
+
+    def most_steps(self) -> int:
+        """Calls of ``step`` that an episode takes at most."""
+        return self.acting_steps + (self.settling_steps if self.settling == "steps" else 0)
 
     def _checked(self, actions: Any) -> NDArray:
         """Actions as an array of the right shape, float64."""
@@ -357,8 +396,9 @@ class Task(TaskDefinition):
     def _score_and_observe(self, envs: NDArray, begins: bool) -> None:
         """Score and observe environments after a step, all of them, or as their episodes begin."""
         view, mesh = self.simulation.view, self._mesh
-        block, lane = self.simulation.layout.at(envs) if begins else self._place
-        pulls = self.simulation.pulls(envs if begins else None) if self.feels_pulls else self._no_pulls
+        everyone = envs is self._everyone
+        block, lane = self._place if everyone else self.simulation.layout.at(envs)
+        pulls = self.simulation.pulls(None if everyone else envs) if self.feels_pulls else self._no_pulls
         if self._in_numpy:
             self._evaluate_in_numpy()
 

@@ -29,12 +29,11 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
     """
     rng = np.random.default_rng(seed)
     task = env.unwrapped.env.task  # type: ignore[attr-defined]
-    steps = task.acting_steps + task.settling_steps
     observations, actions = [], []
     seen: Any = env.reset()
     for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False, disable=None):
         strength = noise * rng.uniform(size=(env.num_envs, 1))
-        for _ in range(steps):
+        for _ in range(task.most_steps()):
             wanted = np.clip(task.expert_actions(), -1, 1).astype(np.float32)
             # what is done while the sheet settles does not matter, and would only blur what does
             acting = task.episode["settling_since"] < 0

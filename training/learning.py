@@ -100,19 +100,51 @@ class HeldOutEvaluation(BaseCallback):
         self.evaluating += time.perf_counter() - begun
 
 
+class Curriculum(BaseCallback):
+    """Begins on environments with other arguments, with ``physics="fast"`` for instance, and goes on with the run's own.
+
+    steps: environment steps of the first part.
+    """
+
+    def __init__(self, config: dict[str, Any], steps: int) -> None:
+        super().__init__()
+        self.config, self.steps = config, steps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps < self.steps or self.model.env is None:
+            return
+        self.steps = sys.maxsize
+        config, seed = self.config, training_seed(self.config["seed"], self.num_timesteps, self.config["num_envs"])
+        self.model.env.close()
+        self.model.set_env(environments(config, config["env_kwargs"], seed), force_reset=False)
+        # the next rollout begins with these; the one that has just ended is learned from all the same
+        self.model._last_obs = self.model.env.reset()  # type: ignore[assignment]
+        self.model._last_episode_starts = np.ones(config["num_envs"], bool)
+
+
+def environments(config: dict[str, Any], env_kwargs: dict[str, Any], seed: int) -> VecMonitor:
+    """A batch of a configuration's environments."""
+    return VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **env_kwargs))
+
+
 def training_seed(seed: int, done: int, num_envs: int) -> int:
     """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
     return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
 
 
-def build(folder: Path, config: dict[str, Any], seed: int) -> PPO:
-    """The learner of a configuration, on its own batch of environments."""
+def build(folder: Path, config: dict[str, Any], seed: int, done: int) -> PPO:
+    """The learner of a configuration, on its own batch of environments; done: environment steps of the run so far."""
     options = dict(config["hyperparameters"])
     policy = options.pop("policy")
     for key in ("learning_rate", "clip_range"):
         if isinstance(options.get(key), str):
             options[key] = _linear(options[key])
-    env = VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **config["env_kwargs"]))
+    first = config["curriculum"]
+    kwargs = config["env_kwargs"] | (first["env_kwargs"] if first and done < first["n_timesteps"] else {})
+    env = environments(config, kwargs, seed)
     return PPO(policy, env, seed=seed, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
 
 
@@ -158,7 +190,7 @@ def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, in
     """
     state = load_last(folder) if resume and policies.has_checkpoint(folder) else None
     done = int(state["num_timesteps"]) if state is not None else 0
-    model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]))
+    model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]), done)
     if state is not None:
         policies.load_checkpoint(folder, model, state)
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
@@ -190,6 +222,8 @@ def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_epis
         callbacks: list[BaseCallback] = [watch]
         if config["algo"] == "ppo_lagrange":
             callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
+    if config["curriculum"] and done < config["curriculum"]["n_timesteps"]:
+        callbacks.append(Curriculum(config, config["curriculum"]["n_timesteps"]))
     if config["clone"] and done == 0:
         watch.trained_before += learn_from_expert(model, config)
     seconds = watch.trained_before

@@ -103,6 +103,7 @@ class Args:
             "algo": self.algo,
             "lagrange": hyperparameters.pop("lagrange", {}),
             "clone": hyperparameters.pop("clone", {}),
+            "curriculum": hyperparameters.pop("curriculum", {}),
             "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
             "num_envs": hyperparameters.pop("n_envs"),
             "timesteps": self.timesteps if self.timesteps is not None else int(hyperparameters["n_timesteps"]),

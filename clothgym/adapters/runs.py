@@ -20,7 +20,7 @@ CHECKPOINT, BEFORE, BEST, CONFIG = "checkpoint.pt", "checkpoint_before.pt", "bes
 VERSION = 1  # of the format of checkpoints
 ADVICE = "train again, or take another run"
 FIELDS = {
-    "env": str, "algo": str, "lagrange": dict, "clone": dict, "env_kwargs": dict, "hyperparameters": dict, "num_envs": int,
+    "env": str, "algo": str, "lagrange": dict, "clone": dict, "curriculum": dict, "env_kwargs": dict, "hyperparameters": dict, "num_envs": int,
     "timesteps": int, "seed": int, "threads": int,
 }  # fmt: skip
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observations) -> actions

@@ -82,9 +82,9 @@ class Solids:
         self.rows[block, index, R_VELOCITY : R_VELOCITY + 3, lane] = now
         self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 
-    def end_step(self) -> None:
-        """Colliders have reached their targets: each goes on with its velocity for afterwards."""
-        self.rows[:, :, R_VELOCITY : R_VELOCITY + 3] = self.rows[:, :, R_AFTER : R_AFTER + 3]
+    def end_step(self, blocks: Any = slice(None)) -> None:
+        """Colliders of these blocks have reached their targets: each goes on with its velocity for afterwards."""
+        self.rows[blocks, :, R_VELOCITY : R_VELOCITY + 3] = self.rows[blocks, :, R_AFTER : R_AFTER + 3]
 
     def positions(self) -> NDArray:
         """Position of each collider [m]: its center, or a point of a plane, (num_envs, colliders, 3)."""
