@@ -28,10 +28,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from bits_scenes import Digest, Row, core
+from bits_scenes import Row, core
 from tqdm import tqdm
 
 from clothgym.lab.bench import machine
+from clothgym.lab.digests import Digest
 from clothgym.registration import ENVIRONMENTS
 
 ENVS, STEPS, LATER = 20, 30, 40  # environments of an id, steps of a row, and how many go before the later row

@@ -1,8 +1,7 @@
-"""The scenes of ``bits.py`` that are no environments, and digests of what happens in them."""
+"""The scenes of ``bits.py`` that are no environments."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -11,39 +10,12 @@ from typing import Any
 import numpy as np
 
 from clothgym import INTEGRATORS, Box, Capsule, ClothMesh, MeshCollider, Plane, Simulation, Sphere, disc, grid
+from clothgym.lab.digests import Digest
 
 Row = dict[str, Any]
 # of a control step, stable on the sheets below
 SUBSTEPS = {"explicit_euler": 400, "implicit_euler": 10, "projective_dynamics": 20, "pbd": 5, "xpbd": 60}
 BENDING = ("springs", "hinge", "quadratic")
-
-
-class Digest:
-    """Of all that is added, by part."""
-
-    def __init__(self) -> None:
-        self.hashes: dict[str, Any] = {}
-
-    def add(self, **parts: Any) -> None:
-        for part, value in parts.items():
-            _feed(self.hashes.setdefault(part, hashlib.sha256()), value)
-
-    def row(self) -> Row:
-        parts = {part: made.hexdigest()[:8] for part, made in self.hashes.items()}
-        return {"digest": hashlib.sha256("".join(parts.values()).encode()).hexdigest()[:12], "parts": parts}
-
-
-def _feed(made: Any, value: Any) -> None:
-    """Shapes, types and bytes, so that integers are compared."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, dict):
-        for key in sorted(value):
-            made.update(key.encode())
-            _feed(made, value[key])
-    elif value is not None:
-        array = np.asarray(value)
-        made.update(f"{array.dtype.str} {array.shape}".encode() + array.tobytes())
 
 
 def watch(simulation: Simulation, steps: int, before: Callable[[int], None] = lambda step: None) -> Row:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from clothgym.registration import register
 
 if TYPE_CHECKING:
+    from clothgym import policies as policies
     from clothgym.attachments import Gripper as Gripper
     from clothgym.collisions import Box as Box
     from clothgym.collisions import Capsule as Capsule
@@ -51,6 +52,8 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "policies":
+        return import_module("clothgym.policies")
     if name not in _HOMES:
         raise AttributeError(f"module 'clothgym' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)
@@ -58,7 +61,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*_HOMES, "__version__"])
+    return sorted([*_HOMES, "policies", "__version__"])
 
 
 register()

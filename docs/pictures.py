@@ -188,18 +188,18 @@ def main() -> None:
         draw_contact()
         return
     sys.path.insert(0, str(HERE.parent / "training"))
+    import drawing
     import policies
-    import report
 
     if options.expert is not None:
         env_id, name = options.expert
         expert = policies.named("expert", f"clothgym:{env_id}", 0)
-        report.film(HERE / name, f"clothgym:{env_id}", expert, {}, episodes=2, stride=4)
+        drawing.film(HERE / name, f"clothgym:{env_id}", expert, {}, episodes=2, stride=4)
         return
     folder = Path(options.run[0])
     config = policies.read_config(folder)
     policy = policies.learned(folder, config["env"])
-    report.film(HERE / options.run[1], config["env"], policy, config["env_kwargs"], episodes=3, stride=2)
+    drawing.film(HERE / options.run[1], config["env"], policy, config["env_kwargs"], episodes=3, stride=2)
 
 
 if __name__ == "__main__":

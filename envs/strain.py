@@ -120,14 +120,14 @@ def _account(own, rules, sheet, info, terms, running, failure):
     strain = largest_strain(sheet.summary)
     info.cost = 1.0 if running and strain > rules.threshold else 0.0
     # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
-    cost = info.cost + (rules.acting_steps - own.step if failure != FINE else 0)
-    own.episode_cost += cost
+    info.cost += rules.acting_steps - own.step if failure != FINE else 0
+    own.episode_cost += info.cost
     info.episode_cost = own.episode_cost
     # what it comes from
     info.strain_excess = max(strain - rules.threshold, 0.0)
     info.strain_p95 = own.strain_p95 if sheet.summary[FINITE] > 0 else MOST_STRAIN
     info.tension_left, info.tension_right = own.tension[0], own.tension[1]
-    terms.cost = -rules.cost_penalty * cost
+    terms.cost = -rules.cost_penalty * info.cost
     return terms.cost
 
 
@@ -379,9 +379,9 @@ class ClothStrainEnv(ClothEnv):
     On the way the potential is the share of the way that lies behind the clips: what is left is their mean distance from the next
     way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.  A success is to arrive.
 
-    ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  ``info["episode_cost"]`` adds them
-    up; a failure adds all the steps that were left, or tearing the sheet would be the cheap way out.  ``cost_penalty`` takes that
-    much from the reward for each, for learners that know no costs.
+    ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  In a step that ends with a failure it
+    is larger by all the steps that were left, or tearing the sheet would be the cheap way out.  ``info["episode_cost"]`` is the
+    sum.  ``cost_penalty`` takes that much from the reward for each, for learners that know no costs.
 
     ## Evaluation
     When each clip is within 0.15 L of its place at the goal, or time is up: ``info["is_success"]`` if it has arrived,

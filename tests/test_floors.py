@@ -40,6 +40,7 @@ FLOORS = {
     "clothgym.cli": 8,
     "clothgym.lab": 8,
     "clothgym.playground": 8,
+    "clothgym.policies": 8,
     "clothgym.__main__": 8,
 }
 STRINGS_ONLY = {"clothgym", "clothgym.registration"}

@@ -1,4 +1,4 @@
-"""``settling="at_once"``: the last step in which the agent acts goes on until the sheet has settled; and steps of some environments."""
+"""``settling="at_once"``: the last step of the agent goes on until the sheet has settled; and steps of some environments."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,7 +6,11 @@ import pytest
 
 from clothgym import Gripper, Plane, Simulation, grid
 
-CASES = (("ClothDrape-v0", {}), ("ClothDrapeGripper-v0", {"slip_force": 0.3}), ("ClothFlatten-v0", {"action_mode": "pick_place", "slip_force": 3.0}))
+CASES = (
+    ("ClothDrape-v0", {}),
+    ("ClothDrapeGripper-v0", {"slip_force": 0.3}),
+    ("ClothFlatten-v0", {"action_mode": "pick_place", "slip_force": 3.0}),
+)
 
 
 def ends(env_id, settling, seed, **kwargs):

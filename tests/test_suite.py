@@ -20,7 +20,7 @@ def run_of_drape(tmp_path):
     folder = tmp_path / "learned"
     folder.mkdir()
     (folder / "checkpoint.pt").touch()
-    config = {"env": "ClothDrape-v0", "algo": "ppo", "lagrange": {}, "clone": {}, "env_kwargs": {"physics": "fast"}}
+    config = {"env": "ClothDrape-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {"physics": "fast"}}
     config |= {"hyperparameters": {}, "num_envs": 4, "timesteps": 100, "seed": 0, "threads": 1}
     files.write_json(folder / "config.json", config | {"clothgym": clothgym.__version__})
     return folder

@@ -25,7 +25,7 @@ ClothDrape-v0:
   policy_kwargs: {net_arch: [8], log_std_init: -1.0}
 """
 CONFIG = {
-    "env": "ClothDrape-v0", "algo": "ppo", "lagrange": {}, "clone": {}, "env_kwargs": {}, "hyperparameters": {}, "num_envs": 4,
+    "env": "ClothDrape-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "hyperparameters": {}, "num_envs": 4,
     "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
 }  # fmt: skip
 
@@ -34,7 +34,7 @@ CONFIG = {
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("training")
     (folder / "short.yml").write_text(SHORT)
-    options = ("--hyperparams", folder / "short.yml", "--eval-episodes", 4, "--final-episodes", 6)
+    options = ("--hyperparams", folder / "short.yml", "--evaluations", 2, "--eval-episodes", 4, "--final-episodes", 6)
     done = run("train.py", "--run", folder / "run", *options, cwd=folder)
     assert done.returncode == 0, done.stderr
     shutil.copytree(folder / "run", folder / "fresh")
@@ -48,6 +48,7 @@ def test_a_run_leaves_its_story(trained):
         "config.json",
         "checkpoint.pt",
         "model.zip",
+        "policy.npz",
         "progress.jsonl",
         "evaluation.json",
         "learning_curve.png",
@@ -88,7 +89,7 @@ def test_the_learnt_policy_is_evaluated_beside_the_references(trained):
 # --- what is wrong, and Ctrl+C ---------------------------------------------------------------------------------------------
 
 WRONG = {
-    "train --algo sac": "invalid choice 'sac'",
+    "train --algo dqn": "invalid choice 'dqn'",
     "train --env ClothDrap-v0": "no environment 'ClothDrap-v0'; did you mean 'ClothDrape-v0'?",
     "train --env ClothReach-v0 --algo ppo_lagrange": "has no hyperparameters for 'ClothReach-v0' (there are: ClothStrain-v0",
     "train --hyperparams gone.yml": "--hyperparams gone.yml: there is no such file",
@@ -98,7 +99,7 @@ WRONG = {
     "train --seed -1": "--seed -1: must be from 0",
     "train --env-kwargs {": "'{' is not JSON",
     "evaluate --env ClothReech-v0": "no environment 'ClothReech-v0'; did you mean 'ClothReach-v0'?",
-    "evaluate --policy nothing": "no policy 'nothing' (there are: noop, random, expert, careless, the folder of a training run)",
+    "evaluate --policy nothing": "no policy 'nothing' (there are: noop, random, expert, careless, learned, a file of a policy, the",
     "evaluate --policy noop chance": "no policy 'chance'",
     "evaluate --policy .": "'.' is not the folder of a training run",
     "evaluate --policy careless": "careless: only ClothStrain-v0 has a careless expert",
@@ -174,10 +175,10 @@ def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, ca
             raise KeyboardInterrupt
 
     saved = []
-    monkeypatch.setattr(learning.policies, "save_checkpoint", lambda folder, model: saved.append(folder))
+    monkeypatch.setattr(learning, "save_checkpoint", lambda folder, model: saved.append(folder))
     config = CONFIG | {"num_envs": 2}
     with pytest.raises(SystemExit) as caught, endings.stopped(lambda: ": go on"):
-        learning.train(tmp_path, config, Learner(), 0, 1, 1)
+        learning.train(tmp_path, config, Learner(), 0, 1, 1, 1)
     assert caught.value.code == 130 and saved == [tmp_path]
     assert capsys.readouterr().err.strip() == "stopped: go on"
 
@@ -233,7 +234,8 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
 
     from clothgym.adapters import runs
 
-    state = runs.load_tensors(broken / "best.pt")
+    (broken / "policy.npz").unlink()
+    state = runs.load_tensors(broken / "checkpoint.pt")
     name = next(iter(state["policy"]))
     nan = state["policy"] | {name: state["policy"][name] * torch.nan}
     for other, said in (
@@ -241,11 +243,11 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
         (state | {"policy": nan}, "no finite number"),
         (state | {"num_timesteps": -3}, "fewer than no steps"),
     ):
-        runs.save_tensors(broken / "best.pt", other)
-        with pytest.raises(ValueError, match=f"best.pt' is no checkpoint .*{said}"):
-            runs.learned(broken, "ClothDrape-v0")
+        runs.save_tensors(broken / "checkpoint.pt", other)
+        with pytest.raises(ValueError, match=f"checkpoint.pt' is no checkpoint .*{said}"):
+            runs.load_tensors(broken / "checkpoint.pt")
     config = files.read_json(broken / "config.json", "", "")
-    runs.save_tensors(broken / "best.pt", state)
+    runs.save_tensors(broken / "checkpoint.pt", state)
     for layers in ([16], [8, 8], [10**9]):
         config["hyperparameters"]["policy_kwargs"]["net_arch"] = layers
         files.write_json(broken / "config.json", config)
@@ -254,19 +256,18 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
 
 
 def test_a_resumed_run_says_what_it_drops(broken, trained):
-    """A broken line and one from after the checkpoint, a damaged best policy and a damaged checkpoint."""
+    """A broken line and one from after the checkpoint, and a checkpoint that is gone."""
     _, options = trained
     lines = (broken / "progress.jsonl").read_text().splitlines()
     later = json.dumps(files.checked_in(files.checked_out(json.loads(lines[0])) | {"timesteps": 5000}))
-    (broken / "progress.jsonl").write_text("\n".join([*lines, lines[0].replace("800", "900"), later, lines[0][:30]]))
-    flip(broken / "best.pt")
+    (broken / "progress.jsonl").write_text("\n".join([*lines, lines[1].replace("800", "900"), later, lines[0][:30]]))
     (broken / "checkpoint.pt").rename(broken / "checkpoint_before.pt")
     resumed = run("train.py", "--resume", broken, "--timesteps", 1200, *options[2:], cwd=broken.parent)
     assert resumed.returncode == 0, resumed.stderr
-    assert "best.pt' is no checkpoint (it is damaged" in resumed.stderr and "using the one before it" in resumed.stderr
-    assert [n for n in range(9) if f"line {n} is broken, and is dropped" in resumed.stderr] == [2, 4]
+    assert "using the one before it" in resumed.stderr
+    assert [n for n in range(9) if f"line {n} is broken, and is dropped" in resumed.stderr] == [3, 5]
     kept = [json.loads(line)["timesteps"] for line in (broken / "progress.jsonl").read_text().splitlines()]
-    assert kept == [800, 1200]
+    assert kept == [400, 800, 1200]
     assert not [path for path in broken.rglob("*") if ".part" in path.name or ".new" in path.name]
 
 
@@ -276,7 +277,7 @@ def test_a_run_without_a_checkpoint_begins_anew(scripts, tmp_path, monkeypatch, 
 
     files.write_json(tmp_path / "config.json", CONFIG)
     args = train.Args(resume=tmp_path)
-    monkeypatch.setattr(learning, "build", lambda folder, config, seed: "a new learner")
+    monkeypatch.setattr(learning, "build", lambda folder, config, seed, done: "a new learner")
     assert learning.learner(args.folder, args.config, resume=True) == ("a new learner", 0)
     assert "has no checkpoint yet: beginning anew" in capsys.readouterr().out
 

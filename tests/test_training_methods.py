@@ -20,7 +20,9 @@ ClothStrain-v0:
   n_epochs: 1
   learning_rate: lin_0.0001
   policy_kwargs: {net_arch: [8], log_std_init: 0.0}
-  lagrange: {cost_limit: 0.5, rate: 0.01}
+  cost_limit: 0.5
+  multiplier_rate: 0.01
+  excess_clip: 10.0
 """
 CLONED = """
 ClothReach-v0:
@@ -39,60 +41,6 @@ ClothReach-v0:
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
 
 
-class Learner:
-    """What the callback needs of one."""
-
-    def __init__(self, env):
-        from stable_baselines3.common.logger import Logger
-
-        self.env, self.logger = env, Logger(None, [])
-
-    def get_env(self):
-        return self.env
-
-
-def multiplier_of(folder, env, **kwargs):
-    from lagrange import LagrangeMultiplier
-
-    callback = LagrangeMultiplier(folder, **kwargs)
-    callback.model = Learner(env)
-    callback._on_training_start()
-    return callback
-
-
-def rollout(callback, costs):
-    """One in which episodes with these costs ended, two a step, beside one that goes on."""
-    for pair in costs:
-        callback.locals = {
-            "dones": np.array([True, False, True]),
-            "infos": [{"episode_cost": pair[0]}, {}, {"episode_cost": pair[1]}],
-        }
-        assert callback._on_step()
-    callback._on_rollout_end()
-
-
-def test_the_multiplier_follows_the_excess_of_the_cost_and_is_never_below_zero(scripts, tmp_path):
-    from clothgym.adapters.sb3 import make_sb3_vec_env
-
-    env = make_sb3_vec_env("ClothStrain-v0", 3)
-    callback = multiplier_of(tmp_path, env, cost_limit=2.0, rate=0.1, most=1.5)
-    seen = []
-    # mean costs 4, none, 1, 1.5, 0, 100, 12 and 3: by 0.1 times the excess over 2, counted up to 10, from 0 to 1.5
-    for costs in ([(3, 5), (4, 4)], [], [(0, 2)], [(1, 2)], [(0, 0)], [(80, 120)], [(12, 12)], [(3, 3)], [(0, 0)] * 3):
-        rollout(callback, costs)
-        seen.append(callback.multiplier)
-        assert env.env.cost_penalty == seen[-1] == callback.multiplier
-        assert files.read_json(tmp_path / "multiplier.json", "multiplier", "") == {"multiplier": seen[-1]}
-    assert seen == pytest.approx([0.2, 0.2, 0.1, 0.05, 0.0, 1.0, 1.5, 1.5, 1.3])
-    # another one in the same folder goes on with it, and so do its environments from the first step on
-    other = make_sb3_vec_env("ClothStrain-v0", 3)
-    assert other.env.cost_penalty == 0
-    again = multiplier_of(tmp_path, other, cost_limit=2.0, rate=0.1, start=0.4)
-    assert other.env.cost_penalty == again.multiplier == pytest.approx(1.3)
-    new = multiplier_of(tmp_path / "elsewhere", other, cost_limit=2.0, rate=0.1, start=0.4)
-    assert other.env.cost_penalty == new.multiplier == 0.4
-
-
 def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
     (tmp_path / "short.yml").write_text(CONSTRAINED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 2, "--final-episodes", 3, "--threads", 1)
@@ -100,16 +48,21 @@ def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
     done = run("train.py", *common, "--run", tmp_path / "run", *options, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     # a policy of pure noise costs far more than the excess of 10 that counts: 0.01 times that for each of two rollouts
-    path = tmp_path / "run" / "multiplier.json"
-    assert json.loads(path.read_text())["multiplier"] == pytest.approx(2 * 0.01 * 10)
+    assert multiplier(tmp_path / "run") == pytest.approx(2 * 0.01 * 10)
     assert "cost" in done.stdout and "careless" in done.stdout
     scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert scores["references"]["careless"]["cost"] > 3 > scores["references"]["expert"]["cost"]
     assert json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[-1])["cost"] >= 0
-    files.write_json(path, {"multiplier": 3.0})
     resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 2400, *options[2:6], cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
-    assert json.loads(path.read_text())["multiplier"] == pytest.approx(3.0 + 0.01 * 10)
+    assert multiplier(tmp_path / "run") == pytest.approx(3 * 0.01 * 10)
+
+
+def multiplier(folder):
+    """Of a constrained run's last checkpoint."""
+    from clothgym.adapters.runs import load_last
+
+    return float(load_last(folder)["constraint"]["multiplier"])
 
 
 def test_costs_are_evaluated(tmp_path):
@@ -175,10 +128,10 @@ def test_what_is_done_while_the_sheet_settles_is_not_demonstrated(scripts):
 
 def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts, tmp_path):
     from clone import clone, demonstrations
-    from policies import save_checkpoint
+    from learners import save_checkpoint
     from stable_baselines3 import PPO
 
-    from clothgym.adapters.runs import BEST, learned
+    from clothgym.adapters.runs import learned
     from clothgym.adapters.sb3 import make_sb3_vec_env
 
     env = make_sb3_vec_env("ClothFoldGoal-v0", 4, seed=0)
@@ -195,12 +148,11 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
     # it tells moments apart: a policy that always does the mean of the actions has their variance as its error
     assert error < 0.25 * actions.var(axis=0).mean()
     config = {
-        "env": "ClothFoldGoal-v0", "algo": "bc_ppo", "lagrange": {}, "clone": {}, "env_kwargs": {}, "num_envs": 4, "timesteps": 1,
+        "env": "ClothFoldGoal-v0", "algo": "bc_ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "num_envs": 4, "timesteps": 1,
         "hyperparameters": {"policy_kwargs": kwargs}, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
     }  # fmt: skip
     files.write_json(tmp_path / "config.json", config)
     save_checkpoint(tmp_path, model)
-    save_checkpoint(tmp_path, model, BEST)
     few = {name: part[:7] for name, part in seen.items()}
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 

@@ -34,12 +34,13 @@ class Args:
     """Ids of the environments; several make a suite.  By default ClothDrape-v0, with --suite all of them."""
     suite: bool = False
     """Every policy on every id that it is for: one table, and one JSON file that keeps the rows that are finished."""
-    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,careless,PATH} ...")] = (
+    policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="{noop,random,expert,careless,learned,PATH} ...")] = (
         "noop",
         "random",
         "expert",
     )
-    """Policies: noop, random, expert, careless (of ClothStrain-v0), or the path of a run's folder."""
+    """Policies: noop, random, expert, careless (of ClothStrain-v0); learned, the committed one, or learned:LEARNER; or the path of
+    a run's folder or of a policy.npz."""
     episodes: int = 500
     """Episodes for each policy."""
     seed: int = HELD_OUT
@@ -120,7 +121,7 @@ def score_one(args: Args) -> None:
     # a run is scored on the environment that it was trained on, and so are the references beside it
     kwargs: dict[str, Any] = {}
     for name in args.policy:
-        kwargs |= policies.env_kwargs(name)
+        kwargs |= policies.env_kwargs(name, env_id)
     kwargs |= policies.parsed_kwargs(args.env_kwargs)
     threads = {} if args.threads is None else {"threads": args.threads}
     # what the environment or a checkpoint does not take is reported before anything runs

@@ -1,61 +1,75 @@
-"""How ``train.py`` learns: the learner of a configuration, held-out evaluations on the way, and the final score."""
+"""How ``train.py`` learns: held-out evaluations on the way, checkpoints, and the final score."""
 
 from __future__ import annotations
 
 import json
-import math
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import evaluate
-import lagrange
 import numpy as np
 import policies
 import torch
 from clone import clone, demonstrations, joined
+from drawing import draw_learning_curve, film
 from endings import refused
-from lagrange import LagrangeMultiplier
-from report import draw_learning_curve, film
-from stable_baselines3 import PPO
+from learners import build, environments, exported, load_checkpoint, save_checkpoint
+from policies import Config
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecMonitor
 
 from clothgym import files
-from clothgym.adapters.runs import load_last, load_tensors
-from clothgym.adapters.sb3 import make_sb3_vec_env
+from clothgym.adapters.runs import POLICY, load_last
 from clothgym.checks import number as finite_number
+from clothgym.lab.bench import machine
+from clothgym.lab.digests import digest_of
 
 PROGRESS, MODEL = "progress.jsonl", "model.zip"
-SCORES = ("timesteps", "training_seconds", "success_rate", "normalized_performance", "return")  # in each of its lines
+SCORES = (
+    "timesteps",
+    "training_seconds",
+    "core_seconds",
+    "success_rate",
+    "normalized_performance",
+    "return",
+)  # in each of its lines
 REFERENCE_EPISODES = 100  # of noop, random and the expert, beside which a learned policy is scored
+CHOOSING_EPISODES = 500  # of the last evaluation on the way, by which one of several seeds may be chosen
+FIRST = 100  # of the final episodes, whose successes the exported policy notes, for a test to count them again
+CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints, at most a rollout more
 
 
-class HeldOutEvaluation(BaseCallback):
-    """Every so many rollouts: score the policy on held-out seeds, add a line to progress.jsonl, save a checkpoint.
+class Clock:
+    """Time spent on training: by the wall, and by all cores together [s]; evaluations are left out."""
 
-    done: environment steps of the checkpoint that it goes on from; evaluations after it are dropped.
+    def __init__(self, wall: float = 0.0, cores: float = 0.0) -> None:
+        self.spent = np.array([wall, cores])
+        self.begun: Any = None
+
+    def start(self) -> None:
+        self.begun = np.array([time.perf_counter(), time.process_time()])
+
+    def stop(self) -> None:
+        if self.begun is not None:
+            self.spent, self.begun = self.spent + np.array([time.perf_counter(), time.process_time()]) - self.begun, None
+
+
+class Watch(BaseCallback):
+    """Between rollouts: a checkpoint each minute; and every so many steps a score on held-out seeds, a line in progress.jsonl.
+
+    every: environment steps between two scores.  done: steps of the checkpoint that it goes on from; lines after it are dropped.
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any], every: int, episodes: int, done: int) -> None:
+    def __init__(self, folder: Path, config: Config, every: int, episodes: int, done: int) -> None:
         super().__init__()
         self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
-        self.rollouts = 0
         self.lines = [line for line in read_progress(folder) if line["timesteps"] <= done]
-        ranks = [_rank(line, config) for line in self.lines] if (folder / policies.BEST).exists() else []
-        self.best = max(ranks, default=-math.inf)
-        self.trained_before = self.lines[-1]["training_seconds"] if self.lines else 0.0
-        self.evaluating = 0.0
-        self.started = time.perf_counter()
-
-    @property
-    def training_seconds(self) -> float:
-        """Time spent on training, evaluations left out."""
-        return self.trained_before + time.perf_counter() - self.started - self.evaluating
-
-    def _on_training_start(self) -> None:
-        self.started = time.perf_counter()
+        last = self.lines[-1] if self.lines else {"training_seconds": 0.0, "core_seconds": 0.0, "timesteps": 0}
+        self.clock = Clock(last["training_seconds"], last["core_seconds"])
+        # a clone is scored before it learns on
+        self.next = 0 if config["clone"] and not self.lines else int(last["timesteps"]) + every
+        self.saved = time.perf_counter()
 
     def _on_step(self) -> bool:
         return True
@@ -63,41 +77,43 @@ class HeldOutEvaluation(BaseCallback):
     def _on_rollout_start(self) -> None:
         # OpenMP's idle workers spin: while the environments run, torch must not have any
         torch.set_num_threads(1)
-        if self.rollouts % self.every == 0 and (self.rollouts or self.config["clone"]):
-            self.evaluate()
-        self.rollouts += 1
+        self.clock.stop()
+        if self.num_timesteps >= self.next:
+            self.next = self.num_timesteps + self.every
+            self.evaluate(self.episodes)
+        elif time.perf_counter() - self.saved > CHECKPOINT_SECONDS:
+            self.save()
+        self.clock.start()
 
     def _on_rollout_end(self) -> None:
         torch.set_num_threads(self.config["threads"])
 
-    def evaluate(self) -> None:
-        begun = time.perf_counter()
-        policies.save_checkpoint(self.folder, self.model)
+    def save(self) -> None:
+        save_checkpoint(self.folder, self.model)
+        self.saved = time.perf_counter()
+
+    def evaluate(self, episodes: int) -> None:
+        """Score the policy as it is, and save a checkpoint."""
+        self.save()
 
         def policy(env: Any, observations: Any) -> Any:
             return self.model.predict(observations, deterministic=True)[0]
 
         # the tail of the held-out seeds: the final score's are others
         first = evaluate.HELD_OUT + 1_000_000
-        seeds = list(range(first, first + self.episodes))
-        episodes = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
-        line = {
-            "timesteps": self.num_timesteps,
-            "training_seconds": self.training_seconds - (time.perf_counter() - begun),
-            "success_rate": float(episodes["is_success"].mean()),
-            "normalized_performance": float(episodes["normalized_performance"].mean()),
-            "return": float(episodes["return"].mean()),
-        }
-        if "episode_cost" in episodes:
-            line["cost"] = float(episodes["episode_cost"].mean())
-        if _rank(line, self.config) >= self.best:
-            self.best = _rank(line, self.config)
-            policies.save_checkpoint(self.folder, self.model, policies.BEST)
+        seeds = list(range(first, first + episodes))
+        found = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
+        wall, cores = self.clock.spent
+        line = {"timesteps": self.num_timesteps, "training_seconds": wall, "core_seconds": cores, "episodes": episodes}
+        line |= {"success_rate": float(found["is_success"].mean())}
+        line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
+        if "episode_cost" in found:
+            line["cost"] = float(found["episode_cost"].mean())
         self.lines.append(line)
         files.write(self.folder / PROGRESS, "".join(json.dumps(files.checked_in(one)) + "\n" for one in self.lines))
-        for key in line.keys() - {"timesteps", "training_seconds"}:
+        for key in line.keys() - set(SCORES[:3]):
             self.logger.record(f"held_out/{key}", line[key])
-        self.evaluating += time.perf_counter() - begun
+        self.saved = time.perf_counter()
 
 
 class Curriculum(BaseCallback):
@@ -106,7 +122,7 @@ class Curriculum(BaseCallback):
     steps: environment steps of the first part.
     """
 
-    def __init__(self, config: dict[str, Any], steps: int) -> None:
+    def __init__(self, config: Config, steps: int) -> None:
         super().__init__()
         self.config, self.steps = config, steps
 
@@ -125,45 +141,9 @@ class Curriculum(BaseCallback):
         self.model._last_episode_starts = np.ones(config["num_envs"], bool)
 
 
-def environments(config: dict[str, Any], env_kwargs: dict[str, Any], seed: int) -> VecMonitor:
-    """A batch of a configuration's environments."""
-    return VecMonitor(make_sb3_vec_env(config["env"], config["num_envs"], seed=seed, **env_kwargs))
-
-
 def training_seed(seed: int, done: int, num_envs: int) -> int:
     """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
     return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
-
-
-def build(folder: Path, config: dict[str, Any], seed: int, done: int) -> PPO:
-    """The learner of a configuration, on its own batch of environments; done: environment steps of the run so far."""
-    options = dict(config["hyperparameters"])
-    policy = options.pop("policy")
-    for key in ("learning_rate", "clip_range"):
-        if isinstance(options.get(key), str):
-            options[key] = _linear(options[key])
-    first = config["curriculum"]
-    kwargs = config["env_kwargs"] | (first["env_kwargs"] if first and done < first["n_timesteps"] else {})
-    env = environments(config, kwargs, seed)
-    return PPO(policy, env, seed=seed, device="cpu", tensorboard_log=str(folder / "tensorboard"), **options)
-
-
-def _linear(text: str) -> Any:
-    """rl_zoo3's "lin_0.001": from there to zero over the run."""
-    kind, _, value = text.partition("_")
-    if kind != "lin":
-        raise ValueError(f"hyperparameter {text!r}: a schedule is written lin_VALUE")
-    start = float(value)
-    return lambda remaining: start * remaining
-
-
-def _rank(line: dict[str, float], config: dict[str, Any]) -> float:
-    """What makes an evaluation the best: its success; a constrained learner's cost must first be within its limit, and where
-    costs have a price the return tells."""
-    if config["env_kwargs"].get("cost_penalty"):
-        return line["return"]
-    limit = config["lagrange"].get("cost_limit", math.inf)
-    return line["success_rate"] if line.get("cost", 0.0) <= limit else -line["cost"]
 
 
 def read_progress(folder: Path) -> list[dict[str, float]]:
@@ -182,7 +162,7 @@ def read_progress(folder: Path) -> list[dict[str, float]]:
     return lines
 
 
-def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, int]:
+def learner(folder: Path, config: Config, resume: bool) -> tuple[Any, int]:
     """The learner of a new run, or of one that goes on, and the environment steps that it has done.
 
     Raises:
@@ -192,61 +172,53 @@ def learner(folder: Path, config: dict[str, Any], resume: bool) -> tuple[PPO, in
     done = int(state["num_timesteps"]) if state is not None else 0
     model = build(folder, config, training_seed(config["seed"], done, config["num_envs"]), done)
     if state is not None:
-        policies.load_checkpoint(folder, model, state)
+        load_checkpoint(folder, model, state)
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
-        drop_damaged_best(folder)
     elif resume:
         print(f"{folder} has no checkpoint yet: beginning anew")
     return model, done
 
 
-def drop_damaged_best(folder: Path) -> None:
-    """Remove a best policy that cannot be read, with a word: the next evaluation is the best then."""
-    best = folder / policies.BEST
-    try:
-        load_tensors(best)
-    except FileNotFoundError:
-        return
-    except ValueError as error:
-        best.unlink()
-        print(f"{error}; it is removed, and the best from now on takes its place", file=sys.stderr)
-
-
-def train(folder: Path, config: dict[str, Any], model: PPO, done: int, eval_episodes: int, final_episodes: int) -> None:
+def train(folder: Path, config: Config, model: Any, done: int, eval_episodes: int, evaluations: int, final_episodes: int) -> None:
     """Learn, with held-out evaluations on the way, and score what was learned."""
-    per_rollout = config["num_envs"] * model.n_steps
-    if done == 0:
-        (folder / lagrange.FILE).unlink(missing_ok=True)  # of a run that was interrupted before its first checkpoint
     with refused():
-        watch = HeldOutEvaluation(folder, config, max(1, round(200_000 / per_rollout)), eval_episodes, done)
+        watch = Watch(folder, config, max(1, config["timesteps"] // evaluations), eval_episodes, done)
         callbacks: list[BaseCallback] = [watch]
-        if config["algo"] == "ppo_lagrange":
-            callbacks.append(LagrangeMultiplier(folder, **config["lagrange"]))
     if config["curriculum"] and done < config["curriculum"]["n_timesteps"]:
         callbacks.append(Curriculum(config, config["curriculum"]["n_timesteps"]))
     if config["clone"] and done == 0:
-        watch.trained_before += learn_from_expert(model, config)
-    seconds = watch.trained_before
+        watch.clock.start()
+        learn_from_expert(model, config)
+        watch.clock.stop()
     if config["timesteps"] > done:
         try:
             # learn() counts its steps on top of those done when the counter is not reset
             left = config["timesteps"] - done
             seen = sys.stdout.isatty() and sys.stderr.isatty()
-            model.learn(left, callback=callbacks, progress_bar=seen, reset_num_timesteps=False, tb_log_name="ppo")
+            model.learn(left, callback=callbacks, progress_bar=seen, reset_num_timesteps=False, tb_log_name=config["algo"])
         except KeyboardInterrupt:
-            policies.save_checkpoint(folder, model)
+            save_checkpoint(folder, model)
             raise
-        seconds = watch.training_seconds
-        watch.evaluate()
+        watch.clock.stop()
+    elif not watch.lines:  # a clone alone
+        watch.init_callback(with_logger(model))
     if config["timesteps"] > done or not (folder / MODEL).exists():
+        watch.evaluate(max(eval_episodes, min(CHOOSING_EPISODES, final_episodes)))
         with files.replacing(folder / MODEL) as part:
             model.save(part)
-    finish(folder, config, watch.lines, seconds, final_episodes)
+    finish(folder, config, model, watch, final_episodes)
 
 
-def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
-    """Clone the scripted expert into the policy; the time it took [s]."""
-    begun = time.perf_counter()
+def with_logger(model: Any) -> Any:
+    """A learner that does not learn has none yet."""
+    from stable_baselines3.common.logger import Logger
+
+    model.set_logger(Logger(None, []))
+    return model
+
+
+def learn_from_expert(model: Any, config: Config) -> None:
+    """Clone the scripted expert into the policy."""
     options = dict(config["clone"])
     env: Any = model.env
     episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
@@ -257,26 +229,37 @@ def learn_from_expert(model: PPO, config: dict[str, Any]) -> float:
             samples = joined(samples, demonstrations(env, 1, noise, config["seed"] + number, model))
         error = clone(model, *samples, **options)
         print(f"cloned the expert from {len(samples[1]):,} samples: mean squared error {error:.4f}")
-    return time.perf_counter() - begun
 
 
-def finish(folder: Path, config: dict[str, Any], lines: list[dict[str, float]], seconds: float, episodes: int) -> None:
-    """Final score beside the references, learning curve and film."""
+def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episodes: int) -> None:
+    """Export the policy, score what was exported beside the references, draw learning curve and film."""
+    wall, cores = watch.clock.spent
+    about = {"digest": digest_of(config["env"], config["env_kwargs"]), "timesteps": config["timesteps"], "training_seconds": wall}
+    about |= {"core_seconds": cores, "chosen_by": watch.lines[-1]["success_rate"], "machine": machine()}
+    policy, path = exported(model, config, about), folder / POLICY
+    if policy is not None:
+        policy.save(path)
+    acting = policies.exported(path) if policy is not None else policies.learned(folder, config["env"])
+    names = ["noop", "random", "expert"] + ["careless"] * (config["env"] == "ClothStrain-v0")
     scores = {}
-    names = ["noop", "random", "expert", str(folder)]
-    if config["env"] == "ClothStrain-v0":
-        names.insert(3, "careless")
-    for name in names:
-        policy = policies.named(name, config["env"], evaluate.HELD_OUT)
-        number = episodes if name == str(folder) else min(episodes, REFERENCE_EPISODES)
+    for name in [*names, str(folder)]:
+        act = acting if name == str(folder) else policies.named(name, config["env"], evaluate.HELD_OUT)
+        number = final_episodes if name == str(folder) else min(final_episodes, REFERENCE_EPISODES)
         seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + number))
         try:
-            scores[name] = evaluate.score(evaluate.run_episodes(config["env"], policy, seeds, **config["env_kwargs"]))
+            episodes = evaluate.run_episodes(config["env"], act, seeds, **config["env_kwargs"])
+            scores[name] = evaluate.score(episodes)
         except NotImplementedError as missing:  # with these arguments the task has no scripted expert
             print(missing)
     print(f"{config['env']}, held-out episodes\n{evaluate.table(scores)}")
-    learned = scores[str(folder)] | {"env": config["env"], "seed": config["seed"], "training_seconds": seconds}
-    evaluate.write_json(folder / "evaluation.json", learned | {"timesteps": config["timesteps"], "references": scores})
-    draw_learning_curve(folder, lines, {name: scores[name]["success_rate"] for name in ("noop", "expert") if name in scores})
-    film(folder / "policy.gif", config["env"], policies.learned(folder, config["env"]), config["env_kwargs"])
-    print(f"trained for {seconds / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
+    own = scores.pop(str(folder)) | {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": config["algo"]}
+    own |= {"seed": config["seed"], "references": scores} | about
+    evaluate.write_json(folder / "evaluation.json", own)
+    if policy is not None:
+        # the file says what it scores
+        policy.about |= {name: own[name] for name in ("success_rate", "normalized_performance", "episodes")}
+        policy.about["first_successes"] = int(episodes["is_success"][:FIRST].sum())
+        policy.save(path)
+    draw_learning_curve(folder, watch.lines, {name: scores[name]["success_rate"] for name in ("noop", "expert") if name in scores})
+    film(folder / "policy.gif", config["env"], acting, config["env_kwargs"])
+    print(f"trained for {wall / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")

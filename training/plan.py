@@ -255,14 +255,17 @@ def episode(planner: Planner, seed: int) -> dict[str, Any]:
 
 def summary(row: suite.Row, results: list[dict[str, Any]]) -> suite.Row:
     """A row of the suite from its episodes, which it keeps."""
+    from clothgym.lab.digests import digest_of  # imported here: flags are checked before numba is loaded
+
     whole = score({name: np.array([one[name] for one in results]) for name in results[0]})
     sums = {name: sum(one[name] for one in results) for name in ("model_steps", "mispredicted", "seconds")}
-    return row | whole | sums | {"date": suite.today(), "by_episode": results}
+    digest = digest_of(row["env"], row["env_kwargs"])
+    return row | whole | sums | {"date": suite.today(), "digest": digest, "by_episode": results}
 
 
 def draw(path: Path, env_id: str, env_kwargs: dict[str, Any], seed: int, taken: list[list[NDArray]]) -> None:
     """A film of episodes side by side, from their actions."""
-    import report  # imported here: it draws, and planning does not
+    import drawing  # imported here: it draws, and planning does not
 
     steps = iter(range(max(map(len, taken))))
 
@@ -270,7 +273,7 @@ def draw(path: Path, env_id: str, env_kwargs: dict[str, Any], seed: int, taken: 
         step = next(steps)
         return np.stack([actions[min(step, len(actions) - 1)] for actions in taken])
 
-    report.film(path, env_id, policy, env_kwargs, episodes=len(taken), seed=seed)
+    drawing.film(path, env_id, policy, env_kwargs, episodes=len(taken), seed=seed)
     print(f"film: {path}")
 
 

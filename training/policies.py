@@ -1,26 +1,25 @@
-"""Policies to evaluate, and checkpoints that can be loaded without unpickling anything.
+"""Policies to evaluate, by their names: scripted ones, those that are committed, runs, and files that runs have exported.
 
-A checkpoint is a run's folder: ``config.json`` says how to build the learner, ``checkpoint.pt`` holds tensors and numbers only
-and is read with ``weights_only=True``.
+A run is a folder: ``config.json`` says how to build the learner, ``checkpoint.pt`` holds tensors and numbers only and is read with
+``weights_only=True``, ``policy.npz`` is what the finished run has exported.
 """
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym import files
-from clothgym.adapters.runs import BEST, CHECKPOINT, CONFIG, Policy, has_checkpoint, learned, read_config, save_tensors
+import clothgym.policies as committed
+from clothgym.adapters.runs import CHECKPOINT, CONFIG, OFF_POLICY, Policy, exported, has_checkpoint, learned, read_config
 from clothgym.registration import ACTORS, actor_named
 
-if TYPE_CHECKING:
-    from stable_baselines3 import PPO
-
-__all__ = ["BEST", "CHECKPOINT", "CONFIG", "Policy", "has_checkpoint", "learned", "read_config"]
+Config = dict[str, Any]
+__all__ = ["CHECKPOINT", "CONFIG", "OFF_POLICY", "Config", "Policy", "exported", "has_checkpoint", "learned", "read_config"]
+COMMITTED = "learned"  # the name of the committed policy, of a certain learner with its name after a colon
 
 
 def noop(env: Any, observations: NDArray) -> NDArray:
@@ -44,7 +43,7 @@ SCRIPTED: dict[str, Policy] = {"noop": noop, "expert": expert, "careless": carel
 
 
 def named(name: str, env_id: str, seed: int) -> Policy:
-    """The policy called noop, random, expert or careless, or the learned one in the run's folder of that path.
+    """The policy called noop, random, expert or careless; "learned", or "learned:ppo", a committed one; or that of a path.
 
     Raises:
         ValueError: no such policy, or a checkpoint of another environment or version.
@@ -54,44 +53,66 @@ def named(name: str, env_id: str, seed: int) -> Policy:
         return SCRIPTED[name]
     if name == "random":
         return random(seed)
+    if is_committed(name):
+        policy = _committed(name, env_id)
+        return lambda env, observations: policy(observations)
+    if name.endswith(".npz"):
+        return exported(Path(name))
     return learned(Path(name), env_id)
 
 
+def is_committed(name: str) -> bool:
+    """Whether a name is of a policy that is committed."""
+    return name.partition(":")[0] == COMMITTED and not Path(name).exists()
+
+
+def _committed(name: str, env_id: str) -> committed.Policy:
+    return committed.load(env_id, name.partition(":")[2] or None)
+
+
 def checked(name: str, env_id: str) -> None:
-    """A policy's name or a run's folder, for that environment; torch is not needed to say no.
+    """A policy's name or path, for that environment; torch is not needed to say no.
 
     Raises:
-        ValueError: no such policy, or a checkpoint of another environment or version.
+        ValueError: no such policy, or one of another environment or version.
     """
     if name == "careless" and env_id != "ClothStrain-v0":
         raise ValueError(f"careless: only ClothStrain-v0 has a careless expert, not {env_id}")
-    if actor_named(name, "careless") not in (*ACTORS, "careless"):
-        try:
-            read_config(Path(name), env_id)
-        except OSError as error:
-            raise ValueError(str(error)) from error
+    if name in (*ACTORS, "careless"):
+        return
+    found = _about(name, env_id)
+    if found["env"] != env_id:
+        raise ValueError(f"{name!r} was trained on {found['env']}, not on {env_id}")
 
 
 def is_for(name: str, env_id: str) -> bool:
-    """Whether a policy can act in an environment: a run in that which it was trained on.
+    """Whether a policy can act in an environment: one that was learned in that which it was trained on.
 
     Raises:
-        ValueError: no such policy, or a checkpoint of another version.
+        ValueError: no such policy, or one of another version.
     """
-    if name == "careless":
-        return env_id == "ClothStrain-v0"
-    if name in ACTORS:
-        return True
-    actor_named(name, "careless")
+    if name in (*ACTORS, "careless"):
+        return name != "careless" or env_id == "ClothStrain-v0"
+    if is_committed(name):
+        learners, learner = committed.available().get(env_id, []), name.partition(":")[2]
+        return learner in learners if learner else bool(learners)
+    return _about(name, env_id)["env"] == env_id
+
+
+def env_kwargs(name: str, env_id: str) -> dict[str, Any]:
+    """Keyword arguments of the environment that a learned policy was trained on; none for the others."""
+    return {} if name in (*ACTORS, "careless") else dict(_about(name, env_id)["env_kwargs"])
+
+
+def _about(name: str, env_id: str) -> dict[str, Any]:
+    """What a learned policy, by name or path, says of itself: its environment and the keyword arguments."""
+    if is_committed(name):
+        return _committed(name, env_id).about
+    actor_named(name, "careless", f"{COMMITTED}, a file of a policy")
     try:
-        return read_config(Path(name))["env"] == env_id
+        return committed.read(name).about if name.endswith(".npz") else read_config(Path(name))
     except OSError as error:
         raise ValueError(str(error)) from error
-
-
-def env_kwargs(name: str) -> dict[str, Any]:
-    """Keyword arguments of the environment that a learned policy was trained on; none for the others."""
-    return {} if name in (*ACTORS, "careless") else dict(read_config(Path(name))["env_kwargs"])
 
 
 def parsed_kwargs(text: str) -> dict[str, Any]:
@@ -107,27 +128,3 @@ def parsed_kwargs(text: str) -> dict[str, Any]:
     if not isinstance(kwargs, dict):
         raise ValueError(f'--env-kwargs {text!r}: must be a JSON object, for instance \'{{"integrator": "xpbd"}}\'')
     return kwargs
-
-
-def save_checkpoint(folder: Path, model: PPO, name: str = CHECKPOINT) -> None:
-    """Write the learner's tensors; the checkpoint before is kept, whatever happens."""
-    state = {
-        "policy": model.policy.state_dict(),
-        "optimizer": model.policy.optimizer.state_dict(),
-        "num_timesteps": model.num_timesteps,
-        "num_updates": model._n_updates,
-    }
-    save_tensors(folder / name, state)
-
-
-def load_checkpoint(folder: Path, model: PPO, state: dict[str, Any]) -> None:
-    """Put a run's tensors and counters into a learner built from its configuration.
-
-    Raises:
-        ValueError: they are of another network than its configuration describes.
-    """
-    with files.naming(folder, "run whose checkpoint is of the network in its configuration", "train again"):
-        model.policy.load_state_dict(state["policy"])
-        model.policy.optimizer.load_state_dict(state["optimizer"])
-    model.num_timesteps = int(state["num_timesteps"])
-    model._n_updates = int(state["num_updates"])

@@ -1,73 +1,337 @@
-"""The pictures that a run leaves: a learning curve, and a film of what was learned."""
+"""Every table of scores in the README and in docs/, and every learning curve, from committed results.
+
+    python training/report.py                                # write them anew
+    python training/report.py --check                        # only say what is stale, with status 1
+    python training/report.py --digests                      # first note what each environment does now: some minutes
+    python training/report.py --add runs/ClothDrape-v0_*     # first take these runs' results, and the policies that are chosen
+
+A result carries the digest of what its environment did when it was made (``clothgym.lab.digests``); the present ones are in
+benchmarks/results/digests.json.  A row whose digest is another is shown as old, until it is made again.
+"""
 
 from __future__ import annotations
 
 import io
+import json
+import re
+import shutil
+import statistics
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import evaluate
-import gymnasium as gym
-import matplotlib
 import numpy as np
-import policies
+import suite
+import tyro
+from endings import refused
 
 from clothgym import files
-from clothgym.render import write_video
+from clothgym.adapters.runs import POLICY
+from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
+from clothgym.registration import ENVIRONMENTS
 
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-
+ROOT = Path(__file__).parent.parent
+RESULTS, CURVES = ROOT / "benchmarks" / "results", ROOT / "docs" / "curves"
+RUNS, DIGESTS, SUITE = RESULTS / "training", RESULTS / "digests.json", RESULTS / "suite.json"
+COMMITTED = ROOT / "clothgym" / "policies"
+KEPT = ("config.json", "evaluation.json", "progress.jsonl")
+PAGES = ("README.md", "docs/results.md")
+ADVICE = "make it with  python training/report.py --digests"
+LABELS = {
+    "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
+    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
+}  # fmt: skip
 INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
+Result = dict[str, Any]
 
 
-def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references: dict[str, float]) -> None:
-    """Held-out success and performance over training time, with the references as level lines; below it the cost, if any."""
-    minutes = [line["training_seconds"] / 60 for line in lines]
-    costly = all("cost" in line for line in lines) and bool(lines)
-    figure, panels = plt.subplots(
-        1 + costly, 1, figsize=(6.4, 5.4 if costly else 3.8), layout="constrained", sharex=True, squeeze=False
-    )
-    axes = panels[0, 0]
-    axes.plot(minutes, [line["success_rate"] for line in lines], color=ACCENT, marker="o", ms=3, label="success rate")
-    axes.plot(minutes, [line["normalized_performance"] for line in lines], color=INK, lw=1, label="normalized performance")
-    for name, level in references.items():
-        axes.axhline(level, color=QUIET, lw=0.8, ls="--")
-        axes.annotate(name, (1.0, level), xycoords=("axes fraction", "data"), ha="right", va="bottom", color=QUIET, fontsize=8)
-    axes.set(ylabel="held-out episodes", ylim=(-0.02, 1.02), title=folder.name)
-    axes.legend(frameon=False, loc="center right")
-    if costly:
-        panels[1, 0].plot(minutes, [line["cost"] for line in lines], color=ACCENT, marker="o", ms=3)
-        panels[1, 0].set(ylabel="mean cost of an episode", yscale="symlog", ylim=(0, None))
-    panels[-1, 0].set(xlabel="training time [minutes]")
-    for panel in panels[:, 0]:
+@dataclass
+class Args:
+    """What to do before the pages are written, if anything."""
+
+    add: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN ...")] = ()
+    """Folders of finished runs whose results are to be committed."""
+    digests: bool = False
+    """Note what each environment does now."""
+    check: bool = False
+    """Write nothing; say which pages are stale."""
+
+
+# --- results ------------------------------------------------------------------------------------------------------------------
+
+
+def read_digests(path: Path = DIGESTS) -> dict[str, str]:
+    """What each environment does now, by ``digests.name_of``."""
+    return files.read_json(path, "list of digests", ADVICE)["digests"]
+
+
+def is_present(row: Result, digests: dict[str, str]) -> bool:
+    """Whether a result is of the code at hand."""
+    return row.get("digest") == digests.get(name_of(row["env"], row["env_kwargs"]), "unknown")
+
+
+def learned(folder: Path = RUNS) -> list[Result]:
+    """The results of all runs that are committed."""
+    return [json.loads(path.read_text()) | {"run": path.parent.name} for path in sorted(folder.glob("*/evaluation.json"))]
+
+
+def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
+    """Results that differ in their seed only, by environment and by what was learned there and how."""
+    found: dict[tuple[str, str], list[Result]] = {}
+    for one in results:
+        more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
+        label = ", ".join([LABELS[one["learner"]], *(f"`{name}={value!r}`" for name, value in more.items())])
+        found.setdefault((one["env"], label), []).append(one)
+    return found
+
+
+def interquartile_mean(values: Iterable[float]) -> float:
+    """Mean without the lowest and the highest quarter, as rliable has it (Agarwal et al. 2021); of three values that of all."""
+    from scipy.stats import trim_mean
+
+    return float(trim_mean(list(values), 0.25))
+
+
+def bootstrap(values: list[float], draws: int = 2000) -> tuple[float, float]:
+    """95 % interval of the interquartile mean over seeds, by drawing them anew (percentiles)."""
+    rng = np.random.default_rng(0)
+    means = [interquartile_mean(rng.choice(values, len(values))) for _ in range(draws)]
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def add(folders: Iterable[Path]) -> None:
+    """Copy what is committed of runs; of each id and learner the policy of the seed whose last evaluation on the way was best."""
+    for folder in folders:
+        if not (folder / "evaluation.json").is_file():
+            raise ValueError(f"{str(folder)!r} holds no finished run, it lacks evaluation.json: finish it with --resume {folder}")
+        target = RUNS / folder.resolve().name
+        target.mkdir(parents=True, exist_ok=True)
+        for name in KEPT:
+            shutil.copyfile(folder / name, target / name)
+        if (folder / POLICY).exists():
+            shutil.copyfile(folder / POLICY, target / POLICY)
+    choose()
+
+
+def choose() -> None:
+    """Of each id and learner the policy of the seed that was best on the episodes for choosing; the others are not kept."""
+    from clothgym import policies
+
+    for path in sorted(RUNS.glob(f"*/{POLICY}")):
+        about = policies.read(path).about
+        kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
+        if not kept.exists() or policies.read(kept).about["chosen_by"] <= about["chosen_by"]:
+            shutil.copyfile(path, kept)
+        path.unlink()
+
+
+# --- tables -------------------------------------------------------------------------------------------------------------------
+
+
+def _old(present: bool) -> str:
+    return "" if present else " **(old)**"
+
+
+def _counts(rows: list[Result]) -> str:
+    return " / ".join(str(sum(row[name] for row in rows)) for name in ("torn", "diverged"))
+
+
+def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
+    """What a table says of doing nothing, chance, or the expert."""
+    low, high = row["success_rate_ci95"]
+    return {
+        "policy": f"`{row['policy']}`{_old(is_present(row, digests))}",
+        "seeds": "",
+        "success": f"{row['success_rate']:.3f} [{low:.3f}, {high:.3f}]",
+        "median": "",
+        "worst": "",
+        "performance": f"{row['normalized_performance']:.3f}",
+        "cost": f"{row['cost']:.2f}" if row.get("cost") is not None else "",
+        "safe": f"{row['safe_success_rate']:.3f}" if row.get("cost") is not None else "",
+        "torn / diverged": _counts([row]),
+        "steps": "",
+        "training": "",
+    }
+
+
+def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict[str, str]:
+    """What a table says of a learner, over its seeds."""
+    rates = [row["success_rate"] for row in rows]
+    low, high = bootstrap(rates) if len(rows) > 1 else rows[0]["success_rate_ci95"]
+    wall, cores = (statistics.median(row[name] / 60 for row in rows) for name in ("training_seconds", "core_seconds"))
+    steps = statistics.median(row["timesteps"] for row in rows)
+    return {
+        "policy": f"{label}{_old(all(is_present(row, digests) for row in rows))}",
+        "seeds": str(len(rows)),
+        "success": f"{interquartile_mean(rates):.3f} [{low:.3f}, {high:.3f}]",
+        "median": f"{statistics.median(rates):.3f}",
+        "worst": f"{min(rates):.3f}",
+        "performance": f"{statistics.median(row['normalized_performance'] for row in rows):.3f}",
+        "cost": f"{statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else "",
+        "safe": f"{statistics.median(row['safe_success_rate'] for row in rows):.3f}" if "cost" in rows[0] else "",
+        "torn / diverged": _counts(rows),
+        "steps": f"{steps / 1e6:.2f} M",
+        "training": f"{wall:.1f} min, {cores:.1f} of one core",
+    }
+
+
+def markdown(rows: list[dict[str, str]]) -> str:
+    """A table; columns in which nothing stands are left out."""
+    columns = [name for name in rows[0] if any(row[name] for row in rows)]
+    lines = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+    return "\n".join([*lines, *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows)])
+
+
+def table_of(env_id: str, results: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
+    """The scores of one environment: scripted policies, and what was learned."""
+    order = {"noop": 0, "random": 1, "careless": 2, "expert": 3}
+    own = [row for row in scripted if row["env"] == env_id and row["policy"] in order and not row["env_kwargs"]]
+    rows = [scripted_row(row, digests) for row in sorted(own, key=lambda row: order[row["policy"]])]
+    rows += [learned_row(label, group, digests) for (env, label), group in groups(results).items() if env == env_id]
+    return markdown(rows) if rows else "None yet."
+
+
+def best_of(env_id: str, results: list[Result]) -> str:
+    """How an environment is learned best, in a few words."""
+    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
+    if not found:
+        return "–"
+    label, rows = max(found, key=lambda one: interquartile_mean(row["success_rate"] for row in one[1]))
+    minutes = statistics.median(row["training_seconds"] for row in rows) / 60
+    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {minutes:.0f} min"
+
+
+# --- curves -------------------------------------------------------------------------------------------------------------------
+
+
+def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
+    """Held-out success of every seed over steps and over minutes; a color for each learner, and the median of its seeds bold."""
+    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
+    if not found:
+        return None
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained", sharey=True)
+    for color, (label, rows) in zip([ACCENT, "#00798c", "#edae49", INK, QUIET], found):
+        curves = [progress(row["run"]) for row in rows]
+        for panel, key, unit in zip(panels, ("timesteps", "training_seconds"), (1e6, 60)):
+            # (evaluations, 2): where and how good; seeds of one learner are evaluated at the same steps
+            points = [np.array([[line[key] / unit, line["success_rate"]] for line in curve]) for curve in curves]
+            for curve in points:
+                panel.plot(*curve.T, color=color, lw=0.8, alpha=0.5)
+            common = min(map(len, points))
+            middle = np.median([curve[:common] for curve in points], axis=0)
+            panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=label.replace("`", ""))
+    for panel, text in zip(panels, ("environment steps [millions]", "training time [minutes]")):
+        panel.set(xlabel=text, ylim=(-0.02, 1.02), xlim=(0, None))
         panel.spines[["top", "right"]].set_visible(False)
+    panels[0].set(ylabel="success, held-out episodes", title=env_id)
+    panels[1].legend(frameon=False, fontsize=8, loc="lower right")
     picture = io.BytesIO()
-    figure.savefig(picture, dpi=150)
+    # without the version in it the same curves make the same file
+    figure.savefig(picture, dpi=110, metadata={"Software": None})
     plt.close(figure)
-    files.write(folder / "learning_curve.png", picture.getvalue())
+    return picture.getvalue()
 
 
-def film(
-    path: Path,
-    env_id: str,
-    policy: policies.Policy,
-    env_kwargs: dict[str, Any],
-    episodes: int = 4,
-    stride: int = 1,
-    seed: int = evaluate.HELD_OUT,
-) -> None:
-    """Some episodes, by default held-out ones, side by side, each one's end standing still; every so many frames of them."""
-    env = gym.make_vec(env_id, num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
-    observations, _ = env.reset(seed=seed)
-    frames, running = [], np.ones(episodes, bool)
-    still = [np.asarray(frame) for frame in env.render()]
-    while running.any():
-        frames.append(np.concatenate(still, axis=1))
-        observations, _, terminated, truncated, _ = env.step(policy(env, observations))
-        fresh = env.render()
-        still = [new if on else old for new, old, on in zip(fresh, still, running)]
-        running &= ~(terminated | truncated)
-    frames += [np.concatenate(still, axis=1)] * 15
-    env.close()
-    write_video(path, frames[::stride], fps=env.metadata["render_fps"] / stride)
+def progress(run: str) -> list[dict[str, float]]:
+    """The evaluations of a committed run on its way."""
+    return [json.loads(line) for line in (RUNS / run / "progress.jsonl").read_text().splitlines()]
+
+
+# --- pages --------------------------------------------------------------------------------------------------------------------
+
+
+def sections(results: list[Result], scripted: list[Result], digests: dict[str, str]) -> dict[str, str]:
+    """The text between ``<!-- NAME -->`` and ``<!-- end -->``, by name."""
+    made = {f"scores of {env_id}": table_of(env_id, results, scripted, digests) for env_id in ENVIRONMENTS}
+    for name in made:
+        if (CURVES / f"{name.split()[-1]}.png").exists():
+            made[name] += f"\n\n![Held-out success while learning](curves/{name.split()[-1]}.png)"
+    return made | {"environments": environments(results)}
+
+
+GOALS = (
+    ("ClothReach-v0", "swing the free corner of a hanging sheet to a goal and bring it to rest there"),
+    ("ClothDrape-v0", "lay a hanging sheet over a sphere, a box or a post, and let go"),
+    ("ClothDrapeGripper-v0", "pick a sheet up from the floor, flat or rumpled, with two grippers; drape it"),
+    ("ClothFlatten-v0", "spread a crumpled sheet"),
+    ("ClothFling-v0", "swing a rumpled sheet, and lay it flat in three throws"),
+    ("ClothFold-v0", "fold a sheet in half, over its diagonal, or twice"),
+    ("ClothFoldGoal-v0", "bring corners to the goals of a fold, for HER"),
+    ("ClothHang-v0", "hang a sheet over a rail"),
+    ("ClothHook-v0", "hang a sheet by its hole on a hook"),
+    ("ClothStrain-v0", "carry a stretchy sheet past a post, in gusts, with its strain below 10 %"),
+)
+
+
+def environments(results: list[Result]) -> str:
+    """The README's table: what there is, and how it is learned."""
+    lines = ["| id | goal | learned by |", "| --- | --- | --- |"]
+    for env_id, goal in GOALS:
+        hard = env_id.replace("-v0", "-Hard-v0")
+        names = ", ".join(f"[`{name}`](docs/tasks/{name}.md)" for name in (env_id, hard) if name in ENVIRONMENTS)
+        lines.append(f"| {names} | {goal} | {best_of(env_id, results)} |")
+    return "\n".join(lines)
+
+
+def filled(text: str, made: dict[str, str]) -> str:
+    """A page with its sections written anew.
+
+    Raises:
+        ValueError: a section that nothing makes.
+    """
+
+    def one(match: re.Match[str]) -> str:
+        if match[1] not in made:
+            raise ValueError(f"no section {match[1]!r} (there are: {', '.join(made)})")
+        return f"<!-- {match[1]} -->\n{made[match[1]]}\n<!-- end -->"
+
+    return re.sub(r"<!-- ([\w\- ]+) -->\n.*?\n?<!-- end -->", one, text, flags=re.DOTALL)
+
+
+def pages() -> dict[Path, str]:
+    """Every page as it is to be."""
+    digests, scripted = read_digests(), suite.read(SUITE)
+    made = sections(learned(), scripted, digests)
+    return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
+
+
+def note_digests() -> None:
+    """Write what each environment does now, as it is and as committed results have it."""
+    wanted = {name_of(env_id, {}): (env_id, {}) for env_id in ENVIRONMENTS}
+    wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in learned()}
+    digests = {}
+    for name, (env_id, kwargs) in wanted.items():
+        digests[name] = digest_of(env_id, kwargs)
+        print(name, digests[name], flush=True)
+    files.write_json(DIGESTS, {"digests": digests})
+
+
+def main(args: Args) -> None:
+    with refused():
+        add(args.add)
+        if args.digests:
+            note_digests()
+        if not args.check:
+            CURVES.mkdir(exist_ok=True)
+            for env_id in ENVIRONMENTS:
+                picture = draw_curves(env_id, learned())
+                if picture is not None:
+                    files.write(CURVES / f"{env_id}.png", picture)
+        stale = [path for path, text in pages().items() if path.read_text() != text]
+        for path in stale:
+            print(f"{path.relative_to(ROOT)}: {'stale' if args.check else 'written'}")
+            if not args.check:
+                path.write_text(pages()[path])
+    if args.check and stale:
+        raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -49,6 +49,15 @@ def load(path: Path | None) -> list[Row]:
     return rows
 
 
+def read(path: Path) -> list[Row]:
+    """The rows of a file, of whatever machine; none where there is no file.
+
+    Raises:
+        ValueError: it is another file, or damaged.
+    """
+    return files.read_json(path, "file of a suite's scores", ADVICE)["rows"] if path.exists() else []
+
+
 def keep(path: Path | None, row: Row) -> None:
     """Put a row into a file, in the place of one of the same identity."""
     if path is None:
@@ -99,7 +108,7 @@ def rows_of(ids: Iterable[str], names: Iterable[str], seed: int, env_kwargs: Row
         if not fitting:
             raise ValueError(f"policy {name!r} is for none of {', '.join(ids)}: name one that is, or its environment")
         for env_id in fitting:
-            kwargs = policies.env_kwargs(name) | env_kwargs
+            kwargs = policies.env_kwargs(name, env_id) | env_kwargs
             wanted.append({"env": env_id, "policy": name, "seed": seed, "env_kwargs": kwargs, "settings": {}})
     return sorted(wanted, key=lambda row: ids.index(row["env"]))
 
@@ -115,6 +124,8 @@ def run(
         chosen = [policies.named(row["policy"], row["env"], row["seed"]) for row in wanted]
         for row in wanted:
             gym.make_vec(row["env"], num_envs=1, **row["env_kwargs"], **more).close()
+    from clothgym.lab.digests import digest_of  # imported here: flags are checked before numba is loaded
+
     rows = []
     for number, (row, policy) in enumerate(zip(wanted, chosen), 1):
         what = f"{number} of {len(wanted)}: {row['env']} {row['policy']}"
@@ -127,7 +138,8 @@ def run(
         warm(row["env"], policy, kwargs)
         begun = time.perf_counter()
         result = score(run_episodes(row["env"], policy, list(range(row["seed"], row["seed"] + episodes)), **kwargs))
-        rows.append(row | result | {"seconds": time.perf_counter() - begun, "date": today()})
+        digest = digest_of(row["env"], row["env_kwargs"])
+        rows.append(row | result | {"seconds": time.perf_counter() - begun, "date": today(), "digest": digest})
         keep(path, rows[-1])
         say(f"{what}: score {result['normalized_performance']:.3f}, {rows[-1]['seconds']:.1f} s")
     return rows

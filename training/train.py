@@ -6,10 +6,10 @@
     python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored again
 
-The folder holds: config.json, checkpoint.pt (the last), checkpoint_before.pt and best.pt (by held-out success), which hold tensors
-only, model.zip (Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line),
-evaluation.json (the final score, of best.pt), learning_curve.png, policy.gif, and the TensorBoard log.  Hyperparameters are read
-from hyperparams/ALGO.yml, in the format of rl_zoo3.
+The folder holds: config.json, checkpoint.pt, one a minute, and checkpoint_before.pt, which hold tensors only, model.zip
+(Stable-Baselines3's own format, for ``PPO.load``), progress.jsonl (one held-out evaluation a line), policy.npz (the last policy,
+for ``clothgym.policies.read``), evaluation.json (its score), learning_curve.png, policy.gif, and the TensorBoard log.
+Hyperparameters are read from hyperparams/ALGO.yml, in the format of rl_zoo3.
 """
 
 from __future__ import annotations
@@ -40,8 +40,9 @@ class Args:
     """Id of the environment."""
     seed: int = 0
     """Seed of the learner and of its environments."""
-    algo: Literal["ppo", "ppo_penalty", "ppo_lagrange", "bc_ppo"] = "ppo"
-    """PPO; with a fixed price, or a Lagrange multiplier, on cost; or after a clone of the scripted expert."""
+    algo: Literal["ppo", "ppo_penalty", "ppo_lagrange", "bc", "bc_ppo", "sac", "her"] = "ppo"
+    """PPO; with a fixed price, or a Lagrange multiplier, on cost; a clone of the scripted expert, alone or before PPO; SAC, or SAC
+    with hindsight (HER) on a task of goals."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
     run: Path | None = None
@@ -52,8 +53,10 @@ class Args:
     """Hyperparameters by environment id, in rl_zoo3's format; hyperparams/ALGO.yml by default."""
     env_kwargs: str = "{}"
     """Keyword arguments of the environment, as JSON: '{"integrator": "xpbd"}'; over those of the hyperparameter file."""
+    evaluations: int = 6
+    """Evaluations on the way."""
     eval_episodes: int = 200
-    """Held-out episodes of each evaluation on the way."""
+    """Held-out episodes of each of them."""
     final_episodes: int = 500
     """Held-out episodes of the final evaluation."""
     threads: int = 1
@@ -64,7 +67,7 @@ class Args:
     def __post_init__(self) -> None:
         """Everything is checked here, before what is slow is imported; errors look like those of a wrong flag."""
         self.env = checked_id(self.env)
-        for name in ("timesteps", "eval_episodes", "final_episodes", "threads"):
+        for name in ("timesteps", "evaluations", "eval_episodes", "final_episodes", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"--{name.replace('_', '-')} {value}: must be at least 1")
@@ -94,14 +97,14 @@ class Args:
             known = ", ".join(table or ())
             raise ValueError(f"{path} has no hyperparameters for {self.env!r} (there are: {known}): give a file with --hyperparams")
         hyperparameters = dict(table[self.env])
-        missing = [key for key in ("n_envs", "n_timesteps", "policy", "n_steps") if key not in hyperparameters]
+        needed = ("n_envs", "n_timesteps", "policy", "train_freq" if self.algo in policies.OFF_POLICY else "n_steps")
+        missing = [key for key in needed if key not in hyperparameters]
         if missing:
             raise ValueError(f"{path} lacks {', '.join(missing)} for {self.env!r}")
         config = {
             "clothgym": clothgym.__version__,
             "env": self.env,
             "algo": self.algo,
-            "lagrange": hyperparameters.pop("lagrange", {}),
             "clone": hyperparameters.pop("clone", {}),
             "curriculum": hyperparameters.pop("curriculum", {}),
             "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
@@ -129,7 +132,7 @@ def main(args: Args) -> None:
     if args.resume is None:
         folder.mkdir(parents=True, exist_ok=True)
         files.write_json(folder / policies.CONFIG, config)
-    train(folder, config, model, done, args.eval_episodes, args.final_episodes)
+    train(folder, config, model, done, args.eval_episodes, args.evaluations, args.final_episodes)
 
 
 if __name__ == "__main__":

@@ -12,17 +12,18 @@ import gymnasium as gym
 from numpy.typing import NDArray
 
 import clothgym
-from clothgym import files
+from clothgym import files, policies
 from clothgym.registration import checked_id
 
-# the last checkpoint and the one before it, the best, and what they were trained with
-CHECKPOINT, BEFORE, BEST, CONFIG = "checkpoint.pt", "checkpoint_before.pt", "best.pt", "config.json"
-VERSION = 1  # of the format of checkpoints
+# the last checkpoint and the one before it, what they were trained with, and what the finished run has exported
+CHECKPOINT, BEFORE, CONFIG, POLICY = "checkpoint.pt", "checkpoint_before.pt", "config.json", "policy.npz"
+VERSION = 2  # of the format of checkpoints
 ADVICE = "train again, or take another run"
 FIELDS = {
-    "env": str, "algo": str, "lagrange": dict, "clone": dict, "curriculum": dict, "env_kwargs": dict, "hyperparameters": dict, "num_envs": int,
-    "timesteps": int, "seed": int, "threads": int,
+    "env": str, "algo": str, "clone": dict, "curriculum": dict, "env_kwargs": dict, "hyperparameters": dict,
+    "num_envs": int, "timesteps": int, "seed": int, "threads": int,
 }  # fmt: skip
+OFF_POLICY = ("sac", "her")
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observations) -> actions
 
 
@@ -52,9 +53,9 @@ def read_config(folder: Path, env_id: str | None = None, begun: bool = True) -> 
         for name, kind in FIELDS.items():
             if type(config.get(name)) is not kind:
                 raise ValueError(f"its {name} is {config.get(name)!r:.60}, not of type {kind.__name__}")
-        for name in ("num_envs", "timesteps", "threads"):
-            if config[name] < 1:
-                raise ValueError(f"its {name} is {config[name]}, not at least 1")
+        for name, least in (("num_envs", 1), ("timesteps", 0), ("threads", 1)):
+            if config[name] < least:
+                raise ValueError(f"its {name} is {config[name]}, not at least {least}")
         checked_id(config["env"])
     if env_id not in (None, config["env"]):
         raise ValueError(f"{str(folder)!r} was trained on {config['env']}, not on {env_id}")
@@ -101,7 +102,7 @@ def load_tensors(path: Path) -> dict[str, Any]:
         content = files.unmarked(files.read(path), "checkpoint", VERSION)
         files.opened(content).close()
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        kinds = {"policy": dict, "optimizer": dict, "num_timesteps": int, "num_updates": int}
+        kinds = {"policy": dict, "optimizer": dict, "variables": dict, "constraint": dict, "num_timesteps": int, "num_updates": int}
         if not isinstance(state, dict) or any(not isinstance(state.get(name), kind) for name, kind in kinds.items()):
             raise ValueError(f"it does not hold {', '.join(kinds)}")
         if min(state["num_timesteps"], state["num_updates"]) < 0:
@@ -132,8 +133,18 @@ def load_last(folder: Path) -> dict[str, Any]:
 # --- policies -----------------------------------------------------------------------------------------------------------------
 
 
+def exported(path: Path) -> Policy:
+    """The policy in a file, as ``clothgym.policies`` keeps it.
+
+    Raises:
+        FileNotFoundError, ValueError: there is none, or it is damaged.
+    """
+    policy = policies.read(path)
+    return lambda env, observations: policy(observations)
+
+
 def learned(folder: Path, env_id: str) -> Policy:
-    """The deterministic policy of a run: the best of its held-out evaluations, or the last while there is none.
+    """The deterministic policy of a run: what it has exported at its end, or its last checkpoint while it has not.
 
     Raises:
         FileNotFoundError, ValueError: no run, or one that is damaged, of another version or environment.
@@ -141,12 +152,17 @@ def learned(folder: Path, env_id: str) -> Policy:
     """
     folder = _folder(folder)
     config = read_config(folder, env_id)
+    if (folder / POLICY).exists():
+        return exported(folder / POLICY)
+    if config["algo"] in OFF_POLICY:
+        raise ValueError(
+            f"{str(folder)!r} is of {config['algo']} and not finished: go on with it, its policy is exported at the end"
+        )
     try:
         from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
     except ImportError as error:
         raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
-    best = folder / BEST
-    tensors = load_tensors(best)["policy"] if best.exists() else load_last(folder)["policy"]
+    tensors = load_last(folder)["policy"]
     kwargs = config["hyperparameters"].get("policy_kwargs", {})
     env = gym.make_vec(env_id, num_envs=1, **config["env_kwargs"])
     with files.naming(folder / CONFIG, "configuration of the network in this run", ADVICE):

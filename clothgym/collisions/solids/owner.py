@@ -82,7 +82,7 @@ class Solids:
         self.rows[block, index, R_VELOCITY : R_VELOCITY + 3, lane] = now
         self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 
-    def end_step(self, blocks: Any = slice(None)) -> None:
+    def end_step(self, blocks: slice | list[int] = slice(None)) -> None:
         """Colliders of these blocks have reached their targets: each goes on with its velocity for afterwards."""
         self.rows[blocks, :, R_VELOCITY : R_VELOCITY + 3] = self.rows[blocks, :, R_AFTER : R_AFTER + 3]
 

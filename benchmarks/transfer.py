@@ -1,0 +1,118 @@
+"""Do policies hold under another simulator?  Committed ones under other integrators, substeps, meshes, fabrics and physics.
+
+    python benchmarks/transfer.py            # goes on with what is in benchmarks/results/transfer.json; draws docs/transfer.png
+
+Each policy was trained in the task as its id fixes it, and has not seen any of the others.  The same held-out episodes for all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from clothgym import files
+from clothgym.lab.bench import machine
+from clothgym.lab.digests import digest_of
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "training"))
+import policies  # noqa: E402 - scripts of training/
+from scoring import HELD_OUT, run_episodes, wilson  # noqa: E402
+
+RESULTS, PICTURE = ROOT / "benchmarks" / "results" / "transfer.json", ROOT / "docs" / "transfer.png"
+EPISODES = 200
+ACTORS = (
+    ("ClothDrape-v0", "expert"),
+    ("ClothDrape-v0", "learned:ppo"),
+    ("ClothDrape-v0", "learned:bc_ppo"),
+    ("ClothReach-v0", "learned:ppo"),
+    ("ClothFold-v0", "learned:bc_ppo"),
+    ("ClothHang-v0", "learned:bc_ppo"),
+)
+# what is changed, and what it is called in the picture
+VARIANTS: dict[str, dict[str, Any]] = {
+    "as trained": {},
+    "verlet": {"integrator": "verlet"},
+    "implicit Euler": {"integrator": "implicit_euler"},
+    "twice the substeps": {"substeps": 100},
+    "13 a side": {"rows": 13},
+    "25 a side": {"rows": 25},
+    "33 a side": {"rows": 33},
+    "silk": {"fabric": "silk"},
+    "cotton": {"fabric": "cotton"},
+    "wool": {"fabric": "wool"},
+    "density ± 30 %": {"randomize": {"density": [0.138, 0.256]}},
+    "fast physics": {"physics": "fast"},
+}
+
+
+def cell(env_id: str, actor: str, changed: dict[str, Any]) -> dict[str, Any]:
+    """Success of one policy under one change."""
+    kwargs = policies.env_kwargs(actor, env_id) | changed
+    kwargs = {name: value for name, value in kwargs.items() if name != "settling"}
+    episodes = run_episodes(env_id, policies.named(actor, env_id, HELD_OUT), list(range(HELD_OUT, HELD_OUT + EPISODES)), **kwargs)
+    successes = int(episodes["is_success"].sum())
+    return {
+        "success_rate": successes / EPISODES,
+        "success_rate_ci95": wilson(successes, EPISODES),
+        "normalized_performance": float(episodes["normalized_performance"].mean()),
+        "digest": digest_of(env_id, kwargs),
+    }
+
+
+def draw(rows: dict[str, dict[str, Any]]) -> None:
+    """A heat map: policies down, changes across; each cell with its interval."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    names = [name for name in rows if rows[name]]
+    rates = np.full((len(names), len(VARIANTS)), np.nan)
+    figure, axes = plt.subplots(figsize=(12, 0.6 * len(names) + 2.2), layout="constrained")
+    for i, name in enumerate(names):
+        for j, variant in enumerate(VARIANTS):
+            if (found := rows[name].get(variant)) is not None:
+                rates[i, j] = found["success_rate"]
+                low, high = found["success_rate_ci95"]
+                axes.text(j, i, f"{rates[i, j]:.2f}\n{low:.2f}–{high:.2f}", ha="center", va="center", fontsize=7,
+                          color="white" if rates[i, j] < 0.6 else "black")  # fmt: skip
+    shown = axes.imshow(rates, vmin=0, vmax=1, cmap="cividis", aspect="auto")
+    axes.set_xticks(range(len(VARIANTS)), list(VARIANTS), rotation=30, ha="right")
+    axes.set_yticks(range(len(names)), [name.replace(" learned:", ", ") for name in names])
+    figure.colorbar(shown, label="success")
+    figure.savefig(PICTURE, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draw", action="store_true", help="draw what there is, and evaluate nothing")
+    options = parser.parse_args()
+    rows: dict[str, dict[str, Any]] = {f"{env_id} {actor}": {} for env_id, actor in ACTORS}
+    if RESULTS.exists():
+        rows |= files.read_json(RESULTS, "table of transfers", "remove it, and make it anew")["rows"]
+    wanted = [(env_id, actor, variant) for env_id, actor in ACTORS for variant in VARIANTS]
+    for env_id, actor, variant in tqdm([] if options.draw else wanted, unit="cell"):
+        own = rows[f"{env_id} {actor}"]
+        if variant in own:
+            continue
+        try:
+            own[variant] = cell(env_id, actor, VARIANTS[variant])
+        except ValueError as error:  # a change that this task does not take
+            print(f"{env_id}, {variant}: {error}")
+            continue
+        files.write_json(RESULTS, {"machine": machine(), "episodes": EPISODES, "variants": VARIANTS, "rows": rows})
+    print(
+        json.dumps({name: {variant: one["success_rate"] for variant, one in row.items()} for name, row in rows.items()}, indent=1)
+    )
+    draw(rows)
+
+
+if __name__ == "__main__":
+    main()

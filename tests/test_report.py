@@ -1,0 +1,116 @@
+"""Tables of scores: committed ones are what the command makes, rows of other code are marked; statistics are those of rliable."""
+
+import json
+
+import numpy as np
+import pytest
+from training_runs import ROOT
+
+from clothgym import files
+from clothgym.lab.digests import digest_of, name_of
+from clothgym.registration import ENVIRONMENTS
+
+DIGESTS = files.read_json(ROOT / "benchmarks" / "results" / "digests.json", "list", "")["digests"]
+
+
+@pytest.fixture
+def report(scripts):
+    """The script, to import from."""
+    import report
+
+    return report
+
+
+def result(rate, seed=0, env_id="ClothReach-v0", **more):
+    row = {"env": env_id, "env_kwargs": {}, "learner": "ppo", "seed": seed, "success_rate": rate, "normalized_performance": rate}
+    row |= {
+        "success_rate_ci95": [rate - 0.1, rate + 0.1],
+        "timesteps": 400_000,
+        "training_seconds": 60.0 + seed,
+        "core_seconds": 90.0,
+    }
+    return row | {"torn": 1, "diverged": 0, "digest": "now", "run": f"run_{seed}", "episodes": 500} | more
+
+
+@pytest.mark.parametrize("name", DIGESTS)
+def test_the_noted_digests_are_what_environments_do_now(name):
+    """Where they are not, ``python training/report.py --digests`` notes them, and marks the rows that are old."""
+    env_id, _, kwargs = name.partition(" ")
+    assert digest_of(env_id, json.loads(kwargs or "{}")) == DIGESTS[name]
+
+
+def test_every_environment_has_one_and_what_moves_no_bits_is_left_out():
+    assert set(ENVIRONMENTS) <= set(DIGESTS) and len(set(DIGESTS.values())) == len(DIGESTS)
+    assert name_of("clothgym:ClothReach-v0", {"threads": 2, "settling": "at_once"}) == "ClothReach-v0"
+    assert name_of("ClothReach-v0", {"rows": 7, "physics": "fast"}) == 'ClothReach-v0 {"physics": "fast", "rows": 7}'
+
+
+def test_committed_pages_are_what_the_command_makes(report):
+    stale = [str(path) for path, text in report.pages().items() if path.read_text() != text]
+    assert not stale, f"python training/report.py  makes others of {', '.join(stale)}"
+
+
+def test_rows_of_other_code_are_marked(report):
+    digests = {"ClothReach-v0": "now"}
+    rows = [result(0.9), result(0.8, seed=1)]
+    assert "old" not in report.table_of("ClothReach-v0", rows, [], digests)
+    # one seed of another code is enough, and so is a row that does not say
+    for wrong in ({"digest": "then"}, {"digest": None}, {"env_kwargs": {"rows": 9}}):
+        assert "PPO" in report.table_of("ClothReach-v0", [rows[0], result(0.8, seed=1) | wrong], [], digests)
+        assert "**(old)**" in report.table_of("ClothReach-v0", [rows[0], result(0.8, seed=1) | wrong], [], digests)
+    scripted = result(0.5) | {"policy": "expert"}
+    table = report.table_of("ClothReach-v0", [], [scripted, scripted | {"policy": "noop", "digest": "then"}], digests)
+    assert "`noop` **(old)**" in table and "`expert` |" in table
+
+
+def test_a_row_says_what_its_seeds_came_to(report):
+    rates = [0.95, 0.70, 0.90, 0.80, 0.99]
+    table = report.table_of("ClothReach-v0", [result(rate, seed) for seed, rate in enumerate(rates)], [], {"ClothReach-v0": "now"})
+    cells = [cell.strip() for cell in table.splitlines()[-1].split("|")]
+    # the middle three of five: (0.80 + 0.90 + 0.95) / 3
+    assert cells[1:3] == ["PPO", "5"] and cells[3].startswith("0.883 [") and cells[4:6] == ["0.900", "0.700"]
+    assert "5 / 0" in cells and cells[-2] == "1.0 min, 1.5 of one core" and "0.40 M" in cells
+    low, high = report.bootstrap(rates)
+    assert 0.70 <= low < 0.8833 < high <= 0.99
+    assert report.bootstrap([0.5, 0.5, 0.5]) == (0.5, 0.5)
+    assert report.interquartile_mean([3, 1, 2]) == pytest.approx(2) and report.interquartile_mean([0, 1, 2, 30]) == pytest.approx(
+        1.5
+    )
+
+
+def test_learners_with_other_arguments_are_other_rows(report):
+    same = [result(0.9, env_kwargs={"settling": "at_once"}), result(0.8, seed=1)]
+    assert [len(rows) for rows in report.groups(same).values()] == [2]
+    other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
+    assert [label for _, label in report.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
+    assert report.best_of("ClothReach-v0", other) == "PPO: 0.85 in 1 min" and report.best_of("ClothDrape-v0", other) == "–"
+
+
+def test_sections_are_filled_and_the_rest_of_a_page_stays(report):
+    text = "a\n<!-- scores of X -->\nold\n\nmore\n<!-- end -->\nb\n<!-- scores of Y -->\n<!-- end -->\n"
+    made = {"scores of X": "| new |", "scores of Y": "two\nlines"}
+    filled = report.filled(text, made)
+    assert filled == "a\n<!-- scores of X -->\n| new |\n<!-- end -->\nb\n<!-- scores of Y -->\ntwo\nlines\n<!-- end -->\n"
+    assert report.filled(filled, made) == filled
+    with pytest.raises(ValueError, match="no section 'scores of X'"):
+        report.filled(text, {})
+
+
+def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(report, tmp_path, monkeypatch):
+    from clothgym import policies
+
+    monkeypatch.setattr(report, "RUNS", tmp_path / "results")
+    monkeypatch.setattr(report, "COMMITTED", tmp_path / "committed")
+    (tmp_path / "committed").mkdir()
+    for seed, chosen_by in enumerate((0.7, 0.9, 0.8)):
+        folder = tmp_path / f"ClothReach-v0_{seed}"
+        folder.mkdir()
+        for name in report.KEPT:
+            (folder / name).write_text("{}")
+        about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": seed, "chosen_by": chosen_by}
+        policies.Policy([(np.ones((3, 2)), np.zeros(2))], about=about).save(folder / "policy.npz")
+    report.add(sorted(tmp_path.glob("ClothReach-v0_*")))
+    assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["seed"] == 1
+    assert sorted(path.name for path in (tmp_path / "results" / "ClothReach-v0_0").iterdir()) == sorted(report.KEPT)
+    with pytest.raises(ValueError, match="holds no finished run, it lacks evaluation.json"):
+        report.add([tmp_path])
