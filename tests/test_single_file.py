@@ -120,9 +120,10 @@ def test_a_truncated_episode_is_worth_what_its_last_observation_is(single):
 
 def test_a_curriculum_begins_with_other_arguments(single, tmp_path, monkeypatch):
     """Until the first rollout that ends beyond its steps; the score is of the task's own."""
-    row = TABLE["ClothReach-v0"] | {"curriculum": {"n_timesteps": 50, "env_kwargs": {"physics": "fast"}}}
-    row |= {"n_envs": 4, "n_steps": 10, "n_epochs": 1, "env_kwargs": {"substeps": 60}}
-    monkeypatch.setattr(single.yaml, "safe_load", lambda text: {"ClothReach-v0": row})
+    row = TABLE["ClothReach-v0"] | {"n_envs": 4, "n_steps": 10, "n_epochs": 1, "env_kwargs": {"substeps": 60}}
+    curricula = {"ppo": {"ClothReach-v0": {"n_timesteps": 50, "env_kwargs": {"physics": "fast"}}}}
+    # of the two files only that of curricula names learners
+    monkeypatch.setattr(single.yaml, "safe_load", lambda text: curricula if "\nppo:\n" in text else {"ClothReach-v0": row})
     begun, scored, collect = [], [], single.rollouts
     monkeypatch.setattr(single, "rollouts", lambda env, *rest: begun.append((env, rest[2])) or collect(env, *rest))
     monkeypatch.setattr(single, "run_episodes", lambda *args, **kwargs: scored.append(kwargs) or run_episodes(*args, **kwargs))

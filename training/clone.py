@@ -34,7 +34,7 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
     for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False, disable=None):
         strength = noise * rng.uniform(size=(env.num_envs, 1))
         for _ in range(task.most_steps()):
-            wanted = np.clip(task.expert_actions(), -1, 1).astype(np.float32)
+            wanted = np.clip(task.expert(), -1, 1).astype(np.float32)
             # what is done while the sheet settles does not matter, and would only blur what does
             acting = task.episode["settling_since"] < 0
             observations.append({key: part[acting] for key, part in seen.items()} if isinstance(seen, dict) else seen[acting])

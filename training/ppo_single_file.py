@@ -72,7 +72,8 @@ class Args:
             raise ValueError(f"{path} has no hyperparameters for {self.env!r} (there are: {', '.join(table)})")
         row = dict(table[self.env])
         row |= row.pop("policy_kwargs") | {"timesteps": int(row.pop("n_timesteps"))}
-        own, first = row.pop("env_kwargs", {}), row.pop("curriculum", None)
+        own = row.pop("env_kwargs", {})
+        first = yaml.safe_load(path.with_name("curricula.yml").read_text()).get("ppo", {}).get(self.env)
         if row.pop("policy") != "MlpPolicy" or not set(row) <= {*LIMITS, "learning_rate"}:
             raise ValueError(f"--env {self.env}: this script does not do all that {path} says of it; train.py does")
         for name, value in row.items():

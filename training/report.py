@@ -34,9 +34,10 @@ from clothgym.registration import ENVIRONMENTS
 ROOT = Path(__file__).parent.parent
 RESULTS, CURVES = ROOT / "benchmarks" / "results", ROOT / "docs" / "curves"
 RUNS, DIGESTS, SUITE = RESULTS / "training", RESULTS / "digests.json", RESULTS / "suite.json"
+MAXIMIZERS = RESULTS / "maximizers.json"
 COMMITTED = ROOT / "clothgym" / "policies"
 KEPT = ("config.json", "evaluation.json", "progress.jsonl")
-PAGES = ("README.md", "docs/results.md")
+PAGES = ("README.md", "docs/results.md", "docs/cheats.md")
 ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
@@ -203,6 +204,23 @@ def best_of(env_id: str, results: list[Result]) -> str:
     return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {minutes:.0f} min"
 
 
+def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
+    """What a planner has found on whole episodes, beside the scripted experts."""
+    experts = {row["env"]: row for row in scripted if row["policy"] == "expert" and not row["env_kwargs"]}
+    found = []
+    for row in sorted(rows, key=lambda row: (list(ENVIRONMENTS).index(row["env"]), row["policy"])):
+        begun = "the expert" if row["policy"] == "cem from expert" else "nothing"
+        found.append({
+            "environment": f"`{row['env']}`{_old(is_present(row, digests))}", "from": begun,
+            "success": f"{round(row['success_rate'] * row['episodes'])} of {row['episodes']}",
+            "performance": f"{row['normalized_performance']:.3f}", "return": f"{row['return']:.3f}",
+            "steps of the model": f"{row['model_steps']:,}", "minutes": f"{row['seconds'] / 60:.1f}",
+            "expert's performance": f"{experts[row['env']]['normalized_performance']:.3f}",
+            "its success": f"{experts[row['env']]['success_rate']:.3f}",
+        })  # fmt: skip
+    return markdown(found)
+
+
 # --- curves -------------------------------------------------------------------------------------------------------------------
 
 
@@ -298,7 +316,7 @@ def filled(text: str, made: dict[str, str]) -> str:
 def pages() -> dict[Path, str]:
     """Every page as it is to be."""
     digests, scripted = read_digests(), suite.read(SUITE)
-    made = sections(learned(), scripted, digests)
+    made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
     return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
 
 

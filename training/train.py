@@ -106,7 +106,7 @@ class Args:
             "env": self.env,
             "algo": self.algo,
             "clone": hyperparameters.pop("clone", {}),
-            "curriculum": hyperparameters.pop("curriculum", {}),
+            "curriculum": hyperparameters.pop("curriculum", self.curriculum()),
             "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
             "num_envs": hyperparameters.pop("n_envs"),
             "timesteps": self.timesteps if self.timesteps is not None else int(hyperparameters["n_timesteps"]),
@@ -121,6 +121,13 @@ class Args:
         if policies.has_checkpoint(folder):
             raise ValueError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
         return folder, config
+
+    def curriculum(self) -> dict[str, Any]:
+        """What a run with our own hyperparameters begins with, if anything; a file of one's own says that itself."""
+        if self.hyperparams is not None:
+            return {}
+        table = yaml.safe_load((HERE / "hyperparams" / "curricula.yml").read_text())
+        return dict(table.get(self.algo, {}).get(self.env, {}))
 
 
 def main(args: Args) -> None:

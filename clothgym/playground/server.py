@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 from numpy.typing import NDArray
 
+from clothgym import policies
 from clothgym.adapters import runs
 from clothgym.checks import known
 from clothgym.playground.access import MOST_VISITS, Access, is_loopback
@@ -80,7 +81,7 @@ class Gallery:
         if name in SCENES:
             return SceneStage(name)
         own = self.policies.get(name, {})
-        return EpisodeStage(name, own, next(iter(own), self.actor))
+        return EpisodeStage(name, {**committed_policies(name), **own}, next(iter(own), self.actor))
 
 
 class Visit:
@@ -183,16 +184,28 @@ def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[s
     """
     # what is wrong with any of them is said before the first is loaded, which takes seconds
     configs = {name: runs.read_config(Path(name)) for name in names if name not in ACTORS}
-    policies: dict[str, dict[str, Policy]] = {}
+    found: dict[str, dict[str, Policy]] = {}
     for run, config in configs.items():
         env_id = config["env"]
         act = runs.learned(Path(run), env_id)
-        own = policies.setdefault(env_id, {})
+        own = found.setdefault(env_id, {})
         name = Path(run).resolve().name
         # runs of the same name are distinguished by their full paths
         own[name if name not in own else str(Path(run).resolve())] = Learnt(act, config["env_kwargs"])
         start = start or env_id
-    return start, policies
+    return start, found
+
+
+def committed_policies(env_id: str) -> dict[str, Policy]:
+    """The policies that come with the project, by name; without those that pick and place, in steps too long to watch."""
+    found: dict[str, Policy] = {}
+    for learner in policies.available().get(env_id, []):
+        policy = policies.load(env_id, learner)
+        # a sheet settles before the visitor's eyes
+        kwargs = {name: value for name, value in policy.about["env_kwargs"].items() if name != "settling"}
+        if "action_mode" not in kwargs:
+            found[f"learned, {learner}"] = Learnt(lambda env, observations, policy=policy: policy(observations), kwargs)
+    return found
 
 
 @dataclass(frozen=True)
