@@ -116,6 +116,30 @@ class Watch(BaseCallback):
         self.saved = time.perf_counter()
 
 
+class FrozenPolicy(BaseCallback):
+    """For some rollouts only the critic learns: beside a cloned policy it knows nothing yet, and would lead it astray."""
+
+    def __init__(self, rollouts: int) -> None:
+        super().__init__()
+        self.left = rollouts
+
+    def _freeze(self, frozen: bool) -> None:
+        policy: Any = self.model.policy
+        for parameter in (*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters(), policy.log_std):
+            parameter.requires_grad_(not frozen)
+
+    def _on_training_start(self) -> None:
+        self._freeze(self.left > 0)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        # what follows is what is learned from this rollout
+        self._freeze(self.left > 0)
+        self.left -= 1
+
+
 class Curriculum(BaseCallback):
     """Begins on environments with other arguments, with ``physics="fast"`` for instance, and goes on with the run's own.
 
@@ -190,6 +214,7 @@ def train(folder: Path, config: Config, model: Any, done: int, eval_episodes: in
         watch.clock.start()
         learn_from_expert(model, config)
         watch.clock.stop()
+        callbacks.append(FrozenPolicy(config["clone"].get("critic_rollouts", 0)))
     if config["timesteps"] > done:
         try:
             # learn() counts its steps on top of those done when the counter is not reset
@@ -219,7 +244,7 @@ def with_logger(model: Any) -> Any:
 
 def learn_from_expert(model: Any, config: Config) -> None:
     """Clone the scripted expert into the policy."""
-    options = dict(config["clone"])
+    options = {name: value for name, value in config["clone"].items() if name != "critic_rollouts"}
     env: Any = model.env
     episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
     samples = demonstrations(env, episodes, noise, config["seed"])

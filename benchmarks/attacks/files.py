@@ -32,11 +32,11 @@ from clothgym.playground.recording import Recording
 from clothgym.playground.stage import SceneStage
 
 ARCHIVES = {"state": 1, "task state": 1, "recording": 1}  # their versions
-OBJECTS = ("configuration", "multiplier")
+OBJECTS = ("configuration",)
 KINDS = (*ARCHIVES, *OBJECTS, *(["checkpoint", "policy"] if importlib.util.find_spec("torch") else []))
 SPECIAL = ("/dev/zero", "/dev/null", "/dev/random", "/proc/self/mem", "folder", "pipe", "empty", "link to itself")
 CONFIG = {
-    "clothgym": clothgym.__version__, "env": "ClothReach-v0", "algo": "ppo", "lagrange": {}, "clone": {}, "env_kwargs": {},
+    "clothgym": clothgym.__version__, "env": "ClothReach-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {},
     "hyperparameters": {"policy_kwargs": {"net_arch": [8]}}, "num_envs": 4, "timesteps": 100, "seed": 0, "threads": 1,
 }  # fmt: skip
 
@@ -137,7 +137,6 @@ def _sample(kind: str) -> tuple[bytes, Callable[[Path], Any], Any]:
         "task state": (lambda path: _environment().get_state().save(path), lambda path: digest(TaskState.load(path))),
         "recording": (lambda path: _stage().recording.save(path), _recorded),
         "configuration": (lambda path: files.write_json(path, CONFIG), _configured),
-        "multiplier": (lambda path: files.write_json(path, {"multiplier": 0.5}), _multiplier),
         "checkpoint": (_save_checkpoint, lambda path: _tensors(runs.load_tensors(path))),
         "policy": (_save_checkpoint, _acted),
     }
@@ -182,19 +181,6 @@ def _configured(path: Path) -> Any:
     return runs.read_config(path.parent, begun=False)
 
 
-def _multiplier(path: Path) -> float:
-    _scripts()
-    from lagrange import known_multiplier
-
-    return known_multiplier(path)
-
-
-def _scripts() -> None:
-    folder = str(Path(__file__).resolve().parents[2] / "training")
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-
-
 @cache
 def _policy() -> Any:
     import torch
@@ -207,8 +193,8 @@ def _policy() -> Any:
 
 def _save_checkpoint(path: Path) -> None:
     policy = _policy()
-    optimizer = policy.optimizer.state_dict()
-    runs.save_tensors(path, {"policy": policy.state_dict(), "optimizer": optimizer, "num_timesteps": 100, "num_updates": 3})
+    more = {"optimizer": {"policy.optimizer": policy.optimizer.state_dict()}, "variables": {}, "constraint": {}}
+    runs.save_tensors(path, {"policy": policy.state_dict(), **more, "num_timesteps": 100, "num_updates": 3})
 
 
 def _tensors(state: dict[str, Any]) -> Any:
