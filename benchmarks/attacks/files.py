@@ -11,7 +11,6 @@ import importlib.util
 import io
 import json
 import os
-import sys
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
