@@ -70,6 +70,8 @@ class Watch(BaseCallback):
         # a clone is scored before it learns on
         self.next = 0 if config["clone"] and not self.lines else int(last["timesteps"]) + every
         self.saved = time.perf_counter()
+        # time in which environments step and the policy chooses actions, and when that began [s]
+        self.collecting, self.collects_since = last.get("collecting_seconds", 0.0), 0.0
 
     def _on_step(self) -> bool:
         return True
@@ -84,8 +86,10 @@ class Watch(BaseCallback):
         elif time.perf_counter() - self.saved > CHECKPOINT_SECONDS:
             self.save()
         self.clock.start()
+        self.collects_since = time.perf_counter()
 
     def _on_rollout_end(self) -> None:
+        self.collecting += time.perf_counter() - self.collects_since
         torch.set_num_threads(self.config["threads"])
 
     def save(self) -> None:
@@ -105,6 +109,7 @@ class Watch(BaseCallback):
         found = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
         wall, cores = self.clock.spent
         line = {"timesteps": self.num_timesteps, "training_seconds": wall, "core_seconds": cores, "episodes": episodes}
+        line["collecting_seconds"] = self.collecting
         line |= {"success_rate": float(found["is_success"].mean())}
         line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
         if "episode_cost" in found:
@@ -260,7 +265,12 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     """Export the policy, score what was exported beside the references, draw learning curve and film."""
     wall, cores = watch.clock.spent
     about = {"digest": digest_of(config["env"], config["env_kwargs"]), "timesteps": config["timesteps"], "training_seconds": wall}
-    about |= {"core_seconds": cores, "chosen_by": watch.lines[-1]["success_rate"], "machine": machine()}
+    about |= {
+        "core_seconds": cores,
+        "collecting_seconds": watch.collecting,
+        "chosen_by": watch.lines[-1]["success_rate"],
+        "machine": machine(),
+    }
     policy, path = exported(model, config, about), folder / POLICY
     if policy is not None:
         policy.save(path)
