@@ -3,7 +3,7 @@
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
 python docs/pictures.py --contact                                  # contact alone
 python docs/pictures.py --folds                                    # a film of the three folds
-python docs/pictures.py --run runs/ClothDrape-v0_0 drape.gif       # and a film of a learned policy
+python docs/pictures.py --learned ClothDrape-v0 drape.gif          # and a film of a committed policy
 python docs/pictures.py --expert ClothHang-Hard-v0 hang.gif        # or of a scripted expert
 """
 
@@ -172,7 +172,9 @@ def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--run", nargs=2, metavar=("FOLDER", "GIF"), help="folder of a training run, and the film's name")
+    parser.add_argument(
+        "--learned", nargs=2, metavar=("ENV", "GIF"), help="id whose committed policy is filmed, and the film's name"
+    )
     parser.add_argument("--expert", nargs=2, metavar=("ENV", "GIF"), help="id whose scripted expert is filmed, and the film's name")
     parser.add_argument("--contact", action="store_true", help="draw contact alone")
     parser.add_argument("--folds", action="store_true", help="draw and film the folds alone")
@@ -183,7 +185,7 @@ def main() -> None:
     if options.folds:
         draw_folds()
         return
-    if options.run is None and options.expert is None:
+    if options.learned is None and options.expert is None:
         draw_strips()
         draw_contact()
         return
@@ -193,13 +195,11 @@ def main() -> None:
 
     if options.expert is not None:
         env_id, name = options.expert
-        expert = policies.named("expert", f"clothgym:{env_id}", 0)
-        drawing.film(HERE / name, f"clothgym:{env_id}", expert, {}, episodes=2, stride=4)
+        drawing.film(HERE / name, f"clothgym:{env_id}", policies.named("expert", env_id, 0), {}, episodes=2, stride=4)
         return
-    folder = Path(options.run[0])
-    config = policies.read_config(folder)
-    policy = policies.learned(folder, config["env"])
-    drawing.film(HERE / options.run[1], config["env"], policy, config["env_kwargs"], episodes=3, stride=2)
+    env_id, name = options.learned
+    kwargs = policies.env_kwargs(policies.COMMITTED, env_id)
+    drawing.film(HERE / name, f"clothgym:{env_id}", policies.named(policies.COMMITTED, env_id, 0), kwargs, episodes=3, stride=2)
 
 
 if __name__ == "__main__":
