@@ -35,7 +35,8 @@ for folder in (HERE, ROOT / "training"):
         sys.path.insert(0, str(folder))
 
 import gallery  # noqa: E402 - a script beside this one
-import suite  # noqa: E402 - one of training/
+import report  # noqa: E402 - scripts of training/
+import suite  # noqa: E402
 
 Suite = dict[str, Any]  # what the file of scores holds
 NOTHING: Suite = {"rows": []}
@@ -116,11 +117,14 @@ def _facts(env_id: str) -> str:
 
 
 def _scores(env_id: str, scores: Suite) -> str:
-    """The table of an id's rows, and how they were made."""
+    """The table of an id's rows, and how they were made; what is of other code is marked."""
+    digests = report.read_digests()
     rows = [row for row in scores["rows"] if row["env"] == env_id]
     if not rows:
         return f"None are committed yet; this makes them: `{COMMAND} --env {env_id}`, and `python docs/task_pages.py` the page."
     lines = [suite.cells(row) for row in rows]
+    for line, row in zip(lines, rows):
+        line["policy"] += "" if report.is_present(row, digests) else " **(old)**"
     columns = [name for name in lines[0] if any(line[name] for line in lines)]
     table = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
     table += [f"| {' | '.join(line[name] for name in columns)} |" for line in lines]
@@ -135,6 +139,7 @@ def _scores(env_id: str, scores: Suite) -> str:
         said += ["Success: in the last step; held: from its first success on to the end."]
     if "best" in columns:
         said += ["Best: the best score of an episode."]
+    said += [f"What has been learned is in [results](../results.md#{env_id.lower()})."] if "-Hard-" not in env_id else []
     return "\n".join([*table, "", "\n".join(said)])
 
 

@@ -172,3 +172,48 @@ def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(t
     assert "cloned the expert" not in resumed.stdout
     scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert scores["timesteps"] == 5120 and scores["success_rate"] > 0.5 > scores["references"]["random"]["success_rate"]
+
+
+def test_beside_a_clone_only_the_critic_learns_at_first(scripts):
+    """For one rollout; the next one moves the policy, too."""
+    from learning import FrozenPolicy
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import CallbackList
+
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    model = PPO(
+        "MlpPolicy", make_sb3_vec_env("ClothReach-v0", 4, seed=0), n_steps=8, batch_size=32, n_epochs=2, seed=0, device="cpu"
+    )
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.learn(32, callback=CallbackList([FrozenPolicy(1)]))
+    moved = {name for name, value in model.policy.state_dict().items() if not value.equal(before[name])}
+    assert moved and all("value" in name for name in moved)
+    frozen = FrozenPolicy(1)
+    model.learn(64, callback=frozen, reset_num_timesteps=False)
+    assert {"action_net.weight", "log_std"} <= {
+        name for name, value in model.policy.state_dict().items() if not value.equal(before[name])
+    }
+
+
+def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
+    """Where the first part ends the learner's environments are others, just begun; a resumed run begins where it belongs."""
+    import learning
+    from learners import build
+
+    config = {"env": "ClothReach-v0", "algo": "ppo", "num_envs": 4, "env_kwargs": {}, "seed": 0, "hyperparameters": {
+        "policy": "MlpPolicy", "n_steps": 8, "batch_size": 32, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}},
+        "curriculum": {"n_timesteps": 64, "env_kwargs": {"physics": "fast"}}}  # fmt: skip
+    model = build(learning.Path("unused"), config, 0, 0)
+    model.tensorboard_log = None
+    seen = []
+
+    class Note(learning.BaseCallback):
+        def _on_step(self):
+            task = self.training_env.unwrapped.env.task
+            seen.append((task.physics_name, int(task.episode["step"][0])))
+            return True
+
+    model.learn(128, callback=[learning.Curriculum(config, 64), Note()])
+    assert seen == [("fast", step) for step in range(1, 17)] + [("true", step) for step in range(1, 17)]
+    assert build(learning.Path("unused"), config, 0, 64).env.unwrapped.env.task.physics_name == "true"
