@@ -26,21 +26,20 @@ import policies  # noqa: E402 - scripts of training/
 from scoring import HELD_OUT, run_episodes, wilson  # noqa: E402
 
 RESULTS, PICTURE = ROOT / "benchmarks" / "results" / "transfer.json", ROOT / "docs" / "transfer.png"
-EPISODES = 200
+EPISODES = 100
 ACTORS = (
     ("ClothDrape-v0", "expert"),
     ("ClothDrape-v0", "learned:ppo"),
-    ("ClothDrape-v0", "learned:bc_ppo"),
     ("ClothReach-v0", "learned:ppo"),
-    ("ClothFold-v0", "learned:bc_ppo"),
-    ("ClothHang-v0", "learned:bc_ppo"),
+    ("ClothFold-v0", "learned:bc"),
+    ("ClothHang-v0", "learned:bc"),
 )
 # what is changed, and what it is called in the picture
 VARIANTS: dict[str, dict[str, Any]] = {
     "as trained": {},
     "verlet": {"integrator": "verlet"},
     "implicit Euler": {"integrator": "implicit_euler"},
-    "twice the substeps": {"substeps": 100},
+    "100 substeps": {"substeps": 100},
     "13 a side": {"rows": 13},
     "25 a side": {"rows": 25},
     "33 a side": {"rows": 33},
@@ -52,9 +51,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-def cell(env_id: str, actor: str, changed: dict[str, Any]) -> dict[str, Any]:
-    """Success of one policy under one change."""
-    kwargs = policies.env_kwargs(actor, env_id) | changed
+def cell(env_id: str, actor: str, kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Success of one policy in an environment with these arguments."""
     kwargs = {name: value for name, value in kwargs.items() if name != "settling"}
     episodes = run_episodes(env_id, policies.named(actor, env_id, HELD_OUT), list(range(HELD_OUT, HELD_OUT + EPISODES)), **kwargs)
     successes = int(episodes["is_success"].sum())
@@ -62,7 +60,6 @@ def cell(env_id: str, actor: str, changed: dict[str, Any]) -> dict[str, Any]:
         "success_rate": successes / EPISODES,
         "success_rate_ci95": wilson(successes, EPISODES),
         "normalized_performance": float(episodes["normalized_performance"].mean()),
-        "digest": digest_of(env_id, kwargs),
     }
 
 
@@ -97,16 +94,21 @@ def main() -> None:
     rows: dict[str, dict[str, Any]] = {f"{env_id} {actor}": {} for env_id, actor in ACTORS}
     if RESULTS.exists():
         rows |= files.read_json(RESULTS, "table of transfers", "remove it, and make it anew")["rows"]
+    for env_id, actor in ACTORS:
+        policies.checked(actor, env_id)
     wanted = [(env_id, actor, variant) for env_id, actor in ACTORS for variant in VARIANTS]
     for env_id, actor, variant in tqdm([] if options.draw else wanted, unit="cell"):
         own = rows[f"{env_id} {actor}"]
-        if variant in own:
-            continue
+        changed = {**policies.env_kwargs(actor, env_id), **VARIANTS[variant]}
         try:
-            own[variant] = cell(env_id, actor, VARIANTS[variant])
+            now = digest_of(env_id, changed)
         except ValueError as error:  # a change that this task does not take
             print(f"{env_id}, {variant}: {error}")
             continue
+        # a cell of other code is measured again
+        if own.get(variant, {}).get("digest") == now:
+            continue
+        own[variant] = cell(env_id, actor, changed) | {"digest": now}
         files.write_json(RESULTS, {"machine": machine(), "episodes": EPISODES, "variants": VARIANTS, "rows": rows})
     print(
         json.dumps({name: {variant: one["success_rate"] for variant, one in row.items()} for name, row in rows.items()}, indent=1)

@@ -8,7 +8,7 @@ it cannot make itself (see ``_jit.uncounted``), is made by ``room_for_block``.
 from __future__ import annotations
 
 from functools import cache
-from threading import get_ident
+from threading import local
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,18 +127,17 @@ class MainLoop:
 
     def __init__(self, kernel: Any, make_room: Any) -> None:
         self.kernel, self.make_room = kernel, make_room
-        # by thread
-        self.rooms: dict[int, Any] = {}
+        # each thread has one, as long as it lives
+        self.rooms = local()
 
     def __call__(
         self, first: int, last: int, motion: Motion, weave: Any, fabric: Any, solids: Solid, sheet: Any, schedule: Schedule,
         outcome: Outcome,
     ) -> None:  # fmt: skip
         """One control step of blocks ``first`` to ``last``."""
-        thread = get_ident()
-        if thread not in self.rooms:
-            self.rooms[thread] = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
-        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms[thread])
+        if not hasattr(self.rooms, "own"):
+            self.rooms.own = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
+        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms.own)
 
 
 @cache

@@ -149,6 +149,7 @@ def index(scores: Suite) -> str:
         "| id | goal | sheet | episode | actions | expert's score | its success |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
+    digests = report.read_digests()
     for env_id, (_, goal) in ENVIRONMENTS.items():
         env = gym.make(env_id).unwrapped
         task: Any = env.task  # type: ignore[attr-defined]
@@ -156,6 +157,8 @@ def index(scores: Suite) -> str:
             (row for row in scores["rows"] if (row["env"], row["policy"], row["env_kwargs"]) == (env_id, "expert", {})), None
         )
         cells = suite.cells(row) if row else {"score": "", "success": ""}
+        if row and not report.is_present(row, digests):
+            cells["score"] += " **(old)**"
         about = f"{_sheet(task)} | {_time(task)} | {_size(env.action_space)}"
         rows.append(f"| [`{env_id}`]({env_id}.md) | {goal} | {about} | {cells['score']} | {cells['success']} |")
         env.close()

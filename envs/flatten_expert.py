@@ -122,24 +122,26 @@ def flatten_picks(task: Any) -> NDArray:
     """Actions of all environments with "pick_place", (num_envs, 10): corners by their numbers, in a fixed order, are pulled apart.
 
     First both ends of an edge, and of the opposite one, to where the edge would lie were the sheet flat behind it; then the
-    diagonals, one across the other.  No choice among corners: what it does is a smooth function of where these are, and of time.
+    diagonals, one across the other.  No choice among corners: but for the side on which they lie, what it does is a smooth function
+    of where they are, and of time; and what is flat is left alone.
     """
     n, side, half = task.num_envs, task.physics.side, task.workspace * task.physics.side
     p = task.simulation.positions[:, list(task.physics.mesh.corners), :2].astype(np.float64)
     actions = np.ones((n, 2, 5))
     number = task.episode["step"] // STEPS
     for k, (a, b, c, d) in enumerate(PULLS):
-        # across: the direction in which the corners are pulled apart; out: from the others to them
+        # along: the direction of the edge, or of the other diagonal; turned: across it, on the side of the corners
         on_edge = k < EDGES_FIRST
         along = (p[:, b] - p[:, a]) + (p[:, d] - p[:, c]) if on_edge else p[:, d] - p[:, c]
         along /= np.maximum(np.sqrt(along[:, 0] ** 2 + along[:, 1] ** 2), 1e-9)[:, None]
         turned = np.stack([-along[:, 1], along[:, 0]], axis=1)
         ahead = (p[:, a] + p[:, b] - p[:, c] - p[:, d]) / 2 if on_edge else p[:, b] - p[:, a]
         turned *= np.where(turned[:, 0] * ahead[:, 0] + turned[:, 1] * ahead[:, 1] < 0, -1.0, 1.0)[:, None]
-        middle, across, whole = (p[:, c] + p[:, d]) / 2, turned, np.sqrt(2) * side
+        middle = (p[:, c] + p[:, d]) / 2
         if on_edge:
-            middle, across, whole = middle + side * turned, along, side
-        apart = PULLED * whole / 2 * across
+            middle, apart = middle + side * turned, PULLED * side / 2 * along
+        else:
+            apart = PULLED * np.sqrt(2) * side / 2 * turned
         now = (number == k) & (task.episode["coverage"] < DONE)
         for gripper, (pick, place) in enumerate(((p[:, a], middle - apart), (p[:, b], middle + apart))):
             actions[now, gripper, 0:2], actions[now, gripper, 2:4] = pick[now] / half, place[now] / half

@@ -136,12 +136,12 @@ class Observer:
         """These environments have a new state."""
         self.stale[envs] = self.pictures is not None
 
-    def stepped(self) -> None:
-        """All environments that were not over before it have made a step."""
+    def stepped(self, envs: NDArray) -> None:
+        """Those of these environments that were not over before it have made a step."""
         if self.pictures is None:
             return
         over, outcome = self.task.episode["over"], self.task.outcome
-        self.stale |= (~over | outcome["terminated"]) & (outcome["failure"] != DIVERGED)
+        self.stale[envs] |= ((~over | outcome["terminated"]) & (outcome["failure"] != DIVERGED))[envs]
         # what goes on after an episode's end is not observed
         self._draw(np.flatnonzero(self.stale & over))
 

@@ -71,7 +71,7 @@ COMMON: dict[str, tuple[str, str]] = {
     "settling": (
         '``"steps"``',
         'or ``"at_once"``: the step in which the agent is done goes on until the sheet has settled and is evaluated, and brings '
-        "the rewards of all of it, so that no action is ignored",
+        "the rewards of all of it, so that no action is ignored; for sheets without holes, see docs/actions.md",
     ),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
     "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),

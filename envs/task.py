@@ -365,16 +365,28 @@ class Task(TaskDefinition):
             self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
-        self.before_step(actions)
-        simulation.step(envs=envs)
-        self.info[chosen] = np.zeros((), self.info.dtype)
-        self.after_step()
+        if envs is None:
+            self.before_step(actions)
+            simulation.step()
+            self.info[...] = np.zeros((), self.info.dtype)
+            self.after_step()
+        else:
+            # a task's own methods go through the whole batch: what they change of those that stand still is put back
+            still = np.ones(self.num_envs, bool)
+            still[envs] = False
+            kept = [(array, array[still]) for array in (self.episode, self.info, simulation.orders.openings[: self.num_envs])]
+            self.before_step(actions)
+            simulation.step(envs=envs)
+            self.info[envs] = np.zeros((), self.info.dtype)
+            self.after_step()
+            for array, values in kept:
+                array[still] = values
         self._score_and_observe(chosen, begins=False)
         # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
             simulation.release(*np.nonzero(self.outcome["free"]))
             self.outcome["free"] = 0
-        self.observed.stepped()
+        self.observed.stepped(chosen)
 
     def steps_taken(self) -> NDArray:
         """Calls of ``step`` since each episode's start, (num_envs,)."""

@@ -62,7 +62,7 @@ def test_an_exported_learner_acts_as_it_did(scripts, learner):
     from clothgym.adapters.sb3 import make_sb3_vec_env
 
     env, kwargs = make_sb3_vec_env("ClothReach-v0", 2), {"policy_kwargs": {"net_arch": [32, 32]}, "device": "cpu", "seed": 0}
-    model = PPO("MlpPolicy", env, n_steps=8, **kwargs) if learner == "ppo" else SAC("MlpPolicy", env, **kwargs)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=16, **kwargs) if learner == "ppo" else SAC("MlpPolicy", env, **kwargs)
     seen = np.random.default_rng(3).normal(size=(40, 58)).astype(np.float32)
     policy = exported(model, {"env": "ClothReach-v0", "env_kwargs": {}, "algo": learner, "seed": 0}, {})
     assert policy.activation == ("tanh" if learner == "ppo" else "relu")

@@ -83,7 +83,10 @@ def test_learners_with_other_arguments_are_other_rows(report):
     assert [len(rows) for rows in report.groups(same).values()] == [2]
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
     assert [label for _, label in report.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
-    assert report.best_of("ClothReach-v0", other) == "PPO: 0.85 in 1 min" and report.best_of("ClothDrape-v0", other) == "–"
+    now = {"ClothReach-v0": "now"}
+    assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 1 min"
+    assert report.best_of("ClothDrape-v0", other, now) == "–"
+    assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}).endswith("1 min **(old)**")
 
 
 def test_sections_are_filled_and_the_rest_of_a_page_stays(report):
@@ -107,10 +110,15 @@ def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(rep
         folder.mkdir()
         for name in report.KEPT:
             (folder / name).write_text("{}")
-        about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": seed, "chosen_by": chosen_by}
+        about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": seed, "chosen_by": chosen_by, "digest": "now"}
         policies.Policy([(np.ones((3, 2)), np.zeros(2))], about=about).save(folder / "policy.npz")
     report.add(sorted(tmp_path.glob("ClothReach-v0_*")))
     assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["seed"] == 1
     assert sorted(path.name for path in (tmp_path / "results" / "ClothReach-v0_0").iterdir()) == sorted(report.KEPT)
+    # the same seed again, and worse: what is committed is what its row says
+    about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": 1, "chosen_by": 0.1, "digest": "now"}
+    policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_1" / "policy.npz")
+    report.add([tmp_path / "ClothReach-v0_1"])
+    assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["chosen_by"] == 0.1
     with pytest.raises(ValueError, match="holds no finished run, it lacks evaluation.json"):
         report.add([tmp_path])

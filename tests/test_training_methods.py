@@ -152,7 +152,7 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
         "hyperparameters": {"policy_kwargs": kwargs}, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
     }  # fmt: skip
     files.write_json(tmp_path / "config.json", config)
-    save_checkpoint(tmp_path, model)
+    save_checkpoint(tmp_path, model, {})
     few = {name: part[:7] for name, part in seen.items()}
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 

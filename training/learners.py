@@ -59,16 +59,20 @@ def _linear(text: str) -> Any:
 # --- checkpoints --------------------------------------------------------------------------------------------------------------
 
 
-def save_checkpoint(folder: Path, model: Any) -> None:
-    """Write the learner's tensors; the checkpoint before is kept, whatever happens.  A replay buffer is not part of it."""
+def save_checkpoint(folder: Path, model: Any, times: dict[str, float]) -> None:
+    """Write the learner's tensors, and the time that it has taken [s]; the checkpoint before is kept, whatever happens.
+
+    A replay buffer is not part of it: a learner that has one fills it anew.
+    """
     parameters = model.get_parameters()
     state = {
         "policy": parameters.pop("policy"),
         "optimizer": parameters,
-        "variables": {name: _found(model, name).detach() for name in _variables(model)},
+        "variables": {name: getattr(model, name).detach() for name in _variables(model)},
         "constraint": model.constraint_state() if isinstance(model, LagrangianPPO) else {},
         "num_timesteps": model.num_timesteps,
         "num_updates": model._n_updates,
+        "times": times,
     }
     save_tensors(folder / CHECKPOINT, state)
 
@@ -82,20 +86,19 @@ def load_checkpoint(folder: Path, model: Any, state: dict[str, Any]) -> None:
     with files.naming(folder, "run whose checkpoint is of the network in its configuration", ADVICE):
         model.set_parameters({"policy": state["policy"], **state["optimizer"]}, device="cpu")
         for name in _variables(model):
-            _found(model, name).data = state["variables"][name]
+            getattr(model, name).data = state["variables"][name]
         if isinstance(model, LagrangianPPO):
             model.set_constraint_state(state["constraint"])
     model.num_timesteps = int(state["num_timesteps"])
     model._n_updates = int(state["num_updates"])
+    if isinstance(model, SAC):
+        # its replay buffer is empty: it acts at random again until there is something to learn from
+        model.learning_starts += model.num_timesteps
 
 
 def _variables(model: Any) -> list[str]:
     """Names of the learner's tensors that belong to no module, SAC's log_ent_coef for instance."""
     return model._get_torch_save_params()[1]
-
-
-def _found(model: Any, name: str) -> torch.Tensor:
-    return getattr(model, name)
 
 
 # --- exported policies --------------------------------------------------------------------------------------------------------

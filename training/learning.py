@@ -25,7 +25,7 @@ from clothgym.checks import number as finite_number
 from clothgym.lab.bench import machine
 from clothgym.lab.digests import digest_of
 
-PROGRESS, MODEL = "progress.jsonl", "model.zip"
+PROGRESS, MODEL, EVALUATION = "progress.jsonl", "model.zip", "evaluation.json"
 SCORES = (
     "timesteps",
     "training_seconds",
@@ -58,20 +58,20 @@ class Clock:
 class Watch(BaseCallback):
     """Between rollouts: a checkpoint each minute; and every so many steps a score on held-out seeds, a line in progress.jsonl.
 
-    every: environment steps between two scores.  done: steps of the checkpoint that it goes on from; lines after it are dropped.
+    every: environment steps between two scores.  state: of the checkpoint that it goes on from; lines after it are dropped.
     """
 
-    def __init__(self, folder: Path, config: Config, every: int, episodes: int, done: int) -> None:
+    def __init__(self, folder: Path, config: Config, every: int, episodes: int, state: dict[str, Any] | None) -> None:
         super().__init__()
         self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
-        self.lines = [line for line in read_progress(folder) if line["timesteps"] <= done]
-        last = self.lines[-1] if self.lines else {"training_seconds": 0.0, "core_seconds": 0.0, "timesteps": 0}
-        self.clock = Clock(last["training_seconds"], last["core_seconds"])
+        before = state or {"num_timesteps": 0, "times": {}}
+        self.lines = [line for line in read_progress(folder) if line["timesteps"] <= before["num_timesteps"]]
+        self.clock = Clock(before["times"].get("training_seconds", 0.0), before["times"].get("core_seconds", 0.0))
         # a clone is scored before it learns on
-        self.next = 0 if config["clone"] and not self.lines else int(last["timesteps"]) + every
+        self.next = 0 if config["clone"] and not self.lines else int(self.lines[-1]["timesteps"] if self.lines else 0) + every
         self.saved = time.perf_counter()
         # time in which environments step and the policy chooses actions, and when that began [s]
-        self.collecting, self.collects_since = last.get("collecting_seconds", 0.0), 0.0
+        self.collecting, self.collects_since = before["times"].get("collecting_seconds", 0.0), 0.0
 
     def _on_step(self) -> bool:
         return True
@@ -92,8 +92,13 @@ class Watch(BaseCallback):
         self.collecting += time.perf_counter() - self.collects_since
         torch.set_num_threads(self.config["threads"])
 
+    def times(self) -> dict[str, float]:
+        """Time spent on training so far [s]."""
+        wall, cores = map(float, self.clock.spent)
+        return {"training_seconds": wall, "core_seconds": cores, "collecting_seconds": self.collecting}
+
     def save(self) -> None:
-        save_checkpoint(self.folder, self.model)
+        save_checkpoint(self.folder, self.model, self.times())
         self.saved = time.perf_counter()
 
     def evaluate(self, episodes: int) -> None:
@@ -107,9 +112,7 @@ class Watch(BaseCallback):
         first = evaluate.HELD_OUT + 1_000_000
         seeds = list(range(first, first + episodes))
         found = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
-        wall, cores = self.clock.spent
-        line = {"timesteps": self.num_timesteps, "training_seconds": wall, "core_seconds": cores, "episodes": episodes}
-        line["collecting_seconds"] = self.collecting
+        line = {"timesteps": self.num_timesteps, **self.times(), "episodes": episodes}
         line |= {"success_rate": float(found["is_success"].mean())}
         line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
         if "episode_cost" in found:
@@ -191,8 +194,8 @@ def read_progress(folder: Path) -> list[dict[str, float]]:
     return lines
 
 
-def learner(folder: Path, config: Config, resume: bool) -> tuple[Any, int]:
-    """The learner of a new run, or of one that goes on, and the environment steps that it has done.
+def learner(folder: Path, config: Config, resume: bool) -> tuple[Any, dict[str, Any] | None]:
+    """The learner of a new run, or of one that goes on, with the checkpoint that it goes on from.
 
     Raises:
         ValueError, TypeError: the environment or the learner does not take one of its options, or no checkpoint can be read.
@@ -205,34 +208,51 @@ def learner(folder: Path, config: Config, resume: bool) -> tuple[Any, int]:
         print(f"going on with {folder} at {done:,} of {config['timesteps']:,} steps")
     elif resume:
         print(f"{folder} has no checkpoint yet: beginning anew")
-    return model, done
+    return model, state
 
 
-def train(folder: Path, config: Config, model: Any, done: int, eval_episodes: int, evaluations: int, final_episodes: int) -> None:
-    """Learn, with held-out evaluations on the way, and score what was learned."""
+def train(
+    folder: Path,
+    config: Config,
+    model: Any,
+    state: dict[str, Any] | None,
+    eval_episodes: int,
+    evaluations: int,
+    final_episodes: int,
+) -> None:
+    """Learn, with held-out evaluations on the way, and score what was learned; state: of the checkpoint that it goes on from."""
+    done = 0 if state is None else int(state["num_timesteps"])
     with refused():
-        watch = Watch(folder, config, max(1, config["timesteps"] // evaluations), eval_episodes, done)
+        watch = Watch(folder, config, max(1, config["timesteps"] // evaluations), eval_episodes, state)
         callbacks: list[BaseCallback] = [watch]
     if config["curriculum"] and done < config["curriculum"]["n_timesteps"]:
         callbacks.append(Curriculum(config, config["curriculum"]["n_timesteps"]))
-    if config["clone"] and done == 0:
-        watch.clock.start()
-        learn_from_expert(model, config)
-        watch.clock.stop()
-        callbacks.append(FrozenPolicy(config["clone"].get("critic_rollouts", 0)))
+    if config["clone"]:
+        if state is None:
+            watch.clock.start()
+            with refused():
+                learn_from_expert(model, config)
+            watch.clock.stop()
+        rollouts = done // (config["num_envs"] * model.n_steps)
+        callbacks.append(FrozenPolicy(config["clone"].get("critic_rollouts", 0) - rollouts))
     if config["timesteps"] > done:
+        # what the run has exported before is of another policy now
+        for name in (POLICY, MODEL, EVALUATION):
+            (folder / name).unlink(missing_ok=True)
         try:
             # learn() counts its steps on top of those done when the counter is not reset
             left = config["timesteps"] - done
             seen = sys.stdout.isatty() and sys.stderr.isatty()
             model.learn(left, callback=callbacks, progress_bar=seen, reset_num_timesteps=False, tb_log_name=config["algo"])
         except KeyboardInterrupt:
-            save_checkpoint(folder, model)
+            watch.clock.stop()
+            save_checkpoint(folder, model, watch.times())
             raise
         watch.clock.stop()
-    elif not watch.lines:  # a clone alone
+    else:  # a clone alone, or a run that was killed before its score
         watch.init_callback(with_logger(model))
-    if config["timesteps"] > done or not (folder / MODEL).exists():
+        watch.num_timesteps = done
+    if config["timesteps"] > done or not (folder / MODEL).exists() or not watch.lines:
         watch.evaluate(max(eval_episodes, min(CHOOSING_EPISODES, final_episodes)))
         with files.replacing(folder / MODEL) as part:
             model.save(part)
@@ -252,7 +272,10 @@ def learn_from_expert(model: Any, config: Config) -> None:
     options = {name: value for name, value in config["clone"].items() if name != "critic_rollouts"}
     env: Any = model.env
     episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
-    samples = demonstrations(env, episodes, noise, config["seed"])
+    try:
+        samples = demonstrations(env, episodes, noise, config["seed"])
+    except NotImplementedError as missing:
+        raise ValueError(str(missing)) from missing
     torch.set_num_threads(config["threads"])
     for number in range(rounds + 1):
         if number:
@@ -274,7 +297,7 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     policy, path = exported(model, config, about), folder / POLICY
     if policy is not None:
         policy.save(path)
-    acting = policies.exported(path) if policy is not None else policies.learned(folder, config["env"])
+    acting = policies.exported(path) if policy is not None else lambda env, seen: model.predict(seen, deterministic=True)[0]
     names = ["noop", "random", "expert"] + ["careless"] * (config["env"] == "ClothStrain-v0")
     scores = {}
     for name in [*names, str(folder)]:
@@ -289,7 +312,7 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     print(f"{config['env']}, held-out episodes\n{evaluate.table(scores)}")
     own = scores.pop(str(folder)) | {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": config["algo"]}
     own |= {"seed": config["seed"], "references": scores} | about
-    evaluate.write_json(folder / "evaluation.json", own)
+    evaluate.write_json(folder / EVALUATION, own)
     if policy is not None:
         # the file says what it scores
         policy.about |= {name: own[name] for name in ("success_rate", "normalized_performance", "episodes")}

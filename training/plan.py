@@ -253,13 +253,10 @@ def episode(planner: Planner, seed: int) -> dict[str, Any]:
     return last | result | {"seconds": time.perf_counter() - begun}
 
 
-def summary(row: suite.Row, results: list[dict[str, Any]]) -> suite.Row:
+def summary(row: suite.Row, results: list[dict[str, Any]], digest: str) -> suite.Row:
     """A row of the suite from its episodes, which it keeps."""
-    from clothgym.lab.digests import digest_of  # imported here: flags are checked before numba is loaded
-
     whole = score({name: np.array([one[name] for one in results]) for name in results[0]})
     sums = {name: sum(one[name] for one in results) for name in ("model_steps", "mispredicted", "seconds")}
-    digest = digest_of(row["env"], row["env_kwargs"])
     return row | whole | sums | {"date": suite.today(), "digest": digest, "by_episode": results}
 
 
@@ -270,7 +267,7 @@ def draw(path: Path, env_id: str, env_kwargs: dict[str, Any], seed: int, taken: 
     steps = iter(range(max(map(len, taken))))
 
     def policy(env: Any, observations: Any) -> NDArray:
-        step = next(steps)
+        step = next(steps, -1)
         return np.stack([actions[min(step, len(actions) - 1)] for actions in taken])
 
     drawing.film(path, env_id, policy, env_kwargs, episodes=len(taken), seed=seed)
@@ -278,6 +275,8 @@ def draw(path: Path, env_id: str, env_kwargs: dict[str, Any], seed: int, taken: 
 
 
 def main(args: Args) -> None:
+    from clothgym.lab.digests import digest_of  # imported here: flags are checked before numba is loaded
+
     kwargs = policies.parsed_kwargs(args.env_kwargs)
     row: suite.Row = {"env": args.env, "policy": "cem from expert" if args.from_expert else "cem", "seed": args.seed}
     row |= {"env_kwargs": kwargs, "settings": {name: value for name, value in asdict(args).items() if name in SETTINGS}}
@@ -286,7 +285,9 @@ def main(args: Args) -> None:
         before = suite.found(suite.load(args.json), row)
         env = gym.make_vec(args.env, num_envs=1, autoreset_mode="Disabled", **(kwargs | {"threads": 1}))
         planner = Planner(args, env, **kwargs)
-    results = [] if before is None else list(before["by_episode"])
+    # episodes of other code are not gone on with
+    digest = digest_of(args.env, kwargs)
+    results = list(before["by_episode"]) if before is not None and before.get("digest") == digest else []
     if results:
         print(f"{args.env}: {len(results)} episodes are in the file already")
     suite.warm(args.env, policies.noop, kwargs)
@@ -300,12 +301,12 @@ def main(args: Args) -> None:
         taken.append(planner.taken)
         scored = f"score {one['normalized_performance']:.3f}, return {one['return']:.3f}"
         print(f"seed {one['seed']}: {scored}, {one['seconds']:.1f} s", flush=True)
-        suite.keep(args.json, summary(row, results))
+        suite.keep(args.json, summary(row, results, digest))
     if args.film is not None and taken:
         draw(args.film, args.env, kwargs, first, taken[:4])
     if not results:
         return
-    whole = summary(row, results)
+    whole = summary(row, results, digest)
     print(f"from seed {args.seed}\n{suite.table([whole])}")
     if whole["mispredicted"]:
         print(f"{whole['mispredicted']} steps were not as predicted: the model is not the environment")

@@ -123,7 +123,9 @@ def choose() -> None:
     for path in sorted(RUNS.glob(f"*/{POLICY}")):
         about = policies.read(path).about
         kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
-        if not kept.exists() or policies.read(kept).about["chosen_by"] <= about["chosen_by"]:
+        other = policies.read(kept).about if kept.exists() else about
+        # one of the same seed, or of other code, is not compared with, but replaced
+        if other["chosen_by"] <= about["chosen_by"] or other["seed"] == about["seed"] or other["digest"] != about["digest"]:
             shutil.copyfile(path, kept)
         path.unlink()
 
@@ -194,14 +196,15 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
     return markdown(rows) if rows else "None yet."
 
 
-def best_of(env_id: str, results: list[Result]) -> str:
+def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
     """How an environment is learned best, in a few words."""
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
     if not found:
         return "–"
     label, rows = max(found, key=lambda one: interquartile_mean(row["success_rate"] for row in one[1]))
     minutes = statistics.median(row["training_seconds"] for row in rows) / 60
-    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {minutes:.0f} min"
+    old = _old(all(is_present(row, digests) for row in rows))
+    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {max(minutes, 1):.0f} min{old}"
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
@@ -271,7 +274,7 @@ def sections(results: list[Result], scripted: list[Result], digests: dict[str, s
     for name in made:
         if (CURVES / f"{name.split()[-1]}.png").exists():
             made[name] += f"\n\n![Held-out success while learning](curves/{name.split()[-1]}.png)"
-    return made | {"environments": environments(results)}
+    return made | {"environments": environments(results, digests)}
 
 
 GOALS = (
@@ -288,13 +291,13 @@ GOALS = (
 )
 
 
-def environments(results: list[Result]) -> str:
+def environments(results: list[Result], digests: dict[str, str]) -> str:
     """The README's table: what there is, and how it is learned."""
     lines = ["| id | goal | learned by |", "| --- | --- | --- |"]
     for env_id, goal in GOALS:
         hard = env_id.replace("-v0", "-Hard-v0")
         names = ", ".join(f"[`{name}`](docs/tasks/{name}.md)" for name in (env_id, hard) if name in ENVIRONMENTS)
-        lines.append(f"| {names} | {goal} | {best_of(env_id, results)} |")
+        lines.append(f"| {names} | {goal} | {best_of(env_id, results, digests)} |")
     return "\n".join(lines)
 
 
@@ -342,11 +345,11 @@ def main(args: Args) -> None:
                 picture = draw_curves(env_id, learned())
                 if picture is not None:
                     files.write(CURVES / f"{env_id}.png", picture)
-        stale = [path for path, text in pages().items() if path.read_text() != text]
-        for path in stale:
+        stale = {path: text for path, text in pages().items() if path.read_text() != text}
+        for path, text in stale.items():
             print(f"{path.relative_to(ROOT)}: {'stale' if args.check else 'written'}")
             if not args.check:
-                path.write_text(pages()[path])
+                files.write(path, text)
     if args.check and stale:
         raise SystemExit(1)
 

@@ -129,8 +129,8 @@ def run(
     rows = []
     for number, (row, policy) in enumerate(zip(wanted, chosen), 1):
         what = f"{number} of {len(wanted)}: {row['env']} {row['policy']}"
-        before = found(finished, row)
-        if before is not None and before["episodes"] == episodes:
+        before, digest = found(finished, row), digest_of(row["env"], row["env_kwargs"])
+        if before is not None and before["episodes"] == episodes and before.get("digest") == digest:
             rows.append(before)
             say(f"{what}: in the file already")
             continue
@@ -138,7 +138,6 @@ def run(
         warm(row["env"], policy, kwargs)
         begun = time.perf_counter()
         result = score(run_episodes(row["env"], policy, list(range(row["seed"], row["seed"] + episodes)), **kwargs))
-        digest = digest_of(row["env"], row["env_kwargs"])
         rows.append(row | result | {"seconds": time.perf_counter() - begun, "date": today(), "digest": digest})
         keep(path, rows[-1])
         say(f"{what}: score {result['normalized_performance']:.3f}, {rows[-1]['seconds']:.1f} s")

@@ -1,4 +1,4 @@
-"""Train PPO on a clothgym environment, evaluate it on held-out seeds, and leave a folder that tells the story.
+"""Train a policy, by PPO unless another learner is named, evaluate it on held-out seeds, and leave a folder that tells the story.
 
     python training/train.py --env ClothDrape-v0                    # runs/ClothDrape-v0_0
     python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
@@ -30,6 +30,8 @@ from clothgym import files
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
+# what these parts of the hyperparameters must have
+PARTS = {"clone": ("episodes", "noise", "epochs", "batch_size", "learning_rate"), "curriculum": ("n_timesteps", "env_kwargs")}
 
 
 @dataclass
@@ -99,6 +101,10 @@ class Args:
         hyperparameters = dict(table[self.env])
         needed = ("n_envs", "n_timesteps", "policy", "train_freq" if self.algo in policies.OFF_POLICY else "n_steps")
         missing = [key for key in needed if key not in hyperparameters]
+        for part, keys in PARTS.items():
+            if part in hyperparameters and not isinstance(hyperparameters[part], dict):
+                raise ValueError(f"{path}: {part} of {self.env!r} must have {', '.join(keys)}")
+            missing += [f"{part}'s {key}" for key in keys if part in hyperparameters and key not in hyperparameters[part]]
         if missing:
             raise ValueError(f"{path} lacks {', '.join(missing)} for {self.env!r}")
         config = {
@@ -135,11 +141,11 @@ def main(args: Args) -> None:
 
     folder, config = args.folder, args.config
     with refused():
-        model, done = learner(folder, config, args.resume is not None)
-    if args.resume is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        files.write_json(folder / policies.CONFIG, config)
-    train(folder, config, model, done, args.eval_episodes, args.evaluations, args.final_episodes)
+        model, state = learner(folder, config, args.resume is not None)
+    # a run that goes on may have been given other steps
+    folder.mkdir(parents=True, exist_ok=True)
+    files.write_json(folder / policies.CONFIG, config)
+    train(folder, config, model, state, args.eval_episodes, args.evaluations, args.final_episodes)
 
 
 if __name__ == "__main__":

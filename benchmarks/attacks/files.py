@@ -192,7 +192,7 @@ def _policy() -> Any:
 
 def _save_checkpoint(path: Path) -> None:
     policy = _policy()
-    more = {"optimizer": {"policy.optimizer": policy.optimizer.state_dict()}, "variables": {}, "constraint": {}}
+    more = {"optimizer": {"policy.optimizer": policy.optimizer.state_dict()}, "variables": {}, "constraint": {}, "times": {}}
     runs.save_tensors(path, {"policy": policy.state_dict(), **more, "num_timesteps": 100, "num_updates": 3})
 
 

@@ -1,4 +1,4 @@
-"""PPO under a constraint on cost: a Lagrange multiplier, and a critic of the cost's own, on Stable-Baselines3's PPO.
+"""PPO under a constraint on cost: a Lagrange multiplier, and a separate critic for the cost, on Stable-Baselines3's PPO.
 
 Maximize the return subject to  J <= d,  with the mean cost J of an episode, the sum of its steps' costs, and the limit d.  PPO
 climbs along the advantage  (A_r - lambda A_c) / (1 + lambda)  with the advantages A_r of the reward and A_c of the cost (Ray,

@@ -102,7 +102,8 @@ def load_tensors(path: Path) -> dict[str, Any]:
         content = files.unmarked(files.read(path), "checkpoint", VERSION)
         files.opened(content).close()
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-        kinds = {"policy": dict, "optimizer": dict, "variables": dict, "constraint": dict, "num_timesteps": int, "num_updates": int}
+        parts = ("policy", "optimizer", "variables", "constraint", "times")
+        kinds = dict.fromkeys(parts, dict) | {"num_timesteps": int, "num_updates": int}
         if not isinstance(state, dict) or any(not isinstance(state.get(name), kind) for name, kind in kinds.items()):
             raise ValueError(f"it does not hold {', '.join(kinds)}")
         if min(state["num_timesteps"], state["num_updates"]) < 0:

@@ -63,12 +63,23 @@ def name_of(env_id: str, env_kwargs: Mapping[str, Any]) -> str:
 
 
 def digest_of(env_id: str, env_kwargs: Mapping[str, Any]) -> str:
+    """The digest of an environment with these keyword arguments, as the code is."""
+    name = name_of(env_id, env_kwargs)
+    if name not in _found:
+        _found[name] = _computed(checked_id(env_id), env_kwargs)
+    return _found[name]
+
+
+_found: dict[str, str] = {}  # by ``name_of``: the code of a process does not change
+
+
+def _computed(env_id: str, env_kwargs: Mapping[str, Any]) -> str:
     """Of whole episodes from seeds 0 to 3, with the scripted expert, where there is one, and with random actions.
 
     Everything counts: observations, rewards and infos of every step, and the sheets at the end.
     """
     kwargs = {name: value for name, value in env_kwargs.items() if name not in WITHOUT_EFFECT}
-    env: Any = gym.make_vec(checked_id(env_id), num_envs=ENVS, autoreset_mode="Disabled", threads=1, **kwargs).unwrapped
+    env: Any = gym.make_vec(env_id, num_envs=ENVS, autoreset_mode="Disabled", threads=1, **kwargs).unwrapped
     random, digest = np.random.default_rng(7), Digest()
     observation, info = env.reset(seed=0)
     digest.add(observations=observation, infos=info)

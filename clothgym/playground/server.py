@@ -12,6 +12,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -204,18 +205,24 @@ def committed_policies(env_id: str) -> dict[str, Policy]:
         # a sheet settles before the visitor's eyes
         kwargs = {name: value for name, value in policy.about["env_kwargs"].items() if name != "settling"}
         if "action_mode" not in kwargs:
-            found[f"learned, {learner}"] = Learnt(lambda env, observations, policy=policy: policy(observations), kwargs)
+            found[f"learned, {learner}"] = Learnt(partial(_decided, policy), kwargs)
     return found
+
+
+def _decided(policy: policies.Policy, env: Any, observations: Any) -> NDArray:
+    return policy(observations)
 
 
 @dataclass(frozen=True)
 class Learnt:
     """A policy for batches, in a single environment, and what that was made with when the policy was trained."""
 
-    act: Policy
+    act: Callable[[Any, Any], NDArray]
     env_kwargs: Mapping[str, Any]
 
-    def __call__(self, env: Any, observation: NDArray) -> NDArray:
+    def __call__(self, env: Any, observation: Any) -> NDArray:
+        if isinstance(observation, Mapping):  # of a goal task
+            return self.act(env, {name: part[None] for name, part in observation.items()})[0]
         return self.act(env, observation[None])[0]
 
 

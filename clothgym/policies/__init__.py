@@ -50,18 +50,18 @@ class Policy:
         about: Mapping[str, Any] | None = None,
     ) -> None:
         one_of("activation", activation, *ACTIVATIONS)
-        check_layers(layers)
         # as they are kept in a file: what is scored is what is loaded
         self.layers = [(as_kept(weight), as_kept(bias)) for weight, bias in layers]
+        check_layers(self.layers)
         self.activation, self.squashed, self.keys, self.about = activation, bool(squashed), tuple(keys), dict(about or {})
 
     def make(self, **kwargs: Any) -> gym.Env:
         """The environment that it was trained for, with the same keyword arguments, and these."""
-        return gym.make(f"clothgym:{self.about['env']}", **(self.about["env_kwargs"] | kwargs))
+        return gym.make(self.about["env"], **(self.about["env_kwargs"] | kwargs))
 
     def make_vec(self, num_envs: int, **kwargs: Any) -> gym.vector.VectorEnv:
         """A batch of it."""
-        return gym.make_vec(f"clothgym:{self.about['env']}", num_envs=num_envs, **(self.about["env_kwargs"] | kwargs))
+        return gym.make_vec(self.about["env"], num_envs=num_envs, **(self.about["env_kwargs"] | kwargs))
 
     def __call__(self, observation: Any) -> NDArray[np.float32]:
         """Actions, (numbers,) or (num_envs, numbers)."""
@@ -103,8 +103,9 @@ class Policy:
 
 
 def as_kept(array: NDArray) -> NDArray[np.float32]:
-    """Numbers as a file holds them, in half precision."""
-    return np.ascontiguousarray(np.asarray(array, np.float16), np.float32)
+    """Numbers as a file holds them, in half precision; those beyond its range are infinite."""
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(np.asarray(array, np.float16), np.float32)
 
 
 def check_layers(layers: Sequence[tuple[NDArray, NDArray]]) -> None:

@@ -15,7 +15,7 @@ from clothgym._jit import inlined, kernel
 
 NONE, TANH, RELU = 0, 1, 2
 ACTIVATIONS = {"tanh": TANH, "relu": RELU}
-SATURATED = 9.0  # beyond it tanh is 1 in single precision
+SATURATED = 9.0  # beyond it tanh is 1 to single precision
 
 
 @inlined
