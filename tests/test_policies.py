@@ -153,3 +153,12 @@ def test_a_committed_policy_scores_what_it_says(env_id, learner):
     # which is what the whole of them says, within what a hundred can tell
     p = policy.about["success_rate"]
     assert abs(successes / 100 - p) < 4 * np.sqrt(max(p * (1 - p), 0.01) / 100)
+
+
+@pytest.mark.parametrize(("env_id", "learner"), COMMITTED, ids=[f"{env_id} {learner}" for env_id, learner in COMMITTED])
+def test_what_a_committed_policy_says_is_in_the_table(env_id, learner, scripts):
+    import report
+
+    about = policies.load(env_id, learner).about
+    rows = [row for row in report.learned() if (row["env"], row["learner"], row["seed"]) == (env_id, learner, about["seed"])]
+    assert [(row["success_rate"], row["digest"]) for row in rows] == [(about["success_rate"], about["digest"])]

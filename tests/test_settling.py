@@ -92,3 +92,32 @@ def test_named_environments_advance_as_alone_and_the_others_stay(threads):
     lanes = Simulation(grid(5, 5, 0.2, 0.2), num_envs=3, integrator="xpbd")
     with pytest.raises(ValueError, match=r"step\(envs=...\): with xpbd on this mesh"):
         lanes.step(envs=[0])
+
+
+def test_what_a_task_s_own_methods_do_to_those_that_stand_still_is_put_back(monkeypatch):
+    from clothgym.envs.drape import DrapeTask
+
+    def count(task):
+        task.episode["yaw"] += 1.0
+
+    monkeypatch.setattr(DrapeTask, "after_step", count)
+    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=2, autoreset_mode="Disabled", settling="at_once").unwrapped
+    env.reset(seed=4)
+    before = env.task.episode["yaw"].copy()
+    env.step(np.array([[0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0, 0, -1.0]]))
+    assert (env.task.episode["yaw"] - before).tolist() == [1 + env.task.settling_steps, 1]
+
+
+def test_a_batch_that_begins_again_by_itself_brings_the_end_of_what_has_settled():
+    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=2, autoreset_mode="SameStep", settling="at_once").unwrapped
+    env.reset(seed=4)
+    lets_go = np.array([[0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0, 0, -1.0]])
+    seen, _, terminated, _, info = env.step(lets_go)
+    assert terminated.tolist() == [True, False] and info["_final_info"].tolist() == [True, False]
+    assert info["final_info"]["settling"][0] and env.task.episode["step"].tolist() == [0, 1]
+    assert not np.array_equal(info["final_obs"][0], seen[0])
+    # the number of steps that an episode may take is of those in which the agent acts
+    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=1, autoreset_mode="Disabled", settling="at_once", max_episode_steps=2)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros((1, 8)))[2:4] for _ in range(2)]
+    assert [(terminated[0], truncated[0]) for terminated, truncated in ends] == [(False, False), (False, True)]

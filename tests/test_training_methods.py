@@ -217,3 +217,51 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
     model.learn(128, callback=[learning.Curriculum(config, 64), Note()])
     assert seen == [("fast", step) for step in range(1, 17)] + [("true", step) for step in range(1, 17)]
     assert build(learning.Path("unused"), config, 0, 64).env.unwrapped.env.task.physics_name == "true"
+
+
+def test_a_clone_alone_is_scored_again_and_not_cloned_again(tmp_path):
+    """Killed before its score, and finished."""
+    (tmp_path / "short.yml").write_text(CLONED.replace("!!float 2560", "0"))
+    options = ("--eval-episodes", 5, "--final-episodes", 10)
+    given = ("--env", "ClothReach-v0", "--algo", "bc", "--hyperparams", tmp_path / "short.yml")
+    done = run("train.py", *given, "--run", tmp_path / "run", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    before = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    for name in ("model.zip", "policy.npz", "evaluation.json"):
+        (tmp_path / "run" / name).unlink()
+    again = run("train.py", "--resume", tmp_path / "run", *options, cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert "cloned" in done.stdout and "cloned" not in again.stdout
+    after = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert after["return"] == before["return"] and after["training_seconds"] == pytest.approx(before["training_seconds"])
+
+
+def test_turned_samples_are_what_the_expert_does_with_turned_sheets(scripts):
+    from types import SimpleNamespace
+
+    from clone import turned
+
+    from clothgym.envs.flatten_expert import flatten_picks
+
+    env = gym.make_vec("clothgym:ClothFlatten-v0", num_envs=3, action_mode="pick_place").unwrapped
+    seen, _ = env.reset(seed=0)
+    task, actions = env.task, np.clip(env.task.expert(), -1, 1)
+    more, done = turned(task, (seen, actions), 2, seed=5)
+    assert np.array_equal(more[:3], seen) and np.array_equal(done[:3], actions)
+    assert more.shape == (9, 102) and done.shape == (9, 10)
+    # by how much each sheet was turned is seen from where its first corner lies
+    where = more[:, :2].astype(float) @ [1, 1j]
+    angles = np.angle(where[3:6] / where[:3])
+    x = task.simulation.positions.astype(float)
+    for e, angle in enumerate(angles):
+        c, s = np.cos(angle), np.sin(angle)
+        x[e, :, :2] = x[e, :, :2] @ np.array([[c, s], [-s, c]])
+    other = SimpleNamespace(
+        num_envs=3, physics=task.physics, workspace=task.workspace, episode=task.episode, simulation=SimpleNamespace(positions=x)
+    )
+    assert done[3:6] == pytest.approx(flatten_picks(other), abs=1e-5)
+    # heights and all that is no direction stay
+    for name in ("coverage", "corners_held", "acting_left"):
+        part = task.observation_slices[name]
+        assert np.array_equal(more[3:6, part], seen[:, part])
+    assert np.array_equal(more[3:6, 2:54:3], seen[:, 2:54:3])
