@@ -293,7 +293,7 @@ GOALS = (
 
 def environments(results: list[Result], digests: dict[str, str]) -> str:
     """The README's table: what there is, and how it is learned."""
-    lines = ["| id | goal | learned by |", "| --- | --- | --- |"]
+    lines = ["| id | goal | learned by: success, time on one core |", "| --- | --- | --- |"]
     for env_id, goal in GOALS:
         hard = env_id.replace("-v0", "-Hard-v0")
         names = ", ".join(f"[`{name}`](docs/tasks/{name}.md)" for name in (env_id, hard) if name in ENVIRONMENTS)
