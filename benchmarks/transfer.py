@@ -32,7 +32,6 @@ ACTORS = (
     ("ClothDrape-v0", "learned:ppo"),
     ("ClothReach-v0", "learned:ppo"),
     ("ClothFold-v0", "learned:bc"),
-    ("ClothHang-v0", "learned:bc"),
 )
 # what is changed, and what it is called in the picture
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -208,7 +208,7 @@ class Attachments:
         bending: Bending,
         fabric: Fabric,
         threads: int,
-        blocks: NDArray | None = None,
+        blocks: list[int] | None = None,
     ) -> NDArray:
         """Force of the cloth on each attachment [N], (blocks, attachments, 3, lanes), in these blocks, or in all of them."""
         out, add = np.empty_like(self.x), pulls_with(bending, self.layout.by_particle)
@@ -219,14 +219,15 @@ class Attachments:
         if blocks is None:
             run_spans(work, self.layout.blocks, threads)
             return out
-        for block in set(blocks.tolist()):
+        for block in set(blocks):
             work(block, block + 1)
         return out
 
-    def slip(self, pull: NDArray, blocks: slice, w: NDArray, free_w: NDArray) -> None:
-        """In these blocks release particles of grippers on which the cloth pulls with more than their slip force, see
-        ``let_slip``; pull: of these blocks [N]."""
-        let_slip(pull, self.holder[blocks], w[blocks], free_w[blocks], self.limits)
+    def slip(self, pull: NDArray, blocks: list[int] | None, w: NDArray, free_w: NDArray) -> None:
+        """In these blocks, or in all, release particles of grippers on which the cloth pulls with more than their slip force, see
+        ``let_slip``; pull: [N], (blocks, attachments, 3, lanes)."""
+        for part in [slice(None)] if blocks is None else [slice(block, block + 1) for block in blocks]:
+            let_slip(pull[part], self.holder[part], w[part], free_w[part], self.limits)
 
 
 class Grippers:

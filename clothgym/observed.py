@@ -109,9 +109,9 @@ class Observed:
         if envs is None:
             return self.layout.to_public(self._pulls())
         chosen = self.layout.chosen(envs)
-        return self.layout.to_public(self._pulls(self.layout.at(chosen)[0]))[chosen]
+        return self.layout.to_public(self._pulls(self.layout.at(chosen)[0].tolist()))[chosen]
 
-    def _pulls(self, blocks: NDArray | None = None) -> NDArray:
+    def _pulls(self, blocks: list[int] | None = None) -> NDArray:
         return self._attachments.pulls(
             self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks
         )

@@ -178,9 +178,7 @@ class Simulation(Observed):
 
     @exclusive
     def step(self, n: int = 1, envs: ArrayLike | None = None) -> None:
-        """Advance environments, all of them or those that are named, by ``n`` control steps; the others stay as they are.
-
-        Attachments move towards their targets at a bounded speed.
+        """Advance all environments, or those that are named, by ``n`` control steps; attachments move at a bounded speed.
 
         Raises:
             RuntimeError: a step was interrupted, and not all environments have been reset since; or another thread is in a call.
@@ -188,11 +186,11 @@ class Simulation(Observed):
         """
         count("n", n)
         self.turn.check_whole()
-        chosen = None if envs is None else self._apart(envs)
+        chosen = None if envs is None else self.layout.alone(envs, self.integrator.name)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
-        motion, solids = Motion(self._x, self._v, self._w), Solid(self._solids.shapes, self._solids.rows)
-        outcome = Outcome(self._limited, self._diverged)
+        motion, outcome = Motion(self._x, self._v, self._w), Outcome(self._limited, self._diverged)
+        solids = Solid(self._solids.shapes, self._solids.rows)
 
         def work(first: int, last: int) -> None:
             blocks = slice(first, last)
@@ -205,25 +203,18 @@ class Simulation(Observed):
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
 
-        def work_on_chosen(first: int, last: int) -> None:
-            for block in chosen[first:last]:  # type: ignore[index]
-                work(block, block + 1)
+        def work_on(first: int, last: int) -> None:
+            for span in [(first, last)] if chosen is None else [(block, block + 1) for block in chosen[first:last]]:
+                work(*span)
 
-        # where one lies in each block, environments and blocks have the same numbers
         stepped: Any = slice(None) if chosen is None else chosen
         for _ in range(n):
             self.turn.unfinished = range(self.num_envs) if chosen is None else chosen
-            if chosen is None:
-                _jit.run_spans(work, self.layout.blocks, self.threads)
-            else:
-                _jit.run_spans(work_on_chosen, len(chosen), self.threads)
-            if self.colliders:
-                self._solids.end_step(stepped)
+            _jit.run_spans(work_on, self.layout.blocks if chosen is None else len(chosen), self.threads)
+            self._solids.end_step(stepped)
             if self._attachments.can_slip:
                 held = self._attachments.holder.copy()
-                pulls = self._pulls(None if chosen is None else np.array(chosen, np.int64))
-                for blocks in [slice(None)] if chosen is None else [slice(block, block + 1) for block in chosen]:
-                    self._attachments.slip(pulls[blocks], blocks, self._w, self._free_w)
+                self._attachments.slip(self._pulls(chosen), chosen, self._w, self._free_w)
                 self._contact.let_go(held, self._attachments.holder)
             self._steps[stepped] += 1
             self.turn.unfinished = ()
@@ -232,16 +223,6 @@ class Simulation(Observed):
                 new = self.diverged & ~self._reported
                 self._reported |= new
                 guards.report_divergence(new, self._steps, self.integrator, self.substeps, self.on_divergence == "raise")
-
-    def _apart(self, envs: ArrayLike) -> list[int]:
-        """Environments that are to be advanced alone."""
-        chosen = self.layout.chosen(envs).tolist()
-        if not self.layout.by_particle:
-            raise ValueError(
-                f"step(envs=...): with {self.integrator.name} on this mesh environments lie side by side in memory and advance "
-                "together; leave envs out, or take a grid with an integrator in which the order of the springs does not matter"
-            )
-        return chosen
 
     def _prepare(self) -> None:
         """Renew the integrator's plan and the main loop's schedule where properties or substeps have changed."""
@@ -455,12 +436,9 @@ class Simulation(Observed):
         self._contact.restore(state, self._x)
         self.turn.unfinished = ()
 
-    # --- from descriptions to rows --------------------------------------------------------------------------------------
-
     def _apply_parameters(self, env: NDArray) -> None:
         """Write spring constants, dampers, drag and masses of environments from their material properties."""
-        block, lane = self.layout.at(env)
-        self._planned_substeps = 0
+        (block, lane), self._planned_substeps = self.layout.at(env), 0
         for name, rows in fabric_rows(self.mesh, self._parameters[env], self.bending.hinged, self.air_density).items():
             array = getattr(self._fabric, name)
             array[(block, slice(None), lane) if rows.ndim == 2 else (block, lane)] = rows

@@ -137,6 +137,20 @@ class Layout(NamedTuple):
         """Block and lane of an environment, or of several, (envs,): two integers, or two arrays of them."""
         return np.divmod(envs, self.lanes)
 
+    def alone(self, envs: ArrayLike, method: str) -> list[int]:
+        """Environments that are to be advanced without the others, under a method of that name; also their blocks.
+
+        Raises:
+            ValueError: there is no such environment, or they share their block with others.
+        """
+        chosen = self.chosen(envs).tolist()
+        if not self.by_particle:
+            raise ValueError(
+                f"step(envs=...): with {method} on this mesh environments lie side by side in memory and advance together; leave "
+                "envs out, or take a grid with an integrator in which the order of the springs does not matter"
+            )
+        return chosen
+
     def chosen(self, envs: ArrayLike | None, once: bool = True) -> NDArray:
         """The environments that someone names: all of them, those of a mask, or by index; each but ``once``, or as often as wanted.
 

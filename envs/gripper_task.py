@@ -14,6 +14,7 @@ from clothgym._jit import inlined
 from clothgym.checks import LARGEST, one_of
 from clothgym.envs import pick_place
 from clothgym.envs.episode import Fields
+from clothgym.envs.settling import settle
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.task import Task
 
@@ -101,7 +102,8 @@ class GripperTask(Task):
             env, component = np.argwhere(~np.isfinite(actions))[0].tolist()
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         pick_place.perform(self, actions)
-        self.settle()
+        if self.settling == "at_once":
+            settle(self)
 
     def expert(self) -> NDArray:
         return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()

@@ -22,16 +22,17 @@ from clothgym import _jit, integrators
 from clothgym.checks import not_negative, numbers, one_of, shown
 from clothgym.envs.definition import TaskDefinition, check_definition
 from clothgym.envs.episode import TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
-from clothgym.envs.observing import Observer, StateVector
+from clothgym.envs.observing import Observer, StateVector, info_of_physics
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
-from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
+from clothgym.envs.settling import check as check_settling
+from clothgym.envs.settling import only, settle
+from clothgym.envs.stepping import IN_NUMPY, compiled, evaluate_in_numpy, mesh_arrays
 from clothgym.exclusive import Turn, exclusive
 from clothgym.material import Material
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
 from clothgym.simulation import Simulation
 
 REWARD_MODES = ("delta", "sparse")
-SETTLING = ("steps", "at_once")
 ROUNDING = 1e-6  # by which a share may leave [0, 1]
 ENVS_A_THREAD = 16  # fewer are not worth another thread
 
@@ -97,7 +98,6 @@ class Task(TaskDefinition):
     ) -> None:
         one_of("obs_mode", obs_mode, *self.obs_modes)
         one_of("reward_mode", reward_mode, *REWARD_MODES)
-        one_of("settling", settling, *SETTLING)
         self.obs_mode, self.reward_mode, self.settling = obs_mode, reward_mode, settling
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
         check_definition(self, self._in_numpy)
@@ -134,11 +134,7 @@ class Task(TaskDefinition):
             threads=threads,
             on_divergence="ignore",  # a step's outcome says so
         )
-        if settling == "at_once" and not self.simulation.layout.by_particle:
-            raise ValueError(
-                f"settling='at_once': with {method.name} on this sheet environments advance together; take settling='steps', or a "
-                "grid and an integrator in which the order of the springs does not matter"
-            )
+        check_settling(self)
         self.num_envs = num_envs
         self.threads = self.simulation.threads
         self.num_attachments = len(fixed.held) + len(fixed.grippers)
@@ -324,25 +320,8 @@ class Task(TaskDefinition):
         """The same as a part of a longer step: whoever calls it sets ``turn.unfinished`` to nothing at the end."""
         self.check_ready()
         self.move(self._checked(actions))
-        self.settle()
-
-    def settle(self) -> None:
-        """With ``settling="at_once"``, take the sheets whose agents are done to their ends; the step's reward is the sum of theirs.
-
-        The others stand still meanwhile: a batch goes on when all of its agents can act again.
-        """
-        if self.settling == "steps":
-            return
-        still = np.zeros((self.num_envs, *self.single_action_space.shape))
-        while True:
-            envs = np.flatnonzero((self.episode["settling_since"] >= 0) & ~self.episode["over"])
-            if not len(envs):
-                return
-            reward, terms = self.outcome["reward"][envs], self.terms[envs]
-            self.move(still, envs)
-            self.outcome["reward"][envs] += reward
-            for name in terms.dtype.names or ():
-                self.terms[name][envs] += terms[name]
+        if self.settling == "at_once":
+            settle(self)
 
     def check_ready(self) -> None:
         """Refuse a step of a batch that has not been reset, or was interrupted."""
@@ -365,22 +344,11 @@ class Task(TaskDefinition):
             self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
-        if envs is None:
-            self.before_step(actions)
-            simulation.step()
-            self.info[...] = np.zeros((), self.info.dtype)
-            self.after_step()
-        else:
-            # a task's own methods go through the whole batch: what they change of those that stand still is put back
-            still = np.ones(self.num_envs, bool)
-            still[envs] = False
-            kept = [(array, array[still]) for array in (self.episode, self.info, simulation.orders.openings[: self.num_envs])]
+        with only(self, envs):
             self.before_step(actions)
             simulation.step(envs=envs)
-            self.info[envs] = np.zeros((), self.info.dtype)
+            self.info[chosen] = np.zeros((), self.info.dtype)
             self.after_step()
-            for array, values in kept:
-                array[still] = values
         self._score_and_observe(chosen, begins=False)
         # anchors that an action has opened let go after the step in which it did
         if self.outcome["free"].any():
@@ -412,7 +380,7 @@ class Task(TaskDefinition):
         block, lane = self._place if everyone else self.simulation.layout.at(envs)
         pulls = self.simulation.pulls(None if everyone else envs) if self.feels_pulls else self._no_pulls
         if self._in_numpy:
-            self._evaluate_in_numpy()
+            evaluate_in_numpy(self)
 
         def work(first: int, last: int) -> None:
             self._finish_step(
@@ -423,16 +391,6 @@ class Task(TaskDefinition):
 
         _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))
 
-    def _evaluate_in_numpy(self) -> None:
-        """Write what the methods of a task without kernels return, for the kernels of all tasks to read."""
-        # a sheet that has diverged makes numbers that are not finite: its failure is what counts
-        with np.errstate(all="ignore"):
-            self.episode["performance"] = np.clip(np.nan_to_num(self.performance()), 0, 1)
-            self.episode["success"], self.episode["done"] = self.success(), self.done()
-            for one in self.observations:
-                values = self.episode[one.name] if one.function is None else one.function(self)
-                self.seen[one.name] = np.reshape(values, (self.num_envs, *one.shape))
-
     # --- what a step has brought ----------------------------------------------------------------------------------------
 
     def infos(self) -> dict[str, Any]:
@@ -440,25 +398,16 @@ class Task(TaskDefinition):
 
         ``failure`` is a place in ``FAILURES``; the reward's terms are ``reward/NAME``.
         """
-        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | self._info_of_physics()
+        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | info_of_physics(self.simulation)
         info["failure"] = self.outcome["failure"].copy()
         return info | {f"reward/{name}": self.terms[name].copy() for name in names_of(self.terms)}
 
     def info_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as plain Python values."""
         info = dict(zip(names_of(self.info), self.info[env].item()))
-        info |= {name: value[env].item() for name, value in self._info_of_physics().items()}
+        info |= {name: value[env].item() for name, value in info_of_physics(self.simulation).items()}
         info["failure"] = self.outcome["failure"][env].item()
         return info | {f"reward/{name}": value for name, value in zip(names_of(self.terms), self.terms[env].item())}
-
-    def _info_of_physics(self) -> dict[str, NDArray]:
-        """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
-        held lags behind [m]."""
-        limiting, contacts = self.simulation.limiting, self.simulation.self_contacts
-        info = {} if limiting is None else {"strain_before_limiting": limiting.before}
-        if contacts is not None:
-            info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "attachment_lag": contacts.lag}
-        return info
 
     # --- state ----------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,66 @@
+"""``settling="at_once"``: the step in which an agent is done goes on until its sheet has settled and is evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import one_of
+
+if TYPE_CHECKING:
+    from clothgym.envs.task import Task
+
+SETTLING = ("steps", "at_once")
+
+
+def check(task: Task) -> None:
+    """Refuse a batch whose environments advance together.
+
+    Raises:
+        ValueError: that, or an unknown mode.
+    """
+    one_of("settling", task.settling, *SETTLING)
+    if task.settling == "at_once" and not task.simulation.layout.by_particle:
+        raise ValueError(
+            f"settling='at_once': with {task.simulation.integrator.name} on this sheet environments advance together; take "
+            "settling='steps', or a grid and an integrator in which the order of the springs does not matter"
+        )
+
+
+def settle(task: Task) -> None:
+    """Take the sheets whose agents are done to their ends, one control step after the other; the step's reward is the sum.
+
+    The others stand still meanwhile: a batch goes on when all of its agents can act again.
+    """
+    still = np.zeros((task.num_envs, *task.single_action_space.shape))
+    while True:
+        envs = np.flatnonzero((task.episode["settling_since"] >= 0) & ~task.episode["over"])
+        if not len(envs):
+            return
+        reward, terms = task.outcome["reward"][envs], task.terms[envs]
+        task.move(still, envs)
+        task.outcome["reward"][envs] += reward
+        for name in terms.dtype.names or ():
+            task.terms[name][envs] += terms[name]
+
+
+@contextmanager
+def only(task: Task, envs: NDArray | None) -> Iterator[None]:
+    """Within it only these environments take a step, if any are named.
+
+    A task's own methods go through the whole batch: what they change of those that stand still is put back.
+    """
+    if envs is None:
+        yield
+        return
+    still = np.ones(task.num_envs, bool)
+    still[envs] = False
+    # where each environment has a block, blocks and environments have the same numbers
+    kept = [(array, array[still]) for array in (task.episode, task.info, task.simulation.orders.openings)]
+    yield
+    for array, values in kept:
+        array[still] = values
