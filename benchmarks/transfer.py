@@ -31,7 +31,6 @@ ACTORS = (
     ("ClothDrape-v0", "expert"),
     ("ClothDrape-v0", "learned:ppo"),
     ("ClothReach-v0", "learned:ppo"),
-    ("ClothFold-v0", "learned:bc"),
 )
 # what is changed, and what it is called in the picture
 VARIANTS: dict[str, dict[str, Any]] = {
