@@ -129,7 +129,9 @@ def test_it_goes_on_with_the_episodes_that_are_in_the_file(scripts, tmp_path, mo
     assert asked == [HELD_OUT, HELD_OUT + 1, HELD_OUT + 2]
     rows = [json.loads((tmp_path / name).read_text())["rows"] for name in ("rows.json", "whole.json")]
     assert len(rows[0]) == 1 and rows[0][0]["episodes"] == 3
-    timeless = [{**row, "seconds": 0, "by_episode": [{**one, "seconds": 0} for one in row["by_episode"]]} for (row,) in rows]
+    # but for when they were made
+    when = {"seconds": 0, "date": ""}
+    timeless = [{**row, **when, "by_episode": [{**one, "seconds": 0} for one in row["by_episode"]]} for (row,) in rows]
     assert timeless[0] == timeless[1]
     assert "cem, 12 x 2, all actions of 4 steps" in capsys.readouterr().out
     # other settings are another row; its film

@@ -175,10 +175,10 @@ def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, ca
             raise KeyboardInterrupt
 
     saved = []
-    monkeypatch.setattr(learning, "save_checkpoint", lambda folder, model: saved.append(folder))
+    monkeypatch.setattr(learning, "save_checkpoint", lambda folder, model, times: saved.append(folder))
     config = CONFIG | {"num_envs": 2}
     with pytest.raises(SystemExit) as caught, endings.stopped(lambda: ": go on"):
-        learning.train(tmp_path, config, Learner(), 0, 1, 1, 1)
+        learning.train(tmp_path, config, Learner(), None, 1, 1, 1)
     assert caught.value.code == 130 and saved == [tmp_path]
     assert capsys.readouterr().err.strip() == "stopped: go on"
 
@@ -278,7 +278,7 @@ def test_a_run_without_a_checkpoint_begins_anew(scripts, tmp_path, monkeypatch, 
     files.write_json(tmp_path / "config.json", CONFIG)
     args = train.Args(resume=tmp_path)
     monkeypatch.setattr(learning, "build", lambda folder, config, seed, done: "a new learner")
-    assert learning.learner(args.folder, args.config, resume=True) == ("a new learner", 0)
+    assert learning.learner(args.folder, args.config, resume=True) == ("a new learner", None)
     assert "has no checkpoint yet: beginning anew" in capsys.readouterr().out
 
 
