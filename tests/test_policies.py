@@ -69,6 +69,18 @@ def test_an_exported_learner_acts_as_it_did(scripts, learner):
     assert np.abs(policy(seen) - model.predict(seen, deterministic=True)[0]).max() < 4e-3
 
 
+def test_a_learner_of_another_activation_is_not_exported_as_what_it_is_not(scripts):
+    import torch
+    from learners import exported
+    from stable_baselines3 import PPO
+
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    kwargs = {"net_arch": [8], "activation_fn": torch.nn.ReLU}
+    model = PPO("MlpPolicy", make_sb3_vec_env("ClothReach-v0", 2), n_steps=8, batch_size=16, policy_kwargs=kwargs, device="cpu")
+    assert exported(model, {"env": "ClothReach-v0", "env_kwargs": {}, "algo": "ppo", "seed": 0}, {}) is None
+
+
 def test_a_file_holds_all_of_it_and_needs_no_pickle(tmp_path):
     policy = policy_of((9, 8, 2), activation="relu", squashed=True, keys=("achieved_goal", "observation"))
     policy.save(tmp_path / "it.npz")

@@ -407,7 +407,6 @@ def test_pulling_the_clips_apart_costs_every_step_until_the_sheet_tears(speed):
     assert info["failure"] == TORN and not info["is_success"] and info["normalized_performance"] == 0
     first = costs.index(1.0)
     assert all(costs[first:]) and len(costs) - first >= 2 and first * speed * STEP < 0.2 * SIDE
-    # the last step costs all that were left
     assert costs[-1] == 1 + STEPS - len(costs) and sum(costs) == info["episode_cost"] == STEPS - first
     assert total < -0.1 * (STEPS - first) - 0.5
 

@@ -105,7 +105,7 @@ def _variables(model: Any) -> list[str]:
 
 
 def exported(model: Any, config: Config, about: dict[str, Any]) -> Policy | None:
-    """The network that decides, without what it was trained with; None for one that looks at pictures."""
+    """The network that decides, without what it was trained with; None for one that looks at pictures, or is not of tanh alone."""
     space = model.observation_space
     plain = list(space.values()) if isinstance(space, gym.spaces.Dict) else [space]
     if any(len(part.shape or ()) != 1 for part in plain):
@@ -116,6 +116,8 @@ def exported(model: Any, config: Config, about: dict[str, Any]) -> Policy | None
     if isinstance(model, SAC):
         actor = policy.actor
         return Policy(_layers([*actor.latent_pi, actor.mu]), "relu", squashed=True, keys=keys, about=about)
+    if policy.activation_fn is not torch.nn.Tanh or model.use_sde:
+        return None
     return Policy(_layers([*policy.mlp_extractor.policy_net, policy.action_net]), "tanh", keys=keys, about=about)
 
 
