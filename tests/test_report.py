@@ -48,6 +48,21 @@ def test_every_environment_has_one_and_what_moves_no_bits_is_left_out():
 def test_committed_pages_are_what_the_command_makes(report):
     stale = [str(path) for path, text in report.pages().items() if path.read_text() != text]
     assert not stale, f"python training/report.py  makes others of {', '.join(stale)}"
+    assert not report.stale_curves(report.learned())
+
+
+def test_curves_of_other_evaluations_are_stale(report, tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "RUNS", tmp_path)
+    monkeypatch.setattr(report, "CURVES", tmp_path)
+    (tmp_path / "run_0").mkdir()
+    line = {"timesteps": 100, "core_seconds": 60.0, "success_rate": 0.5, "cost": 3.0}
+    (tmp_path / "run_0" / "progress.jsonl").write_text(f"{json.dumps(line)}\n{json.dumps(line | {'timesteps': 200})}\n")
+    rows, path = [result(0.5)], tmp_path / "ClothReach-v0.png"
+    assert report.stale_curves(rows) == [path]
+    path.write_bytes(report.draw_curves("ClothReach-v0", rows))
+    assert report.stale_curves(rows) == []
+    (tmp_path / "run_0" / "progress.jsonl").write_text(json.dumps(line | {"success_rate": 0.6}))
+    assert report.stale_curves(rows) == [path]
 
 
 def test_rows_of_other_code_are_marked(report):
@@ -69,7 +84,7 @@ def test_a_row_says_what_its_seeds_came_to(report):
     cells = [cell.strip() for cell in table.splitlines()[-1].split("|")]
     # the middle three of five: (0.80 + 0.90 + 0.95) / 3
     assert cells[1:3] == ["PPO", "5"] and cells[3].startswith("0.883 [") and cells[4:6] == ["0.900", "0.700"]
-    assert "5 / 0" in cells and cells[-2] == "1.0 min, 1.5 of one core" and "0.40 M" in cells
+    assert "5 / 0" in cells and cells[-2] == "1.5 min of one core" and "0.40 M" in cells
     low, high = report.bootstrap(rates)
     assert 0.70 <= low < 0.8833 < high <= 0.99
     assert report.bootstrap([0.5, 0.5, 0.5]) == (0.5, 0.5)
@@ -84,9 +99,9 @@ def test_learners_with_other_arguments_are_other_rows(report):
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
     assert [label for _, label in report.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
     now = {"ClothReach-v0": "now"}
-    assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 1 min"
+    assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 2 min"
     assert report.best_of("ClothDrape-v0", other, now) == "–"
-    assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}).endswith("1 min **(old)**")
+    assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}).endswith("2 min **(old)**")
 
 
 def test_sections_are_filled_and_the_rest_of_a_page_stays(report):

@@ -11,6 +11,7 @@ benchmarks/results/digests.json.  A row whose digest is another is shown as old,
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import re
@@ -18,6 +19,7 @@ import shutil
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +45,8 @@ LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
     "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
 }  # fmt: skip
-INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
+# of learners in a picture of curves, told apart by the color-blind, too (Okabe and Ito)
+COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 Result = dict[str, Any]
 
 
@@ -141,6 +144,11 @@ def _counts(rows: list[Result]) -> str:
     return " / ".join(str(sum(row[name] for row in rows)) for name in ("torn", "diverged"))
 
 
+def _minutes(rows: list[Result]) -> float:
+    """Time of all cores together: runs take turns with other work on their machine, and these minutes do not count that."""
+    return statistics.median(row["core_seconds"] for row in rows) / 60
+
+
 def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
     """What a table says of doing nothing, chance, or the expert."""
     low, high = row["success_rate_ci95"]
@@ -163,7 +171,6 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
     """What a table says of a learner, over its seeds."""
     rates = [row["success_rate"] for row in rows]
     low, high = bootstrap(rates) if len(rows) > 1 else rows[0]["success_rate_ci95"]
-    wall, cores = (statistics.median(row[name] / 60 for row in rows) for name in ("training_seconds", "core_seconds"))
     steps = statistics.median(row["timesteps"] for row in rows)
     return {
         "policy": f"{label}{_old(all(is_present(row, digests) for row in rows))}",
@@ -176,7 +183,7 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
         "safe": f"{statistics.median(row['safe_success_rate'] for row in rows):.3f}" if "cost" in rows[0] else "",
         "torn / diverged": _counts(rows),
         "steps": f"{steps / 1e6:.2f} M",
-        "training": f"{wall:.1f} min, {cores:.1f} of one core",
+        "training": f"{_minutes(rows):.1f} min of one core",
     }
 
 
@@ -202,9 +209,8 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
     if not found:
         return "–"
     label, rows = max(found, key=lambda one: interquartile_mean(row["success_rate"] for row in one[1]))
-    minutes = statistics.median(row["training_seconds"] for row in rows) / 60
     old = _old(all(is_present(row, digests) for row in rows))
-    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {max(minutes, 1):.0f} min{old}"
+    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {max(_minutes(rows), 1):.0f} min{old}"
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
@@ -228,7 +234,11 @@ def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[s
 
 
 def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
-    """Held-out success of every seed over steps and over minutes; a color for each learner, and the median of its seeds bold."""
+    """Held-out success of every seed over steps and over minutes, and its cost where there is one.
+
+    A color for each learner: a thin line for each seed, a band over all of them, their median bold.  A clone that learns no
+    further is a point for each seed.
+    """
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
     if not found:
         return None
@@ -237,27 +247,70 @@ def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, panels = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained", sharey=True)
-    for color, (label, rows) in zip([ACCENT, "#00798c", "#edae49", INK, QUIET], found):
-        curves = [progress(row["run"]) for row in rows]
-        for panel, key, unit in zip(panels, ("timesteps", "training_seconds"), (1e6, 60)):
-            # (evaluations, 2): where and how good; seeds of one learner are evaluated at the same steps
-            points = [np.array([[line[key] / unit, line["success_rate"]] for line in curve]) for curve in curves]
-            for curve in points:
-                panel.plot(*curve.T, color=color, lw=0.8, alpha=0.5)
-            common = min(map(len, points))
-            middle = np.median([curve[:common] for curve in points], axis=0)
-            panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=label.replace("`", ""))
-    for panel, text in zip(panels, ("environment steps [millions]", "training time [minutes]")):
-        panel.set(xlabel=text, ylim=(-0.02, 1.02), xlim=(0, None))
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set(ylabel="success, held-out episodes", title=env_id)
-    panels[1].legend(frameon=False, fontsize=8, loc="lower right")
+    curves = [(label.replace("`", ""), [progress(row["run"]) for row in rows]) for label, rows in found]
+    shown = ["success_rate"] + ["cost"] * any("cost" in line for _, seeds in curves for seed in seeds for line in seed)
+    figure, panels = plt.subplots(
+        len(shown), 2, figsize=(9, 3.2 * len(shown)), layout="constrained", sharex="col", sharey="row", squeeze=False
+    )
+    for (row, what), (column, key, unit) in product(enumerate(shown), ((0, "timesteps", 1e6), (1, "core_seconds", 60))):
+        for color, (label, seeds) in zip(COLORS, curves):
+            _draw_seeds(panels[row, column], [[(line[key] / unit, line[what]) for line in seed] for seed in seeds], color, label)
+        panels[row, column].spines[["top", "right"]].set_visible(False)
+        panels[row, column].set(xlim=(0, None))
+    panels[0, 0].set(ylabel="success", ylim=(0, 1.02), title=env_id)
+    if "cost" in shown:
+        # an untrained policy's cost of 100 and the limit of 0.3 are both to be seen
+        panels[1, 0].set_yscale("symlog", linthresh=1.0)
+        panels[1, 0].set(
+            ylabel="cost of an episode", ylim=(0, 160), yticks=(0, 0.3, 1, 10, 100), yticklabels=("0", "0.3", "1", "10", "100")
+        )
+    for panel, text in zip(panels[-1], ("environment steps [millions]", "training time [minutes of one core]")):
+        panel.set(xlabel=text)
+    panels[0, 1].legend(frameon=False, fontsize=8, loc="lower right")
     picture = io.BytesIO()
-    # without the version in it the same curves make the same file
-    figure.savefig(picture, dpi=110, metadata={"Software": None})
+    # without the version in it the same curves make the same file; by what is drawn a check knows it
+    figure.savefig(picture, dpi=110, metadata={"Software": None, "Comment": drawn_from(env_id, results)})
     plt.close(figure)
     return picture.getvalue()
+
+
+def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, label: str) -> None:
+    """What the seeds of one learner came to on the way; they are evaluated at the same steps."""
+    common = min(map(len, seeds))
+    # (seeds, evaluations, 2)
+    points = np.array([seed[:common] for seed in seeds])
+    if common == 1:
+        panel.plot(*points[:, 0].T, ls="", marker="o", ms=4, color=color, label=label)
+        return
+    for curve in points:
+        panel.plot(*curve.T, color=color, lw=0.7, alpha=0.5)
+    middle = np.median(points, axis=0)
+    panel.fill_between(middle[:, 0], points[:, :, 1].min(axis=0), points[:, :, 1].max(axis=0), color=color, alpha=0.15, lw=0)
+    panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=f"{label} ({len(seeds)})")
+
+
+def drawn_from(env_id: str, results: list[Result]) -> str:
+    """Digest of what the curves of an environment show."""
+    shown = [
+        (label, row["run"], progress(row["run"])) for (env, label), rows in groups(results).items() if env == env_id for row in rows
+    ]
+    return hashlib.sha256(json.dumps(shown, sort_keys=True).encode()).hexdigest()
+
+
+def stale_curves(results: list[Result]) -> list[Path]:
+    """Pictures of curves that are missing, or that show others."""
+    from PIL import Image
+
+    stale = []
+    for env_id in {row["env"] for row in results}:
+        path = CURVES / f"{env_id}.png"
+        if not path.exists():
+            stale.append(path)
+            continue
+        with Image.open(path) as picture:
+            if picture.info.get("Comment") != drawn_from(env_id, results):
+                stale.append(path)
+    return sorted(stale)
 
 
 def progress(run: str) -> list[dict[str, float]]:
@@ -277,27 +330,15 @@ def sections(results: list[Result], scripted: list[Result], digests: dict[str, s
     return made | {"environments": environments(results, digests)}
 
 
-GOALS = (
-    ("ClothReach-v0", "swing the free corner of a hanging sheet to a goal and bring it to rest there"),
-    ("ClothDrape-v0", "lay a hanging sheet over a sphere, a box or a post, and let go"),
-    ("ClothDrapeGripper-v0", "pick a sheet up from the floor, flat or rumpled, with two grippers; drape it"),
-    ("ClothFlatten-v0", "spread a crumpled sheet"),
-    ("ClothFling-v0", "swing a rumpled sheet, and lay it flat in three throws"),
-    ("ClothFold-v0", "fold a sheet in half, over its diagonal, or twice"),
-    ("ClothFoldGoal-v0", "bring corners to the goals of a fold, for HER"),
-    ("ClothHang-v0", "hang a sheet over a rail"),
-    ("ClothHook-v0", "hang a sheet by its hole on a hook"),
-    ("ClothStrain-v0", "carry a stretchy sheet past a post, in gusts, with its strain below 10 %"),
-)
-
-
 def environments(results: list[Result], digests: dict[str, str]) -> str:
     """The README's table: what there is, and how it is learned."""
     lines = ["| id | goal | learned by: success, time on one core |", "| --- | --- | --- |"]
-    for env_id, goal in GOALS:
+    for env_id, (_, goal) in ENVIRONMENTS.items():
+        if "-Hard-" in env_id:
+            continue
         hard = env_id.replace("-v0", "-Hard-v0")
         names = ", ".join(f"[`{name}`](docs/tasks/{name}.md)" for name in (env_id, hard) if name in ENVIRONMENTS)
-        lines.append(f"| {names} | {goal} | {best_of(env_id, results, digests)} |")
+        lines.append(f"| {names} | {goal.rstrip('.')} | {best_of(env_id, results, digests)} |")
     return "\n".join(lines)
 
 
@@ -341,16 +382,19 @@ def main(args: Args) -> None:
             note_digests()
         if not args.check:
             CURVES.mkdir(exist_ok=True)
-            for env_id in ENVIRONMENTS:
-                picture = draw_curves(env_id, learned())
-                if picture is not None:
-                    files.write(CURVES / f"{env_id}.png", picture)
+            for path in stale_curves(learned()):
+                picture = draw_curves(path.stem, learned())
+                assert picture is not None
+                files.write(path, picture)
+        drawings = stale_curves(learned())
+        for path in drawings:
+            print(f"{path.relative_to(ROOT)}: stale")
         stale = {path: text for path, text in pages().items() if path.read_text() != text}
         for path, text in stale.items():
             print(f"{path.relative_to(ROOT)}: {'stale' if args.check else 'written'}")
             if not args.check:
                 files.write(path, text)
-    if args.check and stale:
+    if args.check and (stale or drawings):
         raise SystemExit(1)
 
 
