@@ -88,7 +88,8 @@ def clone(model: PPO, observations: Observations, actions: NDArray, epochs: int,
     policy = model.policy
     parts = observations if isinstance(observations, dict) else {"": observations}
     x, y = {key: torch.as_tensor(part) for key, part in parts.items()}, torch.as_tensor(actions)
-    fitted = [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()]
+    networks = (policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net)
+    fitted = [parameter for network in networks for parameter in network.parameters()]
     optimizer = torch.optim.Adam(fitted, learning_rate)
     steps = max(1, epochs * len(y) // batch_size)
     schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)

@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from clothgym import files
 from clothgym.adapters.lagrange import LagrangianPPO
+from clothgym.adapters.pixels import DepthPolicy
 from clothgym.adapters.runs import CHECKPOINT, save_tensors
 from clothgym.adapters.sb3 import make_sb3_vec_env
 from clothgym.policies import Policy
@@ -21,6 +22,7 @@ from clothgym.policies import Policy
 LEARNERS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "ppo_penalty": PPO, "ppo_lagrange": LagrangianPPO, "bc": PPO, "bc_ppo": PPO, "sac": SAC, "her": SAC,
 }  # fmt: skip
+OWN_POLICIES = {one.__name__: one for one in (DepthPolicy,)}  # beside SB3's own, by the names that hyperparameter files have
 SCHEDULES = ("learning_rate", "clip_range")  # options that may be written lin_VALUE
 ADVICE = "train again"
 
@@ -33,7 +35,8 @@ def environments(config: Config, env_kwargs: dict[str, Any], seed: int) -> VecMo
 def build(folder: Path, config: Config, seed: int, done: int) -> BaseAlgorithm:
     """The learner of a configuration, on its own batch of environments; done: environment steps of the run so far."""
     options = dict(config["hyperparameters"])
-    policy = options.pop("policy")
+    policy = OWN_POLICIES.get(options["policy"], options["policy"])
+    del options["policy"]
     for key in SCHEDULES:
         if isinstance(options.get(key), str):
             options[key] = _linear(options[key])

@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from clothgym import files
 from clothgym.adapters.runs import POLICY, load_last
+from clothgym.adapters.sb3 import channels_first
 from clothgym.checks import number as finite_number
 from clothgym.lab.bench import machine
 from clothgym.lab.digests import digest_of
@@ -105,13 +106,10 @@ class Watch(BaseCallback):
         """Score the policy as it is, and save a checkpoint."""
         self.save()
 
-        def policy(env: Any, observations: Any) -> Any:
-            return self.model.predict(observations, deterministic=True)[0]
-
         # the tail of the held-out seeds: the final score's are others
         first = evaluate.HELD_OUT + 1_000_000
         seeds = list(range(first, first + episodes))
-        found = evaluate.run_episodes(self.config["env"], policy, seeds, progress=False, **self.config["env_kwargs"])
+        found = evaluate.run_episodes(self.config["env"], acting_of(self.model), seeds, progress=False, **self.config["env_kwargs"])
         line = {"timesteps": self.num_timesteps, **self.times(), "episodes": episodes}
         line |= {"success_rate": float(found["is_success"].mean())}
         line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
@@ -124,6 +122,16 @@ class Watch(BaseCallback):
         self.saved = time.perf_counter()
 
 
+def acting_of(model: Any) -> policies.Policy:
+    """What the learner's policy does without exploring, on observations as environments give them."""
+
+    def act(env: Any, observations: Any) -> Any:
+        seen = channels_first(env.unwrapped.task.observed.mode, observations)
+        return model.predict(seen, deterministic=True)[0]
+
+    return act
+
+
 class FrozenPolicy(BaseCallback):
     """For some rollouts only the critic learns: beside a cloned policy it knows nothing yet, and would lead it astray."""
 
@@ -133,8 +141,9 @@ class FrozenPolicy(BaseCallback):
 
     def _freeze(self, frozen: bool) -> None:
         policy: Any = self.model.policy
-        for parameter in (*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters(), policy.log_std):
-            parameter.requires_grad_(not frozen)
+        for network in (policy.pi_features_extractor, policy.mlp_extractor.policy_net, policy.action_net):
+            network.requires_grad_(not frozen)
+        policy.log_std.requires_grad_(not frozen)
 
     def _on_training_start(self) -> None:
         self._freeze(self.left > 0)
@@ -299,7 +308,7 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     policy, path = exported(model, config, about), folder / POLICY
     if policy is not None:
         policy.save(path)
-    acting = policies.exported(path) if policy is not None else lambda env, seen: model.predict(seen, deterministic=True)[0]
+    acting = policies.exported(path) if policy is not None else acting_of(model)
     names = ["noop", "random", "expert"] + ["careless"] * (config["env"] == "ClothStrain-v0")
     scores = {}
     for name in [*names, str(folder)]:

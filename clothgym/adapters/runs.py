@@ -161,6 +161,9 @@ def learned(folder: Path, env_id: str) -> Policy:
         )
     try:
         from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
+
+        from clothgym.adapters.pixels import DepthPolicy
+        from clothgym.adapters.sb3 import channels_first, channels_first_space
     except ImportError as error:
         raise ImportError("a trained policy needs Stable-Baselines3: pip install 'clothgym[sb3]'") from error
     tensors = load_last(folder)["policy"]
@@ -171,13 +174,16 @@ def learned(folder: Path, env_id: str) -> Policy:
         widths = list(_numbers(kwargs))
         if len(widths) > 100 or max(widths, default=0) > max(max(tensor.shape, default=1) for tensor in tensors.values()):
             raise ValueError("policy_kwargs describe a larger one than the checkpoint holds")
-        space = env.single_observation_space
+        mode = env.unwrapped.task.observed.mode  # type: ignore[attr-defined]
+        space = channels_first_space(mode, env.single_observation_space)
         made: Any = MultiInputActorCriticPolicy if isinstance(space, gym.spaces.Dict) else ActorCriticPolicy
+        if config["hyperparameters"].get("policy") == DepthPolicy.__name__:
+            made = DepthPolicy
         policy = made(space, env.single_action_space, lambda _: 0.0, **kwargs)
         policy.load_state_dict(tensors)
     env.close()
     policy.set_training_mode(False)
-    return lambda env, observations: policy.predict(observations, deterministic=True)[0]
+    return lambda env, observations: policy.predict(channels_first(mode, observations), deterministic=True)[0]
 
 
 def _numbers(value: Any) -> Iterator[float]:

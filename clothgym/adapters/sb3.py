@@ -20,6 +20,27 @@ from clothgym.registration import checked_id
 NUMBERS = ("heightmap", "depth", "rgbd")  # modes whose pictures are of numbers
 
 
+def channels_first(mode: str, observation: Any) -> Any:
+    """Pictures of numbers with their channels first, as SB3's CNN takes them; those of colors it turns round itself.
+
+    mode: the environment's ``obs_mode``.  observation: as it gives them, of one environment or of a batch; a dictionary with
+    ``privileged=True``.
+    """
+    if mode not in NUMBERS:
+        return observation
+    if isinstance(observation, dict):
+        return observation | {"observation": channels_first(mode, observation["observation"])}
+    return np.expand_dims(observation, -3) if mode == "heightmap" else np.moveaxis(observation, -1, -3)
+
+
+def channels_first_space(mode: str, space: gym.Space) -> gym.Space:
+    """The space of these."""
+    if isinstance(space, gym.spaces.Dict):
+        return gym.spaces.Dict({**space.spaces, "observation": channels_first_space(mode, space["observation"])})
+    assert isinstance(space, gym.spaces.Box)
+    return gym.spaces.Box(channels_first(mode, space.low), channels_first(mode, space.high), dtype=space.dtype)  # type: ignore[arg-type]
+
+
 class ClothSB3VecEnv(VecEnv):
     """A ``ClothVectorEnv`` in same-step mode as an SB3 ``VecEnv``."""
 
@@ -31,7 +52,9 @@ class ClothSB3VecEnv(VecEnv):
         self._seed: int | None = None
         self._next_options: dict[str, Any] = {}
         self.render_mode = env.render_mode
-        super().__init__(env.num_envs, self._space_for_cnn(env.single_observation_space), env.single_action_space)
+        super().__init__(
+            env.num_envs, channels_first_space(env.task.observed.mode, env.single_observation_space), env.single_action_space
+        )
 
     def reset(self) -> Any:
         observation, _ = self.env.reset(seed=self._seed, options=self._next_options)
@@ -40,21 +63,7 @@ class ClothSB3VecEnv(VecEnv):
         return self._for_cnn(observation)
 
     def _for_cnn(self, observation: Any) -> Any:
-        """Pictures of numbers with their channels first, as SB3's CNN takes them; those of colors it turns round itself."""
-        if self.env.task.observed.mode not in NUMBERS:
-            return observation
-        if isinstance(observation, dict):
-            return observation | {"observation": self._for_cnn(observation["observation"])}
-        heights = self.env.task.observed.mode == "heightmap"
-        return np.expand_dims(observation, -3) if heights else np.moveaxis(observation, -1, -3)
-
-    def _space_for_cnn(self, space: gym.Space) -> gym.Space:
-        """The space of these."""
-        if isinstance(space, gym.spaces.Dict):
-            picture = self._space_for_cnn(space["observation"])
-            return gym.spaces.Dict({**space.spaces, "observation": picture})
-        assert isinstance(space, gym.spaces.Box)
-        return gym.spaces.Box(self._for_cnn(space.low), self._for_cnn(space.high), dtype=space.dtype)  # type: ignore[arg-type]
+        return channels_first(self.env.task.observed.mode, observation)
 
     def step_async(self, actions: NDArray) -> None:
         self._actions = actions
