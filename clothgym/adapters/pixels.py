@@ -70,7 +70,8 @@ class DepthPolicy(MultiInputActorCriticPolicy):
             raise ValueError(
                 "DepthPolicy sees pictures beside a state: make the environment with obs_mode='depth', privileged=True"
             )
-        super().__init__(observation_space, *args, share_features_extractor=False, normalize_images=False, **kwargs)
+        kwargs |= {"share_features_extractor": False, "normalize_images": False}
+        super().__init__(observation_space, *args, **kwargs)
 
     def make_features_extractor(self) -> BaseFeaturesExtractor:
         # SB3 asks for the actor's first, then for the critic's
