@@ -85,6 +85,9 @@ def test_a_row_says_what_its_seeds_came_to(report):
     # the middle three of five: (0.80 + 0.90 + 0.95) / 3
     assert cells[1:3] == ["PPO", "5"] and cells[3].startswith("0.883 [") and cells[4:6] == ["0.900", "0.700"]
     assert "5 / 0" in cells and cells[-2] == "1.5 min of one core" and "0.40 M" in cells
+    timed = [result(rate, seed, collecting_seconds=40.0 + 10 * seed) for seed, rate in enumerate(rates)]
+    # the third of the parts 40 / 60, 50 / 61, 60 / 62, 70 / 63, 80 / 64
+    assert "1.5 min of one core, 97% collecting" in report.table_of("ClothReach-v0", timed, [], {"ClothReach-v0": "now"})
     low, high = report.bootstrap(rates)
     assert 0.70 <= low < 0.8833 < high <= 0.99
     assert report.bootstrap([0.5, 0.5, 0.5]) == (0.5, 0.5)

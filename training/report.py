@@ -149,6 +149,12 @@ def _minutes(rows: list[Result]) -> float:
     return statistics.median(row["core_seconds"] for row in rows) / 60
 
 
+def _collecting(rows: list[Result]) -> str:
+    """The part of the time in which environments step and the policy acts; of a clone, whose expert acts, nothing is said."""
+    parts = [row.get("collecting_seconds", 0.0) / max(row["training_seconds"], 1e-9) for row in rows]
+    return f", {statistics.median(parts):.0%} collecting" if all(parts) else ""
+
+
 def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
     """What a table says of doing nothing, chance, or the expert."""
     low, high = row["success_rate_ci95"]
@@ -183,7 +189,7 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
         "safe": f"{statistics.median(row['safe_success_rate'] for row in rows):.3f}" if "cost" in rows[0] else "",
         "torn / diverged": _counts(rows),
         "steps": f"{steps / 1e6:.2f} M",
-        "training": f"{_minutes(rows):.1f} min of one core",
+        "training": f"{_minutes(rows):.1f} min of one core{_collecting(rows)}",
     }
 
 
