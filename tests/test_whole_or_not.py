@@ -168,6 +168,30 @@ def test_an_interrupted_step_is_not_gone_on_from(env_id, place, after, monkeypat
         assert np.array_equal(env.step(still(env))[0], twin.step(still(env))[0])
 
 
+def test_an_interruption_while_a_sheet_settles_is_not_gone_on_from(monkeypatch):
+    env = make_vec("ClothDrape-v0", 2, settling="at_once").unwrapped
+    env.reset(seed=4)
+    state, original, calls = env.get_state(), env.task.simulation._advance, []
+
+    def stopped(*args, **kwargs):
+        calls.append(None)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        original(*args, **kwargs)
+
+    monkeypatch.setattr(env.task.simulation, "_advance", stopped)
+    # the first environment lets go of its sheet, which settles for longer than five control steps
+    lets_go = np.array([[0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0, 0, -1.0]])
+    with pytest.raises(KeyboardInterrupt):
+        env.step(lets_go)
+    with pytest.raises((gym.error.ResetNeeded, RuntimeError), match=r"interrupted.*reset\(\)"):
+        env.step(lets_go)
+    env.set_state(state)
+    twin = make_vec("ClothDrape-v0", 2, settling="at_once").unwrapped
+    twin.set_state(state)
+    assert np.array_equal(env.step(lets_go)[0], twin.step(lets_go)[0]) and len(calls) > 5
+
+
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_an_interrupted_autoreset_is_not_gone_on_from(mode, monkeypatch):
     env = make_vec(ANY, 2, autoreset_mode=mode).unwrapped
