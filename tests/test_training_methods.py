@@ -236,6 +236,37 @@ def test_a_clone_alone_is_scored_again_and_not_cloned_again(tmp_path):
     assert after["return"] == before["return"] and after["training_seconds"] == pytest.approx(before["training_seconds"])
 
 
+@pytest.mark.parametrize("env_id", ["ClothReach-v0", "ClothFoldGoal-v0"])
+def test_a_replay_buffer_is_filled_with_what_the_expert_did(env_id, scripts):
+    """The transitions are those of a batch that is stepped by hand with the same actions, episode by episode."""
+    from clone import fill
+    from stable_baselines3 import SAC, HerReplayBuffer
+
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    goals = env_id == "ClothFoldGoal-v0"
+    kwargs = {"replay_buffer_class": HerReplayBuffer, "replay_buffer_kwargs": {"n_sampled_goal": 4}} if goals else {}
+    env, other = (make_sb3_vec_env(env_id, 3, seed=0) for _ in range(2))
+    model = SAC(
+        "MultiInputPolicy" if goals else "MlpPolicy", env, seed=0, device="cpu", learning_starts=0, buffer_size=3000, **kwargs
+    )
+    fill(model, 1, noise=0.2, seed=0)
+    steps, buffer = env.env.task.most_steps(), model.replay_buffer
+    assert buffer.pos == steps and not buffer.full
+    seen = other.reset()
+    for step in range(steps):
+        wanted = np.clip(other.env.task.expert(), -1, 1)
+        # where the noise did not reach the actions' bounds, it is smaller than four deviations of it
+        assert np.abs(buffer.actions[step] - wanted).max() < 0.2 * 4.5
+        stored = {key: part[step] for key, part in buffer.observations.items()} if goals else buffer.observations[step]
+        assert all(np.array_equal(stored[key], seen[key]) for key in seen) if goals else np.array_equal(stored, seen)
+        seen, rewards, dones, _ = other.step(buffer.actions[step])
+        assert np.array_equal(buffer.rewards[step], rewards) and np.array_equal(buffer.dones[step].astype(bool), dones)
+    assert buffer.dones.sum() == 3 and model._last_obs is None
+    model.learn(9)
+    assert model._n_updates > 0 and model.num_timesteps == 9
+
+
 def test_turned_samples_are_what_the_expert_does_with_turned_sheets(scripts):
     from types import SimpleNamespace
 

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, HerReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 from tqdm import tqdm
 
@@ -45,6 +46,27 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
     if isinstance(seen, dict):
         return {key: np.concatenate([part[key] for part in observations]) for key in seen}, np.concatenate(actions)
     return np.concatenate(observations), np.concatenate(actions)
+
+
+def fill(model: OffPolicyAlgorithm, episodes: int, noise: float, seed: int) -> None:
+    """Put some episodes of each environment, in which a disturbed expert acts, into the learner's replay buffer.
+
+    noise: as of ``demonstrations``; what is stored is what was done.
+    """
+    rng, env, buffer = np.random.default_rng(seed), model.env, model.replay_buffer
+    assert env is not None and buffer is not None
+    task = env.unwrapped.env.task  # type: ignore[attr-defined]
+    model._last_obs = env.reset()  # type: ignore[assignment]
+    for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False, disable=None):
+        strength = noise * rng.uniform(size=(env.num_envs, 1))
+        for _ in range(task.most_steps()):
+            disturbed = task.expert() + strength * rng.standard_normal((env.num_envs, *task.single_action_space.shape))
+            done = np.clip(disturbed, -1, 1).astype(np.float32)
+            model._store_transition(buffer, done, *env.step(done))  # type: ignore[arg-type]
+    # episodes that have not ended are cut, and learning begins with new ones
+    if isinstance(buffer, HerReplayBuffer):
+        buffer.truncate_last_trajectory()
+    model._last_obs = None
 
 
 def turned(task: Any, samples: tuple[NDArray, NDArray], turns: int, seed: int) -> tuple[NDArray, NDArray]:

@@ -95,7 +95,7 @@ def load_checkpoint(folder: Path, model: Any, state: dict[str, Any]) -> None:
     model.num_timesteps = int(state["num_timesteps"])
     model._n_updates = int(state["num_updates"])
     if isinstance(model, SAC):
-        # its replay buffer is empty: it acts at random again until there is something to learn from
+        # its replay buffer is empty: it acts at random again until there is something to learn from, if it did at first
         model.learning_starts += model.num_timesteps
 
 

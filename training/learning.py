@@ -12,7 +12,7 @@ import evaluate
 import numpy as np
 import policies
 import torch
-from clone import clone, demonstrations, joined, turned
+from clone import clone, demonstrations, fill, joined, turned
 from drawing import draw_learning_curve, film
 from endings import refused
 from learners import build, environments, exported, load_checkpoint, save_checkpoint
@@ -244,6 +244,12 @@ def train(
             watch.clock.stop()
         rollouts = done // (config["num_envs"] * model.n_steps)
         callbacks.append(FrozenPolicy(config["clone"].get("critic_rollouts", 0) - rollouts))
+    if config.get("demonstrations") and config["timesteps"] > done:
+        # a run that goes on has lost its buffer
+        watch.clock.start()
+        with refused():
+            fill(model, **config["demonstrations"], seed=config["seed"])
+        watch.clock.stop()
     if config["timesteps"] > done:
         # what the run has exported before is of another policy now
         for name in (POLICY, MODEL, EVALUATION):

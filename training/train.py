@@ -31,7 +31,11 @@ from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
 # what these parts of the hyperparameters must have
-PARTS = {"clone": ("episodes", "noise", "epochs", "batch_size", "learning_rate"), "curriculum": ("n_timesteps", "env_kwargs")}
+PARTS = {
+    "clone": ("episodes", "noise", "epochs", "batch_size", "learning_rate"),
+    "curriculum": ("n_timesteps", "env_kwargs"),
+    "demonstrations": ("episodes", "noise"),
+}
 
 
 @dataclass
@@ -112,6 +116,7 @@ class Args:
             "env": self.env,
             "algo": self.algo,
             "clone": hyperparameters.pop("clone", {}),
+            "demonstrations": hyperparameters.pop("demonstrations", {}),
             "curriculum": hyperparameters.pop("curriculum", self.curriculum()),
             "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
             "num_envs": hyperparameters.pop("n_envs"),
