@@ -1,0 +1,189 @@
+"use strict";
+// What is drawn: the sheet as a smooth surface through its particles, and solids as boxes swept by a ball.
+
+const REFINED = 4; // drawn cells along the side of a cell of the simulation
+const LIFT = 0.004, DEEPEST = 0.03; // cloth that deep in a solid is drawn above it, at that height [m]
+
+// A grid of particles, drawn as a bicubic surface; its corners go on straight beyond the border.
+class Sheet {
+  constructor(episode) {
+    const [rows, cols] = episode.shape;
+    Object.assign(this, { episode, rows, cols, fineRows: (rows - 1) * REFINED + 1, fineCols: (cols - 1) * REFINED + 1 });
+    const count = this.fineRows * this.fineCols;
+    this.positions = new Float32Array(3 * count);
+    this.normals = new Float32Array(3 * count);
+    this.strain = new Float32Array(count);
+    this.uv = new Float32Array(2 * count); // from the corner [m]
+    this.between = new Float32Array(4 * rows * this.fineCols);
+    this.own = new Float32Array(rows * cols);
+    const spacing = [episode.side / (cols - 1), episode.side / (rows - 1)];
+    for (let row = 0, v = 0; row < this.fineRows; row++) {
+      for (let col = 0; col < this.fineCols; col++, v++) {
+        this.uv[2 * v] = (col / REFINED) * spacing[0];
+        this.uv[2 * v + 1] = (row / REFINED) * spacing[1];
+      }
+    }
+    this.holes = new Set(episode.holes);
+    this.triangles = this.#triangles();
+    this.springs = this.#springs(spacing);
+    this.weights = Array.from({ length: REFINED }, (_, k) => catmullRom(k / REFINED));
+  }
+
+  #triangles() {
+    const triangles = [];
+    for (let row = 0; row < this.fineRows - 1; row++) {
+      for (let col = 0; col < this.fineCols - 1; col++) {
+        if (this.holes.has(Math.floor(row / REFINED) * (this.cols - 1) + Math.floor(col / REFINED))) continue;
+        const a = row * this.fineCols + col, c = a + this.fineCols;
+        triangles.push(a, a + 1, c + 1, a, c + 1, c);
+      }
+    }
+    return new Uint32Array(triangles);
+  }
+
+  // Yarns: neighbors in a row or a column, but for those inside a hole, and their length at rest [m].
+  #springs([across, along]) {
+    const cell = (row, col) => row >= 0 && col >= 0 && row < this.rows - 1 && col < this.cols - 1
+      && !this.holes.has(row * (this.cols - 1) + col);
+    const springs = [];
+    for (let row = 0; row < this.rows; row++) {
+      for (let col = 0; col < this.cols; col++) {
+        const p = row * this.cols + col;
+        if (col + 1 < this.cols && (cell(row, col) || cell(row - 1, col))) springs.push([p, p + 1, across]);
+        if (row + 1 < this.rows && (cell(row, col) || cell(row, col - 1))) springs.push([p, p + this.cols, along]);
+      }
+    }
+    return springs;
+  }
+
+  // x: positions of all points of the episode [m]; solids: those that the cloth rests on, with their centers.
+  place(x, solids) {
+    const { rows, cols, fineRows, fineCols } = this;
+    this.#measure(x);
+    // along the rows, then along the columns; the fourth number is the strain
+    const coarse = (row, col, c) => (c < 3 ? x[3 * (row * cols + col) + c] : this.own[row * cols + col]);
+    const beyond = (k, n, at) => (k < 0 ? 2 * at(0) - at(1) : k >= n ? 2 * at(n - 1) - at(n - 2) : at(k));
+    for (let row = 0; row < rows; row++) {
+      for (let c = 0; c < 4; c++) {
+        const at = (col) => coarse(row, col, c);
+        for (let col = 0; col < fineCols; col++) {
+          const cell = Math.min(Math.floor(col / REFINED), cols - 2), k = col - REFINED * cell;
+          const [p, q, r, s] = k < REFINED ? this.weights[k] : [0, 0, 1, 0];
+          this.between[4 * (row * fineCols + col) + c] =
+            p * beyond(cell - 1, cols, at) + q * at(cell) + r * at(cell + 1) + s * beyond(cell + 2, cols, at);
+        }
+      }
+    }
+    for (let col = 0; col < fineCols; col++) {
+      for (let c = 0; c < 4; c++) {
+        const at = (row) => this.between[4 * (row * fineCols + col) + c];
+        for (let row = 0; row < fineRows; row++) {
+          const cell = Math.min(Math.floor(row / REFINED), rows - 2), k = row - REFINED * cell;
+          const [p, q, r, s] = k < REFINED ? this.weights[k] : [0, 0, 1, 0];
+          const value = p * beyond(cell - 1, rows, at) + q * at(cell) + r * at(cell + 1) + s * beyond(cell + 2, rows, at);
+          const v = row * fineCols + col;
+          if (c < 3) this.positions[3 * v + c] = value;
+          else this.strain[v] = value;
+        }
+      }
+    }
+    for (const { solid, center } of solids) this.#pushOut(solid, center);
+    this.#turn();
+  }
+
+  // The largest strain of the yarns that meet at each particle.
+  #measure(x) {
+    this.own.fill(-1);
+    for (const [i, j, length] of this.springs) {
+      const stretched = Math.hypot(x[3 * i] - x[3 * j], x[3 * i + 1] - x[3 * j + 1], x[3 * i + 2] - x[3 * j + 2]) / length - 1;
+      this.own[i] = Math.max(this.own[i], stretched);
+      this.own[j] = Math.max(this.own[j], stretched);
+    }
+  }
+
+  // Particles rest on a solid, but the surface between them cuts off its edges.
+  #pushOut({ axes, half, radius }, center) {
+    const x = this.positions, local = [0, 0, 0], out = [0, 0, 0];
+    for (let v = 0; v < x.length; v += 3) {
+      let square = 0;
+      for (let a = 0; a < 3; a++) {
+        local[a] = 0;
+        for (let c = 0; c < 3; c++) local[a] += axes[3 * a + c] * (x[v + c] - center[c]);
+        out[a] = local[a] - Math.min(Math.max(local[a], -half[a]), half[a]);
+        square += out[a] * out[a];
+      }
+      let length = Math.sqrt(square), distance = length - radius;
+      if (length === 0) {
+        // inside the box itself: out through the nearest face
+        const gaps = local.map((value, a) => half[a] - Math.abs(value)), least = gaps.indexOf(Math.min(...gaps));
+        distance = -gaps[least] - radius;
+        out[least] = Math.sign(local[least]) || 1;
+        length = 1;
+      }
+      if (distance <= -DEEPEST || distance >= LIFT) continue;
+      for (let c = 0; c < 3; c++) {
+        for (let a = 0; a < 3; a++) x[v + c] += ((LIFT - distance) / length) * out[a] * axes[3 * a + c];
+      }
+    }
+  }
+
+  #turn() {
+    const { positions: x, normals, fineRows, fineCols } = this;
+    for (let row = 0; row < fineRows; row++) {
+      const up = 3 * fineCols * Math.min(row + 1, fineRows - 1), down = 3 * fineCols * Math.max(row - 1, 0);
+      for (let col = 0; col < fineCols; col++) {
+        const right = 3 * Math.min(col + 1, fineCols - 1), left = 3 * Math.max(col - 1, 0);
+        const i = 3 * (row * fineCols + col), j = 3 * row * fineCols;
+        const ux = x[j + right] - x[j + left], uy = x[j + right + 1] - x[j + left + 1], uz = x[j + right + 2] - x[j + left + 2];
+        const k = 3 * col;
+        const vx = x[up + k] - x[down + k], vy = x[up + k + 1] - x[down + k + 1], vz = x[up + k + 2] - x[down + k + 2];
+        const nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx, length = Math.hypot(nx, ny, nz) || 1;
+        normals[i] = nx / length;
+        normals[i + 1] = ny / length;
+        normals[i + 2] = nz / length;
+      }
+    }
+  }
+}
+
+const EDGE = 0.008; // radius to which edges of a box are rounded [m]
+
+// The unit sphere cut into octants, which are moved apart: a ball, a capsule or a rounded box around the origin.
+function solidMesh({ kind, axes, half, radius }, quarter = 10) {
+  if (kind === "box") {
+    radius = Math.min(EDGE, 0.25 * Math.min(...half));
+    half = half.map((side) => side - radius);
+  }
+  const angles = Array.from({ length: quarter + 1 }, (_, k) => (k / quarter) * (Math.PI / 2));
+  const polar = [...angles, ...angles.map((angle) => angle + Math.PI / 2)];
+  const around = [0, 1, 2, 3].flatMap((part) => angles.map((angle) => angle + part * (Math.PI / 2)));
+  const signs = [[1, 1], [-1, 1], [-1, -1], [1, -1]];
+  const positions = [], normals = [], triangles = [];
+  polar.forEach((theta, row) => around.forEach((phi, col) => {
+    const normal = [Math.sin(theta) * Math.cos(phi), Math.sin(theta) * Math.sin(phi), Math.cos(theta)];
+    const [sx, sy] = signs[Math.floor(col / (quarter + 1))], octant = [sx, sy, row <= quarter ? 1 : -1];
+    for (let c = 0; c < 3; c++) {
+      let place = 0, turned = 0;
+      for (let a = 0; a < 3; a++) {
+        place += axes[3 * a + c] * (octant[a] * half[a] + radius * normal[a]);
+        turned += axes[3 * a + c] * normal[a];
+      }
+      positions.push(place);
+      normals.push(turned);
+    }
+  }));
+  const columns = around.length, vertex = (row, col) => row * columns + (col % columns);
+  for (let row = 0; row + 1 < polar.length; row++) {
+    for (let col = 0; col < columns; col++) {
+      const [a, b, c, d] = [vertex(row, col), vertex(row, col + 1), vertex(row + 1, col), vertex(row + 1, col + 1)];
+      triangles.push(a, c, d, a, d, b);
+    }
+  }
+  // the lids between the octants' poles
+  for (const [row, turn] of [[0, 1], [polar.length - 1, -1]]) {
+    const corners = [0, 1, 2, 3].map((part) => vertex(row, part * (quarter + 1)));
+    const [a, b, c, d] = turn > 0 ? corners : corners.reverse();
+    triangles.push(a, b, c, a, c, d);
+  }
+  return { positions: new Float32Array(positions), normals: new Float32Array(normals), triangles: new Uint32Array(triangles) };
+}

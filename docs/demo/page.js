@@ -1,0 +1,246 @@
+"use strict";
+// The page: which episode is shown, at what time, and from where.
+
+const PAUSE_AT_END = 3.5; // before it starts again [s]
+const SLOW = 0.045, COARSEST = 0.6; // a frame that takes longer [s] is drawn with fewer pixels from then on, at least that share
+const ICONS = { play: "M4 2l12 7-12 7z", pause: "M3 2h4v14H3zM11 2h4v14h-4z" };
+const $ = (selector) => document.querySelector(selector);
+const percent = (share) => `${(100 * Math.max(share, 0)).toFixed(1)} %`;
+
+// Where it is seen from: around a target, by angles, and how fast they turn by themselves after a drag.
+class Orbit {
+  // from where the episode's own camera is, but towards the middle of what happens
+  take({ eye, target }, middle) {
+    const [x, y, z] = minus(eye, target);
+    Object.assign(this, { target: middle, distance: Math.hypot(x, y, z), turn: Math.atan2(y, x), speed: [0, 0] });
+    this.rise = Math.asin(z / this.distance);
+    this.nearest = 0.35 * this.distance;
+    this.farthest = 2.5 * this.distance;
+  }
+
+  move(dx, dy) {
+    this.turn -= dx;
+    this.rise = Math.min(Math.max(this.rise + dy, 0.03), 1.5);
+  }
+
+  zoom(factor) {
+    this.distance = Math.min(Math.max(this.distance * factor, this.nearest), this.farthest);
+  }
+
+  coast(seconds) {
+    this.move(this.speed[0] * seconds, this.speed[1] * seconds);
+    this.speed = this.speed.map((value) => value * Math.exp(-5 * seconds));
+  }
+
+  get camera() {
+    const level = this.distance * Math.cos(this.rise);
+    const away = [level * Math.cos(this.turn), level * Math.sin(this.turn), this.distance * Math.sin(this.rise)];
+    return { eye: this.target.map((value, c) => value + away[c]), target: this.target };
+  }
+}
+
+class Page {
+  constructor() {
+    this.viewer = new Viewer($("#stage"));
+    this.orbit = new Orbit();
+    this.loaded = new Map();
+    Object.assign(this, { time: 0, playing: true, waited: 0, stale: true, before: 0, usual: 0, share: 1 });
+    const heat = `linear-gradient(90deg, ${HEAT.map((color) => `rgb(${color})`)})`;
+    $("#scale").style.background = $("#legend div").style.background = heat;
+    for (const { name, title } of EPISODES) {
+      const chip = document.createElement("button");
+      Object.assign(chip, { textContent: title, onclick: () => this.open(name) });
+      chip.dataset.name = name;
+      $(".chips").append(chip);
+    }
+    $("#play").onclick = () => this.toggle();
+    $("#color").onclick = () => this.colorByStrain(!this.viewer.strained);
+    $("#scrubber input").oninput = (event) => this.seek(Number(event.target.value) * this.episode.duration);
+    addEventListener("keydown", (event) => this.#key(event));
+    addEventListener("resize", () => (this.stale = true));
+    addEventListener("hashchange", () => this.open(this.#named()));
+    this.#pointers($("#stage"));
+    this.open(this.#named());
+    requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  #named() {
+    const wanted = decodeURIComponent(location.hash.slice(1));
+    return EPISODES.some(({ name }) => name === wanted) ? wanted : EPISODES[0].name;
+  }
+
+  async open(name) {
+    if (this.name === name) return;
+    this.name = name;
+    for (const chip of $(".chips").children) {
+      chip.setAttribute("aria-pressed", chip.dataset.name === name);
+      if (chip.dataset.name === name) chip.parentNode.scrollLeft = chip.offsetLeft - chip.parentNode.offsetLeft - 40;
+    }
+    history.replaceState(null, "", `#${name}`);
+    try {
+      if (!this.loaded.has(name)) this.loaded.set(name, loadEpisode(name));
+      const episode = await this.loaded.get(name);
+      if (this.name !== name) return; // another was chosen meanwhile
+      this.#show(episode);
+    } catch (error) {
+      trouble(error);
+    }
+  }
+
+  #show(episode) {
+    this.episode = episode;
+    this.viewer.show(episode);
+    this.orbit.take(episode.camera, this.viewer.stage);
+    this.slopes = this.viewer.slopes(this.orbit.camera);
+    $("#title").textContent = EPISODES.find(({ name }) => name === this.name).title;
+    $("#goal").textContent = episode.goal;
+    $("#most").textContent = `${100 * episode.strain_shown} %`;
+    const most = Math.max(...episode.strain, 1e-6), last = episode.frames - 1;
+    const curve = episode.strain.map((value, k) => `L${k / last} ${1 - 0.06 - (0.8 * Math.max(value, 0)) / most}`).join("");
+    document.querySelectorAll("#scrubber path").forEach((path) => path.setAttribute("d", `M0 1${curve}L1 1z`));
+    this.seek(0);
+    this.play(true);
+  }
+
+  play(on) {
+    this.playing = on;
+    this.waited = 0;
+    this.stale = true;
+    $("#play path").setAttribute("d", on ? ICONS.pause : ICONS.play);
+    $("#play").setAttribute("aria-label", on ? "Pause" : "Play");
+  }
+
+  toggle() {
+    if (!this.playing && this.time >= this.episode.duration) this.seek(0);
+    this.play(!this.playing);
+  }
+
+  colorByStrain(on) {
+    this.viewer.strained = on;
+    this.stale = true;
+    $("#color").setAttribute("aria-pressed", on);
+    $("#legend").classList.toggle("shown", on);
+  }
+
+  seek(time) {
+    this.time = Math.min(Math.max(time, 0), this.episode.duration);
+    this.waited = 0;
+    this.viewer.place(this.time);
+    this.stale = true;
+    this.#read();
+  }
+
+  // What is told beside the picture.
+  #read() {
+    const { episode, time } = this, frame = frameAt(episode, time), share = time / (episode.duration || 1);
+    $("#strain b").textContent = percent(episode.strain[frame]);
+    $("#score b").textContent = episode.score[frame].toFixed(2);
+    $("#clock").textContent = `${time.toFixed(1)} / ${episode.duration.toFixed(1)} s`;
+    $("#scrubber input").value = share;
+    $("#scrubber .head").style.left = `${100 * share}%`;
+    $("#past rect").setAttribute("width", share);
+    const over = frame === episode.frames - 1, verdict = $("#verdict");
+    if (over && !verdict.classList.contains("told")) {
+      const rate = `${Math.round(100 * episode.success_rate)} % of ${episode.episodes} unseen episodes`;
+      verdict.innerHTML = "<b></b><span></span>";
+      verdict.firstChild.textContent = `${episode.success ? "Success" : "Not this time"} · score ${episode.score[frame].toFixed(2)}`;
+      verdict.lastChild.textContent = `${episode.learner}: succeeds in ${rate}`;
+      verdict.classList.toggle("failed", !episode.success);
+    }
+    verdict.classList.toggle("told", over);
+  }
+
+  #tick(now) {
+    const seconds = Math.min((now - this.before) / 1000, 0.1);
+    this.before = now;
+    this.usual += 0.1 * (seconds - this.usual);
+    if (this.usual > SLOW && this.share > COARSEST) Object.assign(this, { usual: 0, share: 0.8 * this.share });
+    if (this.episode && this.playing) {
+      if (this.time < this.episode.duration) this.seek(this.time + seconds);
+      else if ((this.waited += seconds) > PAUSE_AT_END) this.seek(0);
+    }
+    if (this.episode && !this.held && Math.hypot(...this.orbit.speed) > 1e-3) {
+      this.orbit.coast(seconds);
+      this.stale = true;
+    }
+    if (this.episode && this.stale) this.draw();
+    requestAnimationFrame((then) => this.#tick(then));
+  }
+
+  draw() {
+    const stage = $("#stage"), moves = this.playing || this.held;
+    const scale = (moves ? this.share : 1) * Math.min(devicePixelRatio || 1, 2);
+    const [width, height] = [Math.round(stage.clientWidth * scale), Math.round(stage.clientHeight * scale)];
+    if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
+    // the panel covers the lower part, and on a phone the heading the upper one
+    const below = 1 - $("#panel").getBoundingClientRect().top / innerHeight;
+    const above = innerWidth < 640 ? $("header > p").getBoundingClientRect().bottom / innerHeight : 0.02;
+    this.viewer.draw(this.orbit.camera, this.slopes, [Math.min(below, 0.5), 1 - Math.min(above, 0.3)]);
+    this.stale = false;
+  }
+
+  #key(event) {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!this.episode || event.target.matches("button, input")) return;
+    if (event.key === " ") this.toggle();
+    else if (step) {
+      this.play(false);
+      this.seek(this.time + step * this.episode.time_step);
+    } else return;
+    event.preventDefault();
+  }
+
+  #pointers(stage) {
+    const fingers = new Map(); // by id, where each is
+    const spread = () => {
+      const [a, b] = [...fingers.values()];
+      return Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
+    };
+    stage.onpointerdown = (event) => {
+      stage.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, [event.clientX, event.clientY, event.timeStamp]);
+      this.orbit.speed = [0, 0];
+      this.held = true;
+    };
+    stage.onpointermove = (event) => {
+      const before = fingers.get(event.pointerId);
+      if (!before) return;
+      const apart = fingers.size > 1 ? spread() : 0;
+      fingers.set(event.pointerId, [event.clientX, event.clientY, event.timeStamp]);
+      if (apart) this.orbit.zoom(apart / spread());
+      else {
+        const turned = [event.clientX - before[0], event.clientY - before[1]].map((pixels) => (4 * pixels) / Math.min(innerWidth, innerHeight));
+        const passed = Math.max(event.timeStamp - before[2], 1) / 1000;
+        this.orbit.move(...turned);
+        this.orbit.speed = turned.map((angle) => Math.min(Math.max(angle / passed, -4), 4));
+      }
+      this.stale = true;
+    };
+    stage.onpointerup = stage.onpointercancel = (event) => {
+      const before = fingers.get(event.pointerId);
+      fingers.delete(event.pointerId);
+      this.held = fingers.size > 0;
+      this.stale = true;
+      // a finger that rested before it was lifted throws nothing
+      if (before && event.timeStamp - before[2] > 60) this.orbit.speed = [0, 0];
+    };
+    stage.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.orbit.zoom(Math.exp(0.001 * event.deltaY));
+      this.stale = true;
+    }, { passive: false });
+  }
+}
+
+function trouble(error) {
+  $("#trouble").textContent = error.message;
+  $("#trouble").style.display = "grid";
+  console.error(error);
+}
+
+let page;
+try {
+  page = new Page();
+} catch (error) {
+  trouble(error);
+}
