@@ -1,7 +1,8 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
 # make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
-# make clients: tests with other libraries      make oldest: tests with the oldest dependencies; each in an environment of its own
+# make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
+# make oldest: tests with the oldest dependencies; each of these in an environment of its own
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
@@ -10,7 +11,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test bits clients oldest bench clean
+.PHONY: train check lint test bits clients rllib oldest bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -37,6 +38,11 @@ clients:
 	$(VENV)-clients/bin/pip install --quiet --constraint .ci/clients.txt "torch==2.13.0" "pytest>=8" ".[clients]"
 	cd tests && ../$(VENV)-clients/bin/python -m pytest -q clients
 
+rllib:
+	$(PYTHON) -m venv $(VENV)-rllib
+	$(VENV)-rllib/bin/pip install --quiet --constraint .ci/rllib.txt "torch==2.13.0" "pytest>=8" ".[rllib]"
+	cd tests && ../$(VENV)-rllib/bin/python -m pytest -q rllib test_reach.py test_vector_env.py
+
 oldest:
 	$(PYTHON) -m venv $(VENV)-oldest
 	$(VENV)-oldest/bin/pip install --quiet --constraint .ci/oldest.txt "pytest>=8" .
@@ -55,4 +61,4 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-clients $(VENV)-oldest build dist *.egg-info clothgym/envs
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest build dist *.egg-info clothgym/envs
