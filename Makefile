@@ -3,7 +3,9 @@
 # make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
 # make oldest: tests with the oldest dependencies; each of these in an environment of its own
+# make release: wheel and sdist of what is committed, checked and tried out      make notebook: runs notebooks/
 PYTHON ?= python3
+PYTHONS ?= $(PYTHON)
 VENV ?= .venv
 BIN = $(VENV)/bin
 ENV ?= ClothDrape-v0
@@ -11,7 +13,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test bits clients rllib oldest bench clean
+.PHONY: train check lint test bits clients rllib oldest notebook release bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -48,6 +50,14 @@ oldest:
 	$(VENV)-oldest/bin/pip install --quiet --constraint .ci/oldest.txt "pytest>=8" .
 	cd tests && ../$(VENV)-oldest/bin/python -m pytest -q $(OLDEST:%=test_%.py)
 
+notebook:
+	$(PYTHON) -m venv $(VENV)-notebook
+	$(VENV)-notebook/bin/pip install --quiet --constraint .ci/notebook.txt "torch==2.13.0" "pytest>=8" ".[notebook]"
+	cd tests && ../$(VENV)-notebook/bin/python -m pytest -q notebooks
+
+release:
+	.ci/release $(PYTHONS)
+
 bench: $(VENV)/ready
 	$(BIN)/python -m clothgym bench
 
@@ -61,4 +71,4 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest build dist *.egg-info clothgym/envs
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest $(VENV)-notebook build dist *.egg-info clothgym/envs

@@ -5,6 +5,8 @@ import sys
 import zipfile
 from pathlib import Path
 
+import clothgym
+
 ROOT = Path(__file__).parent.parent
 
 
@@ -33,7 +35,11 @@ def test_wheel_ships_clothgym_only(tmp_path):
         str(source),
     ]
     subprocess.run(command, check=True, timeout=120)
-    names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
+    wheel = zipfile.ZipFile(next(tmp_path.glob("*.whl")))
+    names = wheel.namelist()
     assert {name.split("/")[0].split("-")[0] for name in names} == {"clothgym"}
     assert "clothgym/envs/drape.py" in names and "clothgym/envs/drape_reference.json" in names and "clothgym/py.typed" in names
     assert not any("test" in name for name in names)
+    metadata = wheel.read(f"clothgym-{clothgym.__version__}.dist-info/METADATA").decode()
+    assert f"\nVersion: {clothgym.__version__}\n" in metadata
+    assert sum(member.compress_size for member in wheel.infolist()) < 3e6
