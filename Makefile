@@ -52,7 +52,7 @@ oldest:
 
 notebook:
 	$(PYTHON) -m venv $(VENV)-notebook
-	$(VENV)-notebook/bin/pip install --quiet --constraint .ci/notebook.txt "torch==2.13.0" "pytest>=8" ".[notebook]"
+	$(VENV)-notebook/bin/pip install --quiet --constraint .ci/constraints.txt --constraint .ci/notebook.txt "torch==2.13.0" "pytest>=8" ".[notebook]"
 	cd tests && ../$(VENV)-notebook/bin/python -m pytest -q notebooks
 
 release:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.play import play
 from gymnasium.wrappers import RecordVideo
-from test_envs import drawn, every_task, make, make_vec, still
+from test_envs import drawn, every_id, every_task, make, make_vec, still
 
 import clothgym
 from clothgym import INTEGRATORS, Plane, Simulation, Sphere
@@ -111,21 +111,31 @@ def test_keys_move_all_attachments(env_id):
         assert moves["o"][:, 3].tolist() == [1] * count and moves["wc"][:, 3].tolist() == [-1] * count
 
 
-def test_gymnasium_plays_it(monkeypatch):
-    """d is held for two steps: the attachment has moved along x by two steps at full speed, and is then still."""
+@every_id
+def test_gymnasium_plays_it(env_id, monkeypatch):
+    """e is held for two steps: all attachments have risen by two steps at full speed, and are then still.  Then d: along x.
+
+    Nothing is held in the first four steps, in which the grippers of a fling close and take no other command.
+    """
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame = pytest.importorskip("pygame")
-    env, places = make("ClothReach-v0", render_mode="rgb_array"), []
+    env, places = make(env_id, render_mode="rgb_array", width=96, height=96), []
+    keys = {5: (pygame.KEYDOWN, "e"), 7: (pygame.KEYUP, "e"), 8: (pygame.KEYDOWN, "d"), 9: (pygame.KEYUP, "d")}
 
     def watch(before, after, action, reward, terminated, truncated, info):
-        places.append(env.unwrapped.task.episode["targets"][0, 0, 0])
-        kind = {1: pygame.KEYDOWN, 3: pygame.KEYUP, 5: pygame.QUIT}.get(len(places))
-        if kind is not None:
-            pygame.event.post(pygame.event.Event(kind, key=ord("d")) if kind != pygame.QUIT else pygame.event.Event(kind))
+        places.append(env.unwrapped.task.episode["targets"][0].copy())
+        if len(places) in keys:
+            kind, key = keys[len(places)]
+            pygame.event.post(pygame.event.Event(kind, key=ord(key)))
+        elif len(places) == 10:
+            pygame.event.post(pygame.event.Event(pygame.QUIT))
 
     play(env, seed=0, callback=watch, fps=1000)
-    speed = env.unwrapped.task.physics.attachment_speed * env.unwrapped.task.physics.time_step
-    assert np.diff(places) == pytest.approx([speed, speed, 0, 0], abs=1e-9)
+    way = env.unwrapped.task.physics.attachment_speed * env.unwrapped.task.physics.time_step
+    steps = np.diff(places[4:], axis=0)
+    assert steps.shape == (5, env.unwrapped.task.num_attachments, 3)
+    for step, along in zip(steps, [(0, 0, way), (0, 0, way), (0, 0, 0), (way, 0, 0), (0, 0, 0)]):
+        assert step == pytest.approx(np.broadcast_to(along, step.shape), abs=1e-6)
 
 
 @every_task

@@ -3,23 +3,22 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-
-import clothgym  # noqa: F401 - registers the ids
+from page import run
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_dataset_with_infos(tmp_path, monkeypatch):
-    minari = pytest.importorskip("minari")
+    pytest.importorskip("minari")
     pytest.importorskip("jax")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    env, strains, done = minari.DataCollector(gym.make("ClothReach-v0"), record_infos=True), [], False
-    strains.append(env.reset(seed=0)[1]["strain_max"])
-    while not done:
-        *_, terminated, truncated, info = env.step(env.unwrapped.expert_action())
-        strains.append(info["strain_max"])
-        done = terminated or truncated
-    dataset = env.create_dataset("cloth/reach-v0", algorithm_name="expert")
+    dataset = run("Minari")["dataset"]
     episode = dataset[0]
+    # the same episode, played without Minari
+    env = gym.make("ClothReach-v0")
+    strains, done = [env.reset(seed=0)[1]["strain_max"]], False
+    while not done:
+        *_, done, _, info = env.step(env.unwrapped.expert_action())
+        strains.append(info["strain_max"])
     # an episode of ClothReach-v0 takes 40 steps, and is evaluated in the last
     assert dataset.total_steps == 40 and episode.terminations.tolist() == [False] * 39 + [True] and not episode.truncations.any()
     assert np.array_equal(episode.infos["strain_max"], strains) and episode.infos["is_success"][-1]

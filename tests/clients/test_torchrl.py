@@ -2,8 +2,7 @@
 
 import gymnasium as gym
 import pytest
-
-import clothgym  # noqa: F401 - registers the ids
+from page import run
 
 STEPS = 45
 
@@ -12,10 +11,11 @@ STEPS = 45
 @pytest.mark.parametrize("mode", ["Disabled", "SameStep"])
 def test_batches_roll_through_the_end_of_an_episode(mode):
     envs = pytest.importorskip("torchrl.envs")
-    env = envs.GymWrapper(gym.make_vec("ClothReach-v0", num_envs=3, autoreset_mode=mode))
     if mode == "Disabled":
-        env.auto_register_info_dict()
-    rolled = env.rollout(STEPS, break_when_any_done=False)["next"]
+        rolled = run("TorchRL")["data"]["next"]
+    else:
+        env = envs.GymWrapper(gym.make_vec("ClothReach-v0", num_envs=3, autoreset_mode=mode))
+        rolled = env.rollout(STEPS, break_when_any_done=False)["next"]
     ends = rolled["terminated"][..., 0]
     assert ends.shape == (3, STEPS) and ends[:, 39].all() and ends.sum() == 3 and not rolled["truncated"].any()
     # a term of the reward is beside the reward
@@ -26,8 +26,8 @@ def test_batches_roll_through_the_end_of_an_episode(mode):
 
 @pytest.mark.filterwarnings("ignore")
 def test_a_single_environment():
-    envs = pytest.importorskip("torchrl.envs")
+    pytest.importorskip("torchrl.envs")
     utils = pytest.importorskip("torchrl.envs.utils")
-    env = envs.GymEnv("ClothReach-v0")
+    env = run("TorchRL")["single"]
     utils.check_env_specs(env)
     assert env.rollout(STEPS).batch_size[0] == 40
