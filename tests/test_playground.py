@@ -9,11 +9,12 @@ from stages import advanced, page
 
 from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.playground import server
+from clothgym.playground.colors import RAMP, linear, ramp
 from clothgym.playground.episode import EpisodeStage
 from clothgym.playground.recording import strains, tensions, yarns
 from clothgym.playground.scenes import SCENES, scene_named, turned_on_a_lathe
-from clothgym.playground.show import RAMP, linear, ramp
-from clothgym.playground.stage import SceneStage, Stability, why_it_burst
+from clothgym.playground.sheets import Stability, why_it_burst
+from clothgym.playground.stage import SceneStage
 from clothgym.playground.world import Settings
 from clothgym.registration import ENVIRONMENTS
 
@@ -38,8 +39,8 @@ def test_every_scene_begins_whole_and_goes_on(name):
         assert np.abs(last.positions - first.positions).max() > 1e-3
 
 
-def test_without_gravity_the_patch_stays_flat_and_with_it_droops_from_pins_that_do_not_move():
-    stage = SceneStage("patch")
+def test_without_gravity_and_air_the_patch_stays_flat_and_with_gravity_it_droops_from_pins_that_do_not_move():
+    stage = SceneStage("patch", Settings(gravity=0.0, fabric="knit", air_drag=0.75))
     pins = list(stage.scene.anchors)
     still = advanced(stage, 30).frame
     assert np.abs(still.positions[0] - stage.scene.start).max() < 1e-6
@@ -82,12 +83,20 @@ def test_colors_by_strain_are_loudest_where_the_test_finds_the_most_strained_spr
     visitor.stage, visitor.moment, visitor.playing = stage, 60, False
     visitor._see()
     visitor.tick()
-    shown = client.scene.handles["/sheet0/yarns"]
+    shown, full = client.scene.handles["/threads0"], visitor.show.scale.strained
+    assert mine.max() <= full < 2 * mine.max()  # the scale fits what is shown
     most = np.argsort(mine)[-4:]
-    assert np.array_equal(shown.points[most], x[mesh.springs.particles[springs[most]]])
-    assert np.array_equal(shown.colors[most], np.broadcast_to(linear(ramp(np.ones((4, 2)))), (4, 2, 3)))
+    assert np.linalg.norm(shown.points[most] - x[mesh.springs.particles[springs[most]]], axis=2).max() < 0.0031
+    assert np.array_equal(shown.colors[most], np.repeat(linear(ramp(mine[most] / full))[:, None], 2, axis=1))
+    # threads at rest are not drawn: they have no length
+    idle = mine < 0.2 * full
+    assert idle.any() and np.array_equal(shown.points[idle, 0], shown.points[idle, 1])
+    # the sheet hangs from two pins, and is stretched most where they hold it
     i, j = mesh.springs.particles[springs[np.argmax(mine)]]
-    assert f"| {i} to {j} |" in visitor.controls["readings"].content
+    assert x[[i, j], 2].mean() > x[:, 2].min() + 0.7 * np.ptp(x[:, 2])
+    side = "left" if x[[i, j], 0].mean() < 0 else "right"
+    assert f"| {side} edge, near the top |" in visitor.controls["readings"].content
+    assert f"{100 * mine.max():.2f} %" in visitor.controls["glance"].content
 
 
 def test_the_colors_of_pushed_idle_and_loaded_springs_are_the_scales():
@@ -159,7 +168,7 @@ def test_a_strain_limit_shows_the_sheet_before_and_after():
 def test_the_sheet_without_the_limit_hangs_beside_the_limited_one():
     visitor, client = page()
     assert not visitor.controls["unlimited"].visible
-    for label, value in (("fabric", "knit"), ("gravity m/s²", 9.81), ("strain limit %", 10.0)):
+    for label, value in (("wind m/s", 0.0), ("gusts m/s", 0.0), ("gravity m/s²", 9.81), ("strain limit %", 10.0)):
         client.gui.handles[label].turn(value)
     visitor.tick()
     assert visitor.controls["unlimited"].visible and len(visitor.stage.sheets) == 1
@@ -170,7 +179,7 @@ def test_the_sheet_without_the_limit_hangs_beside_the_limited_one():
     own = mesh.springs.kind < 2
     limited, free = ((lengths(mesh, x.astype(float)) / mesh.springs.rest_length - 1)[own].max() for x in frame.positions)
     assert limited < 0.11 and free > 0.2
-    assert client.scene.handles["/sheet0/front"].color != client.scene.handles["/sheet1/front"].color
+    assert client.scene.handles["/sheet0/front0"].color != client.scene.handles["/sheet1/front0"].color
     plain = SceneStage("patch", visitor.stage.settings.changed(strain_limit=None))
     assert np.abs(advanced(plain, 40).frame.positions[0] + visitor.stage.offsets[1] - frame.positions[1]).max() < 1e-6
     client.gui.handles["strain limit %"].turn(0.0)

@@ -22,6 +22,14 @@ from clothgym.playground.scenes import scene_named
 from clothgym.playground.stage import SceneStage
 from clothgym.playground.world import Settings, begin
 
+
+def assert_drawn(client, frame, lifted=0.0):
+    """The surface in the viewer goes through the particles of the first sheet, or lies so high above a solid at them [m]."""
+    drawn = np.concatenate([node.vertices for name, node in client.scene.handles.items() if name.startswith("/sheet0/front")])
+    gaps = [np.abs(drawn - particle).max(axis=1).min() for particle in frame.positions[0][::7]]
+    assert max(gaps) < 1e-6 + lifted
+
+
 # --- the page -----------------------------------------------------------------------------------------------------------
 
 
@@ -31,10 +39,8 @@ def test_the_gravity_slider_moves_the_cloth_of_this_visitor_alone():
     for _ in range(20):
         mine.tick()
         theirs.tick()
-    assert mine.stage.frame.positions[0, :, 2].min() < 0.7
-    assert np.abs(theirs.stage.frame.positions[0] - theirs.stage.scene.start).max() < 1e-6
-    front = client.scene.handles["/sheet0/front"]
-    assert np.array_equal(front.vertices, mine.stage.frame.positions[0])
+    assert mine.stage.frame.positions[0, :, 2].min() < 0.55 < theirs.stage.frame.positions[0, :, 2].min()
+    assert_drawn(client, mine.stage.frame)
 
 
 def test_controls_turn_settings_and_follow_them():
@@ -43,9 +49,9 @@ def test_controls_turn_settings_and_follow_them():
     handles["fabric"].turn("denim")
     visitor.tick()
     assert visitor.controls["stretch_stiffness"].value == 1615.7
-    handles["bending µN m"].turn(20.0)
+    handles["bending stiffness µN m"].turn(20.0)
     handles["integrator"].turn("verlet")
-    handles["by the bound"].turn(False)
+    handles["safe substeps"].turn(False)
     handles["strain limit %"].turn(5.0)
     visitor.tick()
     settings = visitor.stage.settings
@@ -53,14 +59,14 @@ def test_controls_turn_settings_and_follow_them():
     assert settings.substeps == visitor.stage.sheets[0].simulation.substeps
     handles["fabric"].turn("knit")
     visitor.tick()
-    handles["bending µN m"].turn(200.0)
+    handles["bending stiffness µN m"].turn(200.0)
     visitor.tick()
     assert "lower the shear stiffness or the rigidity" in client.notifications[-1]
     assert visitor.controls["bend_rigidity"].value == pytest.approx(0.225)
 
 
 def test_pause_step_scrub_and_reset():
-    visitor, _ = page("flag")
+    visitor, client = page("flag")
     controls = visitor.controls
     for _ in range(5):
         visitor.tick()
@@ -74,7 +80,7 @@ def test_pause_step_scrub_and_reset():
     assert len(visitor.stage.recording.frames) == count + 1
     controls["moment"].turn(2)
     visitor.tick()
-    assert np.array_equal(visitor.show._sheets[0][0][0].vertices, visitor.stage.recording.frames[2].positions[0])
+    assert_drawn(client, visitor.stage.recording.frames[2], lifted=0.006)
     controls["seed"].value = 3
     controls["time"].turn("reset")
     visitor.tick()
@@ -89,14 +95,14 @@ def test_a_recording_is_scrubbed_to_any_frame_and_plays_on_from_there():
     assert visitor.moment == 1 and visitor.controls["moment"].max == 12
     visitor.controls["moment"].turn(9)
     visitor.tick()
-    front = client.scene.handles["/sheet0/front"]
-    assert np.array_equal(front.vertices, stage.recording.frames[9].positions[0])
+    assert_drawn(client, stage.recording.frames[9])
     visitor.controls["time"].turn("step")
     visitor.tick()
     visitor.controls["time"].turn("play / pause")
     for _ in range(9):
         visitor.tick()
-    assert visitor.moment == 12 and np.array_equal(front.vertices, stage.frame.positions[0])
+    assert visitor.moment == 12
+    assert_drawn(client, stage.frame)
     terms = visitor.plots.shown["reward terms"].data
     assert np.array_equal(terms[0], [frame.time for frame in stage.recording.frames])
     names = sorted(stage.frame.terms)
@@ -170,7 +176,7 @@ def test_comparison_has_a_sheet_and_a_color_for_each():
     assert [sheet.name for sheet in visitor.stage.sheets] == ["semi_implicit_euler", "verlet"]
     visitor.controls["show"].turn("fabric")
     visitor.tick()
-    colors = [client.scene.handles[f"/sheet{k}/front"].color for k in range(2)]
+    colors = [client.scene.handles[f"/sheet{k}/front0"].color for k in range(2)]
     assert len(set(colors)) == 2 and not visitor.controls["integrator"].visible
     visitor.controls["compare"].turn(False)
     visitor.tick()

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from clothgym.playground import server
-from clothgym.playground.page import MOST_SUBSTEPS
+from clothgym.playground.controls import MOST_SUBSTEPS
 
 SECONDS = 20.0  # in which the server answers
 MESSAGES = 12  # of an attack

@@ -23,6 +23,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from clothgym.checks import shown
+from clothgym.playground.dress import dressed
 
 MOST_VISITS = 16
 NOWHERE = "clothgym.invalid"  # a name that no server has
@@ -91,6 +92,7 @@ class Access:
                 return connection.respond(refused[0], refused[1] + "\n")
             response = process(connection, request) if process is not None else None
             if response is not None:
+                dressed(response)
                 response.headers["Content-Security-Policy"] = FRAMES
                 response.headers["Referrer-Policy"] = "no-referrer"
                 if self.token:

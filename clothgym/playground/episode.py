@@ -15,7 +15,8 @@ from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.envs.episode import FAILURES, within_ball
 from clothgym.material import PRESETS
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
-from clothgym.playground.stage import Attachment, Stability, Stage, set_in_place, stability, visible, within_view
+from clothgym.playground.sheets import Attachment, Stability, set_in_place, stability, visible, within_view
+from clothgym.playground.stage import Stage
 from clothgym.playground.world import SLIDERS, Settings
 from clothgym.registration import checked_id
 from clothgym.render.solids import drawn

@@ -16,13 +16,22 @@ class Handle:
         self.kind, self.removed = kind, False
         self.value: Any = None
         self.content: Any = None
-        self.callbacks: list[Callable[[Any], None]] = []
+        self.callbacks: list[Callable[[Any], Any]] = []
         for name, value in properties.items():
             setattr(self, name, value)
 
-    def on_update(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
+    def on_update(self, callback: Callable[[Any], Any]) -> Callable[[Any], Any]:
         self.callbacks.append(callback)
         return callback
+
+    def on_drag(self, button: str) -> Callable[..., Any]:
+        """As a node: register what a drag calls."""
+        return self.on_update
+
+    def drag(self, phase: str, start: Any, end: Any) -> None:
+        """Act as a visitor: drag a node from one position to another."""
+        for callback in self.callbacks:
+            asyncio.run(callback(SimpleNamespace(target=self, phase=phase, start_position=start, end_position=end, client_id=0)))
 
     def turn(self, value: Any = None, phase: str = "update") -> None:
         """Act as a visitor: set a control to a value, press a button, or drag a node."""
@@ -54,6 +63,15 @@ class Part:
     def __init__(self) -> None:
         self.handles: dict[str, Handle] = {}
         self.main_panel = Handle("panel")
+        self.clicks: dict[str | None, Callable[[Any], Any]] = {}
+
+    def on_click(self, modifier: str | None = None) -> Callable[..., Any]:
+        """Register what a click anywhere calls."""
+        return lambda callback: self.clicks.setdefault(modifier, callback)
+
+    def click(self, origin: Any, direction: Any, modifier: str | None = None) -> None:
+        """Act as a visitor: click where a ray leads."""
+        asyncio.run(self.clicks[modifier](SimpleNamespace(ray_origin=origin, ray_direction=direction, modifier=modifier)))
 
     def reset(self) -> None:
         self.handles.clear()
@@ -81,7 +99,9 @@ class NullClient:
 
     def __init__(self) -> None:
         self.scene, self.gui = Part(), Part()
-        self.camera = SimpleNamespace(position=(1.0, -1.0, 1.0), look_at=(0.0, 0.0, 0.0), fov=0.6)
+        self.camera = SimpleNamespace(
+            position=(1.0, -1.0, 1.0), look_at=(0.0, 0.0, 0.0), fov=0.6, image_width=1280, image_height=800
+        )
         self.files: dict[str, bytes] = {}
         self.notifications: list[str] = []
 

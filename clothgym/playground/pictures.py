@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from clothgym.checks import one_of
 from clothgym.forces import structural_strain
+from clothgym.playground.colors import sides
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.show import sides
 from clothgym.render import Camera, Drawn, Renderer, write_animation
 from clothgym.render.heat import largest_at_particles
 
@@ -30,7 +30,7 @@ def painter(
     mesh, seen = recording.mesh, camera or recording.camera
     renderers = []
     for label in recording.labels:
-        front, back = sides(label, len(recording.labels) > 1)
+        front, back, _ = sides(label, len(recording.labels) > 1)
         uv = mesh.rest_positions[:, :2]
         renderers.append(Renderer(mesh.triangles, uv, seen, size, size, antialias, grid_shape=mesh.shape, front=front, back=back))
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from clothgym.lab.compare_pictures import INK
+from clothgym.playground.colors import own_color
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.show import own_color
 from clothgym.render.shading import CORAL
 
 POINTS = 300  # frames in a plot

@@ -14,6 +14,7 @@ from clothgym.playground.world import Scene, Settings, Targets
 from clothgym.render import Camera, Drawn
 
 STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colors of solids
+BREATH = 0.7, 0.2  # steady wind that keeps a weightless sheet spread, and gusts that ripple it [m/s]
 SWING_DRAG = 0.75  # linear drag that damps slow swinging [N s/m^3]
 
 
@@ -104,16 +105,17 @@ def pinned_patch() -> Scene:
     return Scene(
         name="patch",
         title=TITLES["patch"],
-        about="A little patch, pinned at two corners. Pull the gravity slider, and watch the yarns take up the load.",
+        about="A patch of cloth in a breath of air. Pull the gravity slider, and see which threads light up.",
         mesh=mesh,
         start=mesh.rest_positions + (0, 0, 0.8),
-        settings=Settings(gravity=0.0, fabric="knit", air_drag=SWING_DRAG),
+        settings=Settings(gravity=0.0, wind=BREATH[0], gust=BREATH[1], fabric="knit", air_drag=SWING_DRAG),
         anchors=mesh.corners[2:],
         names=("left pin", "right pin"),
         held=(0, 1),
         handles=(0, 1),
-        camera=Camera(eye=(0.9, -1.3, 1.2), target=(0.0, 0.12, 0.5)),
+        camera=Camera(eye=(0.95, -1.45, 1.2), target=(0.0, 0.0, 0.6)),
         strained=0.08,
+        downwind=(0.0, -1.0, 0.0),  # away from the pins
     )
 
 

@@ -4,82 +4,43 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym import integrators
 from clothgym.checks import indices, vector
-from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.guards import BURST, refusal
-from clothgym.parameters import PROPERTIES, of_material
-from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
+from clothgym.guards import refusal
+from clothgym.material import PRESETS
+from clothgym.playground import hands
+from clothgym.playground.recording import Frame, Recording, stiffness
 from clothgym.playground.scenes import scene_named
+from clothgym.playground.sheets import (
+    Attachment,
+    Sheet,
+    Stability,
+    carried_over,
+    changed_properties,
+    own,
+    set_in_place,
+    simulated,
+    stability,
+    visible,
+    within_view,
+)
 from clothgym.playground.world import FRAME, Scene, Settings, Targets, begin, drive
-from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
 GUSTS = 3600  # control steps after which the gusts repeat
 LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
-EDGE_OF_VIEW = 9.0  # of each coordinate [m]
 KEPT = 1800  # most recent frames that are kept
 MOST_COMPARED = 4
 REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
-UNLIMITED = ", no limit"  # ends the label of a sheet without the others' strain limit
-SHREDS = 0.12  # largest displacement at which a sheet that has blown up is drawn [m]: its real position is out of sight
-EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
 # settings that change the compiled loop or a method's plan: they need a new simulation of the same sheet
 REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
-
-
-class Attachment(NamedTuple):
-    """An anchor or gripper as a visitor sees it: name, position [m], whether it holds anything, and whether it can be dragged."""
-
-    name: str
-    position: NDArray
-    holds: bool
-    draggable: bool
-
-
-class Stability(NamedTuple):
-    """The present substep [s], the largest that the integrator should be used with (0 if there is none), why, the control step
-    [s], and whether a sheet beyond the bound blows up, or is only inaccurate as it moves."""
-
-    substep: float
-    bound: float
-    why: str
-    time_step: float
-    explicit: bool = True
-
-    @property
-    def share(self) -> float:
-        """Of the bound that the substep takes; above 1 it is beyond it."""
-        return self.substep / self.bound if self.bound > 0 else np.inf
-
-    @property
-    def verdict(self) -> str:
-        """What the bound says of the substep."""
-        if self.explicit:
-            return "stable" if self.share <= 1 else "unstable"
-        return "accurate" if self.share <= 1 else "stable, coarse"
-
-
-def stability(simulation: Simulation) -> Stability:
-    explicit = simulation.integrator.name in EXPLICIT
-    return Stability(simulation.time_step / simulation.substeps, *simulation.largest_substep(), simulation.time_step, explicit)
-
-
-def why_it_burst(name: str, at: Stability) -> str:
-    """A sentence on a sheet that has blown up."""
-    if at.bound <= 0:
-        return f"**{name}** burst: it has no bound here, {at.why}."
-    step, bound = f"{1e3 * at.substep:.3g} ms", f"{1e3 * at.bound:.3g} ms"
-    if at.share > 1:
-        return f"**{name}** burst: its substep of {step} is beyond its bound of {bound}: {at.why}."
-    return f"**{name}** burst, though its substep of {step} is within the bound of {bound} for a sheet at rest."
+UNTOUCHED = "Nothing can be {} here: choose a scene."
 
 
 class Stage:
@@ -144,64 +105,34 @@ class Stage:
         """The stability of each sheet; empty if nothing is simulated."""
         return []
 
+    # --- the visitor's hand -----------------------------------------------------------------------------------------------
+
+    def grab(self, place: ArrayLike) -> None:
+        """Take hold of the sheet where it is nearest to a position [m], (3,)."""
+        raise ValueError(UNTOUCHED.format("held"))
+
+    def pull(self, place: ArrayLike) -> None:
+        """Move what is held to a position [m], (3,)."""
+
+    def let_go(self) -> None:
+        """Let go of what is held, which flies on."""
+
+    def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
+        """Pin the sheet where a ray from ``origin`` [m] meets it, or take away the pin that is there."""
+        raise ValueError(UNTOUCHED.format("pinned"))
+
+    def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
+        """Blow on the sheet along a ray from ``origin`` [m]."""
+        raise ValueError(UNTOUCHED.format("blown"))
+
+    def pinned(self) -> NDArray[np.float32]:
+        """Where the visitor holds and has pinned the sheets [m], (points, 3)."""
+        return np.zeros((0, 3), np.float32)
+
     def _keep(self, frame: Frame) -> Frame:
         self.recording.frames.append(frame)
         del self.recording.frames[:-KEPT]
         return frame
-
-
-@dataclass
-class Sheet:
-    """One simulation on a stage.
-
-    Attributes:
-        name: of its integrator.
-        limited: whether it has the settings' strain limit.
-        simulation: a batch of one.
-        cost: of its last control step [s].
-        burst: why it has blown up, or ""; it is not advanced any more then.
-        penetration: how deep it was in a solid when last measured [m].
-        shredded: whether its last positions were set after it blew up.
-        positions, touching, readings: when last measured, see ``Frame``.
-    """
-
-    name: str
-    simulation: Simulation
-    limited: bool = True
-    cost: float = 0.0
-    burst: str = ""
-    penetration: float = 0.0
-    shredded: bool = False
-    positions: NDArray[np.float32] = field(init=False)
-    touching: NDArray[np.bool_] = field(init=False)
-    readings: dict[str, float] = field(init=False)
-
-    @property
-    def label(self) -> str:
-        return self.name if self.limited else self.name + UNLIMITED
-
-    def step(self, n: int) -> None:
-        begun = time.perf_counter()
-        for _ in range(n):
-            self.simulation.step()
-        self.cost = (time.perf_counter() - begun) / n
-        with np.errstate(all="ignore"):
-            strain = self.simulation.strain().max()
-        if self.simulation.diverged[0] or not strain <= BURST:
-            self.burst = why_it_burst(self.name, stability(self.simulation))
-
-    def look(self, penetration: bool) -> None:
-        """Update positions and readings.  A sheet that has blown up keeps its readings, and is drawn in shreds."""
-        s = self.simulation
-        if self.burst:
-            if not self.shredded:
-                away = np.nan_to_num(s.positions[0] - self.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
-                self.positions, self.shredded = self.positions + np.clip(away, -SHREDS, SHREDS).astype(np.float32), True
-            return
-        if penetration and s.colliders:
-            self.penetration = float(s.penetration()[0])
-        self.positions, self.touching = visible(s.positions[0]), touching(s)
-        self.readings = read(s, self.cost, self.penetration)
 
 
 class SceneStage(Stage):
@@ -210,10 +141,10 @@ class SceneStage(Stage):
     Args:
         scene: its name, or a ``Scene``.
         settings: instead of the scene's own.
-        compared: two to four integrators, a sheet each; none for one sheet with the settings' integrator.
+        compared: two to four integrators, or fabrics, a sheet each; none for one sheet with the settings' own.
 
     Raises:
-        ValueError: no such scene or integrator, or a number of them that cannot be compared.
+        ValueError: no such scene, integrator or fabric, or a number of them that cannot be compared.
     """
 
     def __init__(self, scene: str | Scene, settings: Settings | None = None, compared: Sequence[str] = (), seed: int = 0) -> None:
@@ -224,6 +155,8 @@ class SceneStage(Stage):
         self.seed = seed
         self.steps = 0
         self._dragged: dict[int, NDArray] = {}
+        self._held_anchor: int | None = None  # of the scene, that the visitor holds by the sheet
+        self._breath: tuple[float, NDArray, NDArray] | None = None  # until when, through where and along which way
         self._gusts = np.zeros((1, 3))
         self._bounds: list[Stability] | None = None
         self.sheets: list[Sheet] = []
@@ -242,11 +175,15 @@ class SceneStage(Stage):
             # a frame that takes too long is cut short: then the cloth moves slowly, but the page answers
             if self.left() or time.perf_counter() - begun > self.budget:
                 break
-            wind = np.array([self.settings.wind, 0, 0]) + self.settings.gust * self._gusts[self.steps % len(self._gusts)]
+            gust = self.settings.gust * self._gusts[self.steps % len(self._gusts)]
+            wind = self.settings.wind * np.array(self.scene.downwind) + gust
             for sheet in self.sheets:
                 if not sheet.burst and not self.left():
                     drive(sheet.simulation, self.scene, self.time, self._targets())
+                    sheet.hand.follow()
                     sheet.simulation.set_wind(wind)
+                    if self._breath is not None and self.time < self._breath[0]:
+                        hands.blow(sheet.simulation, *self._breath[1:], FRAME)
                     sheet.step(1)
             self.steps += 1
         bursts = [sheet.burst for sheet in self.sheets if sheet.burst]
@@ -258,6 +195,7 @@ class SceneStage(Stage):
         self.seed = self.seed if seed is None else int(seed)
         self.steps = 0
         self._dragged.clear()
+        self._held_anchor = self._breath = None
         self.notes.pop("burst", None)
         self._gusts = Wind(gust=1.0).series(np.random.default_rng(self.seed), GUSTS, FRAME)
         for sheet in self.sheets:
@@ -266,22 +204,24 @@ class SceneStage(Stage):
         self.recording.frames[:] = [self._look()]
 
     def compare(self, names: Sequence[str], unlimited: bool = False) -> None:
-        """Start again with a sheet for each of these integrators, two to four.  Without names, with one sheet for the integrator of
-        the settings, and with ``unlimited`` beside it the same without the strain limit.
+        """Start again with a sheet for each of these integrators, or of these fabrics, two to four.  Without names, with one sheet
+        for the integrator of the settings, and with ``unlimited`` beside it the same without the strain limit.
 
         Raises:
-            ValueError: another number of integrators, or names with ``unlimited``.
+            ValueError: another number, integrators beside fabrics, or names with ``unlimited``.
         """
-        names = list(dict.fromkeys(names))
+        names = [name if name in PRESETS else integrators.get(name).name for name in dict.fromkeys(names)]
         if len(names) == 1 or len(names) > MOST_COMPARED:
-            raise ValueError(f"compared={names!r}: choose two to {MOST_COMPARED} integrators")
+            raise ValueError(f"compared={names!r}: choose two to {MOST_COMPARED} integrators or fabrics")
+        if len({name in PRESETS for name in names}) > 1:
+            raise ValueError(f"compared={names!r}: compare integrators or fabrics, not both")
         if names and unlimited:
             raise ValueError(f"compared={names!r}, unlimited=True: compare integrators, or one with and without its strain limit")
-        methods = [(integrators.get(name).name, True) for name in names] or [(self.settings.integrator, True)]
+        methods = [(name, True) for name in names] or [(self.settings.integrator, True)]
         if unlimited:
             methods.append((self.settings.integrator, False))
         settings = self.settings
-        self.sheets = [Sheet(name, self.scene.simulation(own(settings, name, limited)), limited) for name, limited in methods]
+        self.sheets = [Sheet(name, simulated(self.scene, own(settings, name, limited)), limited) for name, limited in methods]
         self.compared, self.unlimited = tuple(names), unlimited
         apart = 1.25 * self.scene.mesh.size[0]
         self.offsets = np.array([((k - (len(methods) - 1) / 2) * apart, 0.0, 0.0) for k in range(len(methods))])
@@ -320,20 +260,24 @@ class SceneStage(Stage):
         made = []
         for sheet in self.sheets:
             name = sheet.name if self.compared else after.integrator
-            properties = changed_properties(before, after)
-            ignored = properties & integrators.get(name).ignored
+            old, new = (own(settings, name, sheet.limited) for settings in (before, after))
+            method = integrators.get(new.integrator)
+            properties = changed_properties(old, new)
+            ignored = properties & method.ignored
             if ignored:
-                self.notes["ignored"] = refusal(integrators.get(name), sorted(ignored)[0]).capitalize() + "."
+                self.notes["ignored"] = refusal(method, sorted(ignored)[0]).capitalize() + "."
             if rebuilt or ignored:
-                made.append((name, carried_over(sheet.simulation, self.scene, own(after, name, sheet.limited))))
+                made.append((name, carried_over(sheet.simulation, self.scene, new)))
             else:
-                unbounded = set_in_place(sheet.simulation, before, after)
+                unbounded = set_in_place(sheet.simulation, old, new)
                 if unbounded:
                     self.notes["substeps"] = unbounded
                 made.append((name, sheet.simulation))
         # recorded positions and readings stay: a sheet that has blown up is not measured again before a reset
         for sheet, (name, simulation) in zip(self.sheets, made):
-            sheet.name, sheet.simulation = name, simulation
+            sheet.name = name
+            if simulation is not sheet.simulation:
+                sheet.use(simulation)
         self.settings, self._bounds = after, None
         self.recording.labels = tuple(sheet.label for sheet in self.sheets)
 
@@ -346,7 +290,7 @@ class SceneStage(Stage):
 
     def attachments(self) -> list[Attachment]:
         s = self.sheets[0].simulation
-        held, places = s.attached[0], s.attachment_positions[0]
+        held, places = s.attached[0], s.attachment_positions[0, : len(s.anchors)]
         # an open anchor is shown at its particle
         for attachment in np.flatnonzero(~held):
             places[attachment] = s.positions[0, s.anchors[attachment]]
@@ -373,70 +317,92 @@ class SceneStage(Stage):
         if not holds:
             self._dragged.pop(attachment, None)
 
+    # --- the visitor's hand -----------------------------------------------------------------------------------------------
+
+    def grab(self, place: ArrayLike) -> None:
+        where = within_view(vector("place", place))
+        number = int(np.argmin([((sheet.positions + offset - where) ** 2).sum(axis=1).min() for sheet, offset in self._placed()]))
+        particle = hands.nearest(self.sheets[number].positions, where - self.offsets[number])
+        anchor = self._anchor_of(particle)
+        if anchor is not None:
+            self._held_anchor = anchor
+            return
+        if not self.sheets[number].burst:
+            for sheet in self.sheets:
+                sheet.hand.take(hands.HAND, particle)
+            # sheets beside the one that is held are held alike
+            self._apart = self.offsets[number]
+
+    def pull(self, place: ArrayLike) -> None:
+        where = within_view(vector("place", place))
+        where[2] = max(where[2], 0.0)
+        if self._held_anchor is not None:
+            self._dragged[self._held_anchor] = where - self.offsets[0]
+            return
+        for sheet in self.sheets:
+            if sheet.hand.held[hands.HAND]:
+                sheet.hand.goals[hands.HAND] = where - self._apart
+
+    def let_go(self) -> None:
+        self._held_anchor = None
+        for sheet in self.sheets:
+            sheet.hand.let_go(hands.HAND)
+
+    def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
+        seen = self._seen(origin, direction)
+        if seen is None:
+            return
+        number, where = seen
+        sheet = self.sheets[number]
+        particle = hands.nearest(sheet.positions, where)
+        anchor = self._anchor_of(particle)
+        if anchor is not None:
+            return self.hold(anchor, False)
+        near = [
+            pin for pin in np.flatnonzero(sheet.hand.held)
+            if pin != hands.HAND and np.linalg.norm(sheet.hand.goals[pin] - where) < hands.CLICK
+        ]  # fmt: skip
+        loose = next((k for k, p in enumerate(sheet.simulation.anchors) if p == particle), None)
+        for one in self.sheets:
+            if near:
+                one.hand.let_go(int(near[0]))
+            elif loose is None:
+                free = np.flatnonzero(~one.hand.held[1:])
+                one.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
+        if loose is not None and not near:
+            self.hold(loose, True)
+
+    def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
+        seen = self._seen(origin, direction)
+        if seen is not None:
+            way = vector("direction", direction)
+            self._breath = self.time + hands.BREATH_TIME, seen[1], way / max(float(np.linalg.norm(way)), 1e-9)
+
+    def pinned(self) -> NDArray[np.float32]:
+        places = [sheet.hand.goals[sheet.hand.held] + offset for sheet, offset in self._placed()]
+        for place, sheet in zip(places, self.sheets):
+            if sheet.hand.held[hands.HAND]:
+                place[0] = sheet.simulation.grippers.positions[0, hands.HAND] + self.offsets[self.sheets.index(sheet)]
+        return visible(np.concatenate(places))
+
+    def _placed(self) -> list[tuple[Sheet, NDArray]]:
+        return list(zip(self.sheets, self.offsets))
+
+    def _seen(self, origin: ArrayLike, direction: ArrayLike) -> tuple[int, NDArray] | None:
+        """The sheet that a ray meets first, and where in its own place [m]."""
+        start, way = within_view(vector("origin", origin)), vector("direction", direction)
+        hits = [hands.hit(sheet.positions, self.scene.mesh.triangles, start - offset, way) for sheet, offset in self._placed()]
+        met = [(found[1], number, found[0]) for number, found in enumerate(hits) if found is not None]
+        return min(met)[1:] if met else None
+
+    def _anchor_of(self, particle: int) -> int | None:
+        """The scene's anchor that holds a particle of the first sheet."""
+        s = self.sheets[0].simulation
+        holder = int(s.get_state().holder[0, particle])
+        return holder if 0 <= holder < len(s.anchors) else None
+
     def _checked(self, attachment: int) -> None:
         indices("attachment", [attachment], len(self.scene.anchors), "the attachments of this scene")
 
     def _targets(self) -> Targets:
         return self._dragged
-
-
-def own(settings: Settings, integrator: str, limited: bool) -> Settings:
-    """The settings of one of several sheets."""
-    return settings.changed(integrator=integrator, **({} if limited else {"strain_limit": None}))
-
-
-# --- changing a simulation ----------------------------------------------------------------------------------------------
-
-
-def changed_properties(before: Settings, after: Settings) -> set[str]:
-    """Properties of the fabric in which two settings differ."""
-    pairs = zip(PROPERTIES, of_material(before.material), of_material(after.material))
-    return {name for name, old, new in pairs if old != new}
-
-
-def set_in_place(simulation: Simulation, before: Settings, after: Settings) -> str:
-    """Change a running simulation in place.  Returns a sentence if its substeps stay since there is no bound, else ""."""
-    properties: dict[str, Any] = {name: getattr(after.material, name) for name in changed_properties(before, after)}
-    if after.gravity != before.gravity:
-        properties["gravity"] = (0, 0, -after.gravity)
-    if properties:
-        simulation.set_parameters(warn=False, **properties)
-    if after.friction != before.friction:
-        state = simulation.get_state()
-        state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction
-        simulation.set_state(state)
-    if after.substeps != "auto":
-        simulation.substeps = after.substeps
-        return ""
-    largest, why = simulation.largest_substep()
-    if largest > 0:
-        simulation.substeps = simulation.integrator.automatic_substeps(simulation.time_step, largest)
-        return ""
-    return f"{simulation.integrator.name} has no bound here, {why}: it goes on with {simulation.substeps} substeps."
-
-
-def carried_over(simulation: Simulation, scene: Scene, settings: Settings) -> Simulation:
-    """A new simulation of a scene's sheet with other settings, with the positions, velocities and attachments of the old one."""
-    old = simulation.get_state()
-    new = scene.simulation(settings)
-    finite = np.isfinite(old.positions).all() and np.isfinite(old.velocities).all()
-    if not finite:
-        return new
-    new.reset(positions=old.positions, velocities=old.velocities)
-    state = new.get_state()
-    for name in ("holder", "attachment_positions", "attachment_targets", "colliders", "collider_homes", "steps", "diverged"):
-        setattr(state, name, getattr(old, name))
-    state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = settings.friction
-    new.set_state(state)
-    new.set_wind(old.wind)
-    return new
-
-
-def visible(x: NDArray) -> NDArray[np.float32]:
-    """Positions that can be drawn [m]: values that are not finite or far away are clipped to the edge of the view."""
-    return within_view(np.nan_to_num(x, nan=0.0)).astype(np.float32)
-
-
-def within_view(x: NDArray) -> NDArray:
-    """Positions [m] clipped to the edge of the view."""
-    return np.clip(x, -EDGE_OF_VIEW, EDGE_OF_VIEW)

@@ -27,17 +27,24 @@ Vector = tuple[float, float, float]
 SLIDERS = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
 # sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
 WORLD = (
-    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "from zero to that of the Earth"),
-    ("wind", "wind m/s", 12.0, 0.1, 1.0, "steady part, to the right"),
-    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "root mean square of each component"),
-    ("friction", "friction", 1.0, 0.01, 1.0, "Coulomb's coefficient of the solids"),
+    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "pull it: from none to that of the Earth"),
+    ("wind", "wind m/s", 12.0, 0.1, 1.0, "how fast the air moves; gusts come on top"),
+    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "how much the wind changes: root mean square of each component"),
+    ("friction", "friction", 1.0, 0.01, 1.0, "of solids, and of the sheet on itself: Coulomb's coefficient"),
 )
 CLOTH = (
-    ("stretch_stiffness", "yarns N/m", 2000.0, 1.0, 1.0, "stretch stiffness: Young's modulus times thickness"),
-    ("shear_stiffness", "diagonals N/m", 1000.0, 1.0, 1.0, "shear stiffness: shear modulus times thickness"),
-    ("bend_rigidity", "bending µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
+    ("stretch_stiffness", "stretch stiffness N/m", 2000.0, 1.0, 1.0, "of its threads: Young's modulus times thickness"),
+    (
+        "shear_stiffness",
+        "shear stiffness N/m",
+        1000.0,
+        1.0,
+        1.0,
+        "along its diagonals: shear modulus times thickness",
+    ),
+    ("bend_rigidity", "bending stiffness µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
     ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
-    ("air_drag", "drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
+    ("air_drag", "air drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
     ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
 )
 
@@ -142,6 +149,7 @@ class Scene:
         rests: time at which moving anchors are released [s].
         camera: its view.
         strained: strain at which the color scale ends.
+        downwind: where the steady wind blows, a unit vector.
     """
 
     name: str
@@ -161,6 +169,7 @@ class Scene:
     motion: Callable[[float], tuple[NDArray, Targets]] | None = None
     rests: float = np.inf
     strained: float = 0.05
+    downwind: Vector = (1.0, 0.0, 0.0)
 
     def simulation(self, settings: Settings | None = None, **options: Any) -> Simulation:
         """The scene at its start, with its own settings or others; options: of ``Simulation``, in place of theirs."""
@@ -213,7 +222,7 @@ def begin(simulation: Simulation, scene: Scene, seed: int | None = None) -> None
 
 def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | None = None) -> None:
     """Move a scene's anchors and solids to their targets for a time [s]; others: targets of dragged anchors, by number [m]."""
-    targets = simulation.attachment_positions
+    targets = simulation.attachment_positions[:, : len(scene.anchors)]
     if scene.motion is not None and time <= scene.rests:
         targets[0], solids = scene.motion(time)
         for number, place in solids.items():
