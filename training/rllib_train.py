@@ -293,7 +293,11 @@ def state_of(algo: Any, done: int, iterations: int, times: dict[str, float]) -> 
 def restore(algo: Any, state: dict[str, Any]) -> None:
     """Put a checkpoint's tensors into the learners, and into the runners."""
     network = {name: tensor.numpy() for name, tensor in state["policy"].items()}
-    algo.learner_group.set_state({"learner": {"rl_module": {MODULE: network}, "optimizer": state["optimizer"]}})
+    # Adam's moments are the checkpoint's, its learning rate is the schedule's: the run may have been given other steps
+    optimizers = algo.learner_group.get_state()["learner"]["optimizer"]
+    for name, optimizer in optimizers.items():
+        optimizer["state"] |= {"state": state["optimizer"][name]["state"]["state"]}
+    algo.learner_group.set_state({"learner": {"rl_module": {MODULE: network}, "optimizer": optimizers}})
     algo.env_runner_group.sync_weights(from_worker_or_learner_group=algo.learner_group, inference_only=True)
 
 
