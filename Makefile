@@ -4,6 +4,7 @@
 # make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
 # make oldest: tests with the oldest dependencies; each of these in an environment of its own
 # make release: wheel and sdist of what is committed, checked and tried out      make notebook: runs notebooks/
+# make site: the documentation as a site in build/site, from the pages, the docstrings and the command line's help
 PYTHON ?= python3
 PYTHONS ?= $(PYTHON)
 VENV ?= .venv
@@ -13,7 +14,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test bits clients rllib oldest notebook release bench clean
+.PHONY: train check lint test bits clients rllib oldest notebook release site bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -58,6 +59,13 @@ notebook:
 release:
 	.ci/release $(PYTHONS)
 
+site:
+	$(PYTHON) -m venv $(VENV)-site
+	$(VENV)-site/bin/pip install --quiet --constraint .ci/docs.txt ".[docs]"
+	rm -rf build/site
+	$(VENV)-site/bin/sphinx-build -q -W --keep-going docs build/site
+	$(VENV)-site/bin/python docs/check_site.py build/site
+
 bench: $(VENV)/ready
 	$(BIN)/python -m clothgym bench
 
@@ -71,4 +79,4 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest $(VENV)-notebook build dist *.egg-info clothgym/envs
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest $(VENV)-notebook $(VENV)-site build dist *.egg-info clothgym/envs

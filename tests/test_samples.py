@@ -1,0 +1,197 @@
+"""What the pages show runs: Python samples and doctests are executed, and commands have the options that are named.
+
+The README's samples are executed by ``test_docs``.  Those of docs/clients.md need the library that they are about: without it they
+are skipped here, and ``make clients`` has them all.
+"""
+
+import contextlib
+import doctest
+import importlib.util
+import io
+import re
+import runpy
+import shlex
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import clothgym
+import clothgym.envs
+import clothgym.render
+from clothgym import cli
+from clothgym.registration import ENVIRONMENTS
+
+ROOT = Path(__file__).parent.parent
+PAGES = {
+    path.relative_to(ROOT).as_posix(): path.read_text() for path in [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
+}
+API = sorted((ROOT / "docs" / "api").glob("*.rst"))
+BLOCKS = {name: re.findall(r"^```(\w*)\n(.*?)^```", page, re.DOTALL | re.MULTILINE) for name, page in PAGES.items()}
+PYTHON = {name: [text for language, text in blocks if language == "python"] for name, blocks in BLOCKS.items()}
+SAMPLES = [name for name, blocks in PYTHON.items() if blocks and name not in ("README.md", "docs/clients.md")]
+
+# the same in fewer steps, of fewer environments, and of smaller batches
+SHORTER = (
+    (r"\.learn\([\d_]+\)", ".learn(1)"),
+    (r'(make_sb3_vec_env\("[\w-]+", num_envs=)\d+', r"\g<1>2"),
+    (r"n_steps=\d+", "n_steps=20"),
+    (r"batch_size=\d+", "batch_size=40"),
+    (r"n_eval_episodes=\d+", "n_eval_episodes=2"),
+    (r"len\(successes\) < \d+", "len(successes) < 2"),
+    (r"\b64\b", "4"),
+    (r"range\(12\)", "range(2)"),
+    (r"num_envs=16\b", "num_envs=4"),
+    (r"for frame in range\(60\)", "for frame in range(4)"),
+    (r"\[ball\]\] \* 60", "[ball]] * 4"),
+    (r"\.step\(60\)", ".step(4)"),
+    (r"steps=60", "steps=4"),
+)
+
+
+def run(page, blocks):
+    """Execute a page's blocks one after the other, as somebody does who reads it."""
+    names = {"__name__": "__main__"}
+    for block in blocks:
+        for long, short in SHORTER:
+            block = re.sub(long, short, block)
+        exec(compile(block, page, "exec"), names)
+    return names
+
+
+@pytest.mark.parametrize("page", SAMPLES)
+def test_a_page_s_samples_run(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    names = run(page, PYTHON[page])
+    if page == "docs/howto/task.md":  # it is the whole of a task: its expert gets there
+        task = names["envs"].unwrapped.task
+        middle = task.simulation.positions[:, 40, :2]  # of 9 x 9 particles
+        assert names["terminated"].all() and abs(middle - task.episode["goal"]).max() < 0.05
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("sample", PYTHON["docs/clients.md"], ids=lambda text: re.sub(r"\W+", " ", text)[:60])
+def test_a_client_s_sample_runs(sample, tmp_path, monkeypatch):
+    for module in set(re.findall(r"^(?:from|import) (\w+)", sample, re.MULTILINE)) | set(
+        re.findall(r", (\w+)$", sample, re.MULTILINE)
+    ):
+        if importlib.util.find_spec(module) is None:
+            pytest.skip(f"needs {module}: make clients")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    run("docs/clients.md", [sample])
+
+
+@pytest.mark.parametrize("page", API, ids=lambda page: page.name)
+def test_doctests_of_the_reference(page):
+    text = page.read_text()
+    test = doctest.DocTestParser().get_doctest(text, {}, page.name, str(page), 0)
+    out = io.StringIO()
+    outcome = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=out.write)
+    assert outcome.failed == 0, out.getvalue()
+    assert outcome.attempted == len(re.findall(r"^>>> ", text, re.MULTILINE))
+
+
+def test_the_reference_has_every_public_name():
+    text = "\n".join(page.read_text() for page in API)
+    described = set(re.findall(r"^(?:\.\. [\w:]+::| +)\s*clothgym\.([\w.]+)", text, re.MULTILINE))
+    public = (
+        set(clothgym._HOMES)
+        | {f"envs.{name}" for name in clothgym.envs.__all__}
+        | {f"render.{name}" for name in clothgym.render.__all__}
+    )
+    public |= {f"policies.{name}" for name in ("load", "available", "read", "Policy")} | {"adapters.sb3.make_sb3_vec_env"}
+    assert public <= described, sorted(public - described)
+    for env_id, (name, _) in ENVIRONMENTS.items():
+        assert f"clothgym.envs.{name}Env(" in text and f"</tasks/{env_id}>" in text
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------------
+
+
+def commands(text):
+    """What is typed: lines of blocks that are no program, and code within sentences, which may go on in the next line."""
+    blocks = [
+        line
+        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+        if not language
+        for line in block.splitlines()
+    ]
+    rest = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    indented = re.findall(r"^    (\S.*)$", rest, re.MULTILINE)
+    spans = [" ".join(span.split()) for span in re.findall(r"(?<!`)`([^`]+)`(?!`)", rest)]
+    return [re.split(r"\s#\s|\s{2,}#", line)[0].strip() for line in blocks + indented + spans]
+
+
+TYPED = sorted({(name, line) for name, page in PAGES.items() for line in commands(page)})
+STARTED = [(name, line) for name, line in TYPED if re.match(r"python (-m clothgym|(training|benchmarks|docs)/)", line)]
+
+
+@pytest.fixture(scope="module")
+def help_of():
+    """What a program answers to ``--help``; each is asked once, in this process."""
+    known = {}
+
+    def ask(program):
+        if program not in known:
+            said, before, path, argv = io.StringIO(), set(sys.modules), list(sys.path), list(sys.argv)
+            try:
+                with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+                    if program[0] == "clothgym":
+                        cli.main([*program[1:], "--help"])
+                    else:
+                        sys.argv = [program[0], "--help"]
+                        sys.path.insert(0, str((ROOT / program[0]).parent))
+                        runpy.run_path(str(ROOT / program[0]), run_name="__main__")
+            except ModuleNotFoundError:  # a library that is not here: what its source says
+                said.write((ROOT / program[0]).read_text())
+            finally:
+                sys.path[:], sys.argv[:] = path, argv
+                for name in set(sys.modules) - before:  # scripts of several folders have the same names
+                    if Path(getattr(sys.modules[name], "__file__", None) or "/").parent in (
+                        ROOT / "training",
+                        ROOT / "benchmarks",
+                        ROOT / "docs",
+                    ):
+                        del sys.modules[name]
+            known[program] = set(re.findall(r"--[a-z][\w-]*", said.getvalue()))
+        return known[program]
+
+    return ask
+
+
+def test_commands_are_found_and_take_their_options(help_of):
+    assert len(STARTED) > 60
+    wrong = []
+    for page, line in STARTED:
+        _, *words = shlex.split(line.replace("'", ""))
+        program = ("clothgym", *[word for word in words[2:3] if word[0] != "-"]) if words[0] == "-m" else (words[0],)
+        if words[0] != "-m" and not (ROOT / words[0]).is_file():
+            wrong.append(f"{page}: {line}: there is no {words[0]}")
+            continue
+        wrong += [
+            f"{page}: {line}: no {word}" for word in words if word.startswith("--") and word.split("=")[0] not in help_of(program)
+        ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_targets_and_extras_exist():
+    targets = set(re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    extras = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"])
+    for page, line in TYPED:
+        if made := re.match(r"make (\w+)", line):
+            assert made[1] in targets, f"{page}: {line}"
+        if install := re.match(r"pip install .*\[([\w,]+)\]", line):
+            assert set(install[1].split(",")) <= extras | {"create"}, f"{page}: {line}"
+
+
+def test_every_id_that_is_named_exists():
+    for name, page in PAGES.items():
+        assert set(re.findall(r"\bCloth[A-Z]\w+(?:-Hard)?-v\d+", page)) <= set(ENVIRONMENTS), name
+
+
+def test_what_looks_like_python_is_marked_as_python():
+    for name, blocks in BLOCKS.items():
+        for language, text in blocks:
+            assert language or not re.search(r"^(import|from|env|def|class) ?\b.*", text, re.MULTILINE), f"{name}: {text}"
