@@ -62,7 +62,7 @@ def cell(env_id: str, actor: str, kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def draw(rows: dict[str, dict[str, Any]]) -> None:
-    """A heat map: policies down, changes across; each cell with its interval."""
+    """A heat map: policies down, changes across; each cell with its interval.  The colors begin below the lowest success."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -70,18 +70,31 @@ def draw(rows: dict[str, dict[str, Any]]) -> None:
 
     names = [name for name in rows if rows[name]]
     rates = np.full((len(names), len(VARIANTS)), np.nan)
-    figure, axes = plt.subplots(figsize=(12, 0.6 * len(names) + 2.2), layout="constrained")
     for i, name in enumerate(names):
         for j, variant in enumerate(VARIANTS):
-            if (found := rows[name].get(variant)) is not None:
-                rates[i, j] = found["success_rate"]
-                low, high = found["success_rate_ci95"]
-                axes.text(j, i, f"{rates[i, j]:.2f}\n{low:.2f}–{high:.2f}", ha="center", va="center", fontsize=7,
-                          color="white" if rates[i, j] < 0.6 else "black")  # fmt: skip
-    shown = axes.imshow(rates, vmin=0, vmax=1, cmap="cividis", aspect="auto")
+            rates[i, j] = rows[name].get(variant, {}).get("success_rate", np.nan)
+    lowest = np.floor(10 * np.nanmin(rates)) / 10
+    figure, axes = plt.subplots(figsize=(12, 0.62 * len(names) + 1.9), layout="constrained")
+    # perceptually uniform from dark to light, and its order is seen without its legend
+    shown = axes.imshow(rates, vmin=lowest, vmax=1, cmap="magma", aspect="auto")
+    for i, name in enumerate(names):
+        for j, variant in enumerate(VARIANTS):
+            place = {"ha": "center", "va": "center"}
+            if (found := rows[name].get(variant)) is None:
+                axes.text(j, i, "not run", fontsize=7.5, color="#8d99ae", **place)
+                continue
+            low, high = found["success_rate_ci95"]
+            color = "black" if rates[i, j] > lowest + 0.5 * (1 - lowest) else "white"
+            axes.text(j, i - 0.12, f"{rates[i, j]:.2f}", fontsize=11, weight="bold", color=color, **place)
+            axes.text(j, i + 0.24, f"{low:.2f}–{high:.2f}", fontsize=7.5, color=color, **place)
+    axes.set_xticks(np.arange(len(VARIANTS) + 1) - 0.5, minor=True)
+    axes.set_yticks(np.arange(len(names) + 1) - 0.5, minor=True)
+    axes.grid(which="minor", color="white", lw=2)
+    axes.tick_params(which="both", length=0)
+    axes.spines[:].set_visible(False)
     axes.set_xticks(range(len(VARIANTS)), list(VARIANTS), rotation=30, ha="right")
     axes.set_yticks(range(len(names)), [name.replace(" learned:", ", ") for name in names])
-    figure.colorbar(shown, label="success")
+    figure.colorbar(shown, label=f"success in {EPISODES} episodes", pad=0.01)
     figure.savefig(PICTURE, dpi=120)
 
 
