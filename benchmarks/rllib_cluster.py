@@ -29,7 +29,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS, PICTURE = ROOT / "benchmarks" / "results" / "rllib.json", ROOT / "docs" / "cluster.png"
 ENV = "ClothReach-v0"
 WARM_UP = 2  # iterations, left out of the medians
-PHASE = 12  # iterations before the node is killed, without it, and with the new one
+PHASE = 10  # iterations before the node is killed, without it, and with the new one
 LONGEST = 900  # seconds to wait for an iteration
 
 
@@ -62,7 +62,7 @@ class Run:
             time.sleep(0.2)
 
     def stop(self) -> None:
-        self.process.send_signal(signal.SIGINT)
+        self.process.terminate()
         self.process.wait()
 
 

@@ -105,8 +105,6 @@ class Args:
 
     def new_run(self) -> tuple[Path, dict[str, Any]]:
         """Folder and configuration of a new one."""
-        if not self.hyperparams.is_file():
-            raise ValueError(f"--hyperparams {self.hyperparams}: there is no such file")
         table = yaml.safe_load(self.hyperparams.read_text())
         if not isinstance(table, dict) or self.env not in table:
             raise ValueError(f"{self.hyperparams} has no hyperparameters for {self.env!r} (there are: {', '.join(table or ())})")
@@ -210,6 +208,23 @@ def actor_critic() -> type:
     return ActorCritic
 
 
+def learner() -> type:
+    """The class of the learner: RLlib's, with advantages standardized as in train.py."""
+    from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
+
+    class Learner(PPOTorchLearner):
+        """RLlib adds a step to each episode, for the value of what came last.  The loss leaves it out, but the mean and deviation
+        of the advantages do not, and its own, an episode's whole value, is many times theirs: all others became negative.
+        """
+
+        def compute_loss_for_module(self, *, batch: dict[str, Any], **kwargs: Any) -> Any:
+            taken = batch["advantages"][batch["loss_mask"]]
+            batch["advantages"] = (batch["advantages"] - taken.mean()) / (taken.std() + 1e-8)
+            return super().compute_loss_for_module(batch=batch, **kwargs)
+
+    return Learner
+
+
 # --- the algorithm ---------------------------------------------------------------------------------------------------------
 
 
@@ -233,48 +248,34 @@ def build(args: Args, env_kwargs: dict[str, Any], done: int) -> Any:
     register_env(ALGO, make_batch)
     # other episodes after an interruption than at the beginning
     seed = int(np.random.SeedSequence([config["seed"], done]).generate_state(1)[0]) % 2**31
-    made = (
-        PPOConfig()
-        .environment(
-            ALGO,
-            env_config={"id": f"clothgym:{config['env']}", "threads": args.cpus_per_runner} | env_kwargs,
-            # what is executed is clipped, what is learned from is the action that was drawn
-            normalize_actions=False,
-            clip_actions=True,
-        )
-        .env_runners(
-            num_env_runners=args.runners,
-            num_envs_per_env_runner=config["num_envs"] // runners,
-            num_cpus_per_env_runner=args.cpus_per_runner,
-            gym_env_vectorize_mode="vector_entry_point",
-            rollout_fragment_length=given["n_steps"],
-            sample_timeout_s=None,  # a runner may be slow; one that is lost is reported by Ray
-        )
-        .learners(num_learners=args.learners)
-        .training(
-            train_batch_size_per_learner=config["num_envs"] * given["n_steps"] // learners,
-            minibatch_size=given["batch_size"] // learners,
-            num_epochs=given["n_epochs"],
-            lr=schedule,
-            gamma=given["gamma"],
-            lambda_=given["gae_lambda"],
-            clip_param=CLIP_RANGE,
-            vf_loss_coeff=VF_COEF,
-            grad_clip=MAX_GRAD_NORM,
-            grad_clip_by="global_norm",
-            # what RLlib has beyond that is turned off
-            vf_clip_param=float("inf"),
-            use_kl_loss=False,
-        )
-        .rl_module(rl_module_spec=RLModuleSpec(module_class=actor_critic(), model_config=dict(given["policy_kwargs"])))
-        .fault_tolerance(
-            restart_failed_env_runners=True,
-            num_consecutive_env_runner_failures_tolerance=10**6,
-            env_runner_health_probe_timeout_s=1.0,  # each iteration waits so long for a runner that is not back
-        )
-        .callbacks(on_episode_end=note_success)
-        .debugging(seed=seed, log_level="ERROR")
-    )
+    made = PPOConfig()
+    made.environment(
+        ALGO,
+        env_config={"id": f"clothgym:{config['env']}", "threads": args.cpus_per_runner} | env_kwargs,
+        # what is executed is clipped, what is learned from is the action that was drawn
+        normalize_actions=False, clip_actions=True,
+    )  # fmt: skip
+    made.env_runners(
+        num_env_runners=args.runners, num_envs_per_env_runner=config["num_envs"] // runners,
+        num_cpus_per_env_runner=args.cpus_per_runner, gym_env_vectorize_mode="vector_entry_point",
+        rollout_fragment_length=given["n_steps"],
+        sample_timeout_s=None,  # a runner may be slow; one that is lost is reported by Ray
+    )  # fmt: skip
+    made.learners(num_learners=args.learners)
+    made.training(
+        learner_class=learner(), train_batch_size_per_learner=config["num_envs"] * given["n_steps"] // learners,
+        minibatch_size=given["batch_size"] // learners, num_epochs=given["n_epochs"], lr=schedule, gamma=given["gamma"],
+        lambda_=given["gae_lambda"], clip_param=CLIP_RANGE, vf_loss_coeff=VF_COEF, grad_clip=MAX_GRAD_NORM,
+        grad_clip_by="global_norm",
+        # what RLlib has beyond that is turned off
+        vf_clip_param=float("inf"), use_kl_loss=False,
+    )  # fmt: skip
+    made.rl_module(rl_module_spec=RLModuleSpec(module_class=actor_critic(), model_config=dict(given["policy_kwargs"])))
+    made.fault_tolerance(
+        restart_failed_env_runners=True, num_consecutive_env_runner_failures_tolerance=10**6,
+        env_runner_health_probe_timeout_s=1.0,  # each iteration waits so long for a runner that is not back
+    )  # fmt: skip
+    made.callbacks(on_episode_end=note_success).debugging(seed=seed, log_level="ERROR")
     return made.build_algo()
 
 
@@ -283,9 +284,9 @@ def state_of(algo: Any, done: int, iterations: int, times: dict[str, float]) -> 
     import torch
     import tree
 
-    learner = algo.learner_group.get_state()["learner"]
-    tensors = tree.map_structure(lambda x: torch.from_numpy(x.copy()) if isinstance(x, np.ndarray) else x, learner["optimizer"])
-    network = {name: torch.from_numpy(array.copy()) for name, array in learner["rl_module"][MODULE].items()}
+    kept = algo.learner_group.get_state()["learner"]
+    tensors = tree.map_structure(lambda x: torch.from_numpy(x.copy()) if isinstance(x, np.ndarray) else x, kept["optimizer"])
+    network = {name: torch.from_numpy(array.copy()) for name, array in kept["rl_module"][MODULE].items()}
     counters = {"num_timesteps": done, "num_updates": iterations, "times": times}
     return {"policy": network, "optimizer": tensors, "variables": {}, "constraint": {}} | counters
 
@@ -310,8 +311,10 @@ def cluster(args: Args) -> Iterator[None]:
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     with refused():
         import ray  # imported here: it takes seconds, and what is wrong has been said by now
-    here = {"num_cpus": max(args.runners * args.cpus_per_runner + args.learners, 1), "include_dashboard": False} if local else {}
-    with refused():
+
+        here = (
+            {"num_cpus": max(args.runners * args.cpus_per_runner + args.learners, 1), "include_dashboard": False} if local else {}
+        )
         ray.init(address=args.address, logging_level="ERROR", log_to_driver=False, **here)
     try:
         yield

@@ -113,9 +113,18 @@ def test_runners_meet_other_episodes(module):
     assert len(np.unique(np.concatenate(seen[:2]), axis=0)) == 8
 
 
+def test_advantages_are_standardized_over_the_steps_that_were_taken(module, monkeypatch):
+    torch = pytest.importorskip("torch")
+    theirs = pytest.importorskip("ray.rllib.algorithms.ppo.torch.ppo_torch_learner").PPOTorchLearner
+    monkeypatch.setattr(theirs, "compute_loss_for_module", lambda self, *, batch, **kwargs: batch["advantages"])
+    made = module.learner()
+    batch = {"advantages": torch.tensor([1.0, 3.0, 50.0]), "loss_mask": torch.tensor([True, True, False])}
+    learned = made.compute_loss_for_module(object.__new__(made), batch=batch)
+    torch.testing.assert_close(learned[:2], torch.tensor([-1.0, 1.0]) / 2**0.5)
+
+
 KILLED = """
-import os, signal, sys
-sys.path.insert(0, sys.argv[1])
+import os, signal
 import rllib_train
 args = rllib_train.Args(env="ClothReach-v0", runners=2)
 with rllib_train.cluster(args):
@@ -123,10 +132,8 @@ with rllib_train.cluster(args):
     def step():
         sampled = algo.train()["env_runners"]["num_env_steps_sampled"]
         return int(sampled), algo.env_runner_group.num_healthy_remote_workers()
-    def first_seeds():
-        return algo.env_runner_group.foreach_env_runner(lambda runner: (os.getpid(), runner.worker_index), local_env_runner=False)
     print(step())
-    os.kill(first_seeds()[0][0], signal.SIGKILL)
+    os.kill(algo.env_runner_group.foreach_env_runner(lambda runner: os.getpid(), local_env_runner=False)[0], signal.SIGKILL)
     counts = [step() for _ in range(3)]
     while counts[-1][1] < 2 and len(counts) < 100:
         counts.append(step())
@@ -136,8 +143,11 @@ with rllib_train.cluster(args):
 
 def test_a_killed_runner_comes_back_and_its_share_is_not_missing():
     pytest.importorskip("ray")
-    command = [sys.executable, "-c", KILLED, str(ROOT / "training")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | {"PYTHONWARNINGS": "ignore"})
+    command = [sys.executable, "-c", KILLED]
+    paths = [str(ROOT / "training"), str(ROOT), os.environ.get("PYTHONPATH", "")]  # of the runners, too
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    )
     assert done.returncode == 0, done.stderr
     whole, killed = done.stdout.splitlines()
     assert whole == f"({STEPS}, 2)"
