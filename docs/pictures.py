@@ -1,117 +1,281 @@
-"""The pictures of the README.
+"""The pictures of the README and of the pages.
 
 python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
+python docs/pictures.py --strips reach.png fold.png                # some of them
 python docs/pictures.py --contact                                  # contact alone
 python docs/pictures.py --folds                                    # a film of the three folds
-python docs/pictures.py --learned ClothDrape-v0 drape.gif          # and a film of a committed policy
+python docs/pictures.py --learned ClothDrape-v0 drape.gif          # a film of a committed policy
+python docs/pictures.py --learned ClothStrain-v0 strain.gif        # in the colors of the strain, with their scale
 python docs/pictures.py --expert ClothHang-Hard-v0 hang.gif        # or of a scripted expert
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
-import imageio.v3 as iio
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
+import clothgym
 from clothgym import Box, MeshCollider, Plane, Simulation, grid
-from clothgym.envs.pictures import draw, renderer_of
-from clothgym.render.camera import Camera
-from clothgym.render.renderer import Renderer
+from clothgym.forces import structural_strain
+from clothgym.render import Camera, Drawn, Renderer, write_picture, write_video
+from clothgym.render.heat import heat_colors, largest_at_particles
+from clothgym.render.solids import drawn
 from clothgym.starts import MANEUVERS
 
 HERE = Path(__file__).parent
-SIZE, FILMED = 300, 220
+SIZE, FILMED, GAP = 300, 240, 4  # pixels of a picture, of one in a film, and of the white between two
+HELD_OUT = 1_000_000  # the first seed of held-out episodes
+FILLED = 0.92  # share of a picture that what happens takes up
+INK = (43, 45, 66)
 
 
-def strip(
-    env_id: str,
-    moments: tuple[int, ...],
-    seed: int,
-    options: dict[str, Any] | None = None,
-    careless: bool = False,
-    **kwargs: Any,
-) -> Any:
-    """One episode of a scripted agent as a row of moments, the last of which is its end, (height, width, 3)."""
-    env = gym.make(f"clothgym:{env_id}", **kwargs).unwrapped
-    env.reset(seed=seed, options=options)
-    renderer = renderer_of(env.task, SIZE, SIZE, antialias=3)
-    frames, step, terminated = [], 0, False
-    while not terminated:
-        if step in moments:
-            frames.append(draw(env.task, renderer, "rgb_array", [0])[0])
-        action = env.task.careless_actions()[0] if careless else env.expert_action()
-        *_, terminated, _, _ = env.step(action)
-        step += 1
-    return np.concatenate([*frames[: len(moments)], draw(env.task, renderer, "rgb_array", [0])[0]], axis=1)
+# --- panels -------------------------------------------------------------------------------------------------------------
 
 
-def draw_strips() -> None:
-    targets = [{"target": {"shape": shape, "center": (0.0, 0.0)}} for shape in ("sphere", "box", "post")]
-    pictures = {
-        "drape.png": [strip("ClothDrape-v0", (0, 22, 34), 7, target) for target in targets],
-        "gripper.png": [
-            strip("ClothDrapeGripper-v0", (0, 12, 28, 42), 9, {"rumpled": False}),
-            strip("ClothDrapeGripper-v0", (0, 14, 30, 46), 9, {"rumpled": True}),
-        ],
-        "strain.png": [
-            strip("ClothStrain-v0", (0, 30, 50, 75), 7),
-            strip("ClothStrain-v0", (0, 12, 22, 35), 7, careless=True),
-        ],
-        "hang.png": [
-            strip("ClothHang-v0", (0, 12, 18, 30), 7),
-            strip("ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
-        ],
-        "hook.png": [
-            strip("ClothHook-v0", (0, 24, 46, 60), 7),
-            strip("ClothHook-Hard-v0", (0, 30, 80, 112), 9, {"rumpled": True}),
-        ],
-        "flatten.png": [
-            strip("ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
-            strip("ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_003),
-        ],
-        "fling.png": [
-            strip("ClothFling-v0", (0, 40, 72, 78), 1_000_000),
-            strip("ClothFling-Hard-v0", (0, 44, 82, 90), 1_000_001),
-        ],
-        "reach.png": [strip("ClothReach-v0", (0, 6, 12, 18), 7)],
-        "fold.png": fold_strips(),
-    }
-    for name, rows in pictures.items():
-        iio.imwrite(HERE / name, np.concatenate(rows, axis=0))
+def labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """A picture with a text in its upper left corner, on some paper."""
+    picture = Image.fromarray(image)
+    pen, font = ImageDraw.Draw(picture, "RGBA"), ImageFont.load_default(max(12, image.shape[0] // 20))
+    left, top, right, bottom = pen.multiline_textbbox((9, 7), text, font)
+    pen.rounded_rectangle((left - 4, top - 3, right + 4, bottom + 3), 4, fill=(255, 255, 255, 150))
+    pen.multiline_text((9, 7), text, INK, font)
+    return np.asarray(picture)
 
 
-def fold_strips() -> list[Any]:
-    """A row for each fold."""
-    return [
-        strip("ClothFold-v0", (0, 16, 30, 44), 7, fold="half"),
-        strip("ClothFold-v0", (0, 18, 36, 54), 7, fold="diagonal"),
-        strip("ClothFold-Hard-v0", (0, 30, 60, 100), 8),
-    ]
+def beside(images: Sequence[NDArray[np.uint8]], axis: int = 1) -> NDArray[np.uint8]:
+    """Pictures in a row, or below each other with ``axis=0``, with white between them."""
+    shape = list(images[0].shape)
+    shape[axis] = GAP
+    gap = np.full(shape, 255, np.uint8)
+    return np.concatenate([part for image in images for part in (image, gap)][:-1], axis=axis)
 
 
-def draw_folds() -> None:
-    """The strip of the folds, and their film, side by side: what has ended stands still."""
-    from clothgym.render import write_video
+def scale_of_strain(width: int, most: float) -> NDArray[np.uint8]:
+    """The colors of strains from 0 to ``most``, with numbers, (height, width, 3)."""
+    high, bar = 34, min(220, width // 2)
+    image = np.full((high, width, 3), 255, np.uint8)
+    left = (width - bar) // 2
+    image[6:16, left : left + bar] = heat_colors(np.linspace(0, 1, bar))
+    picture = Image.fromarray(image)
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(13)
+    for share in (0, 0.5, 1):
+        pen.text((left + share * bar, 18), f"{100 * share * most:g} %", INK, font, anchor="mt")
+    pen.text((left - 12, 11), "strain of the yarns", INK, font, anchor="rm")
+    return np.asarray(picture)
 
-    iio.imwrite(HERE / "fold.png", np.concatenate(fold_strips(), axis=0))
-    columns = []
-    for env_id, fold in (("ClothFold-v0", "half"), ("ClothFold-v0", "diagonal"), ("ClothFold-Hard-v0", "quarter")):
-        env = gym.make(f"clothgym:{env_id}", fold=fold).unwrapped
-        env.reset(seed=7)
-        renderer = renderer_of(env.task, FILMED, FILMED, antialias=1)
-        frames, terminated = [draw(env.task, renderer, "rgb_array", [0])[0]], False
-        while not terminated:
-            *_, terminated, _, _ = env.step(env.expert_action())
-            frames.append(draw(env.task, renderer, "rgb_array", [0])[0])
-        columns.append(frames)
-    longest = max(map(len, columns))
-    film = [np.concatenate([column[min(k, len(column) - 1)] for column in columns], axis=1) for k in range(0, longest, 4)]
-    write_video(HERE / "fold.gif", film, fps=7.5)
+
+# --- what is seen -------------------------------------------------------------------------------------------------------
+
+
+def framed(camera: Camera, points: NDArray) -> Camera:
+    """A camera in the same place that has all these points [m], (points, 3), in its square picture, and no more around them."""
+    eye = np.asarray(camera.eye)
+    for _ in range(4):
+        right, up, forward = map(np.asarray, camera.axes)
+        away = (points - eye) @ np.stack([right, up, forward], axis=1)
+        slopes = away[:, :2] / away[:, 2:]
+        low, high = slopes.min(axis=0), slopes.max(axis=0)
+        x, y = (low + high) / 2
+        way = forward + x * right + y * up
+        target = eye + camera.distance * way / np.linalg.norm(way)
+        camera = replace(
+            camera, target=tuple(target), vertical_fov=math.degrees(2 * math.atan(float((high - low).max()) / 2 / FILLED))
+        )
+    return camera
+
+
+def corners(solids: Iterable[Drawn]) -> NDArray[np.float64]:
+    """Points around solids [m], (points, 3)."""
+    found = [np.empty((0, 3))]
+    signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)])
+    for solid in solids:
+        axes, half, radius = solid.rounded_box()
+        found.append(np.asarray(solid.collider.center) + (signs * half) @ axes + signs * radius)
+    return np.concatenate(found)
+
+
+class Moment(NamedTuple):
+    """positions: of the particles [m], (particles, 3); solids, which hold the sheet up, and markers."""
+
+    time: float
+    positions: NDArray[np.float32]
+    solids: list[Drawn]
+    markers: list[Drawn]
+
+
+class Episode(NamedTuple):
+    """An episode from its first moment to its last, one for each control step."""
+
+    task: Any
+    moments: list[Moment]
+
+    def painter(self, size: int, antialias: int, color: str = "fabric") -> Callable[[Moment], NDArray[np.uint8]]:
+        """What draws its moments, by a camera that has the sheet in sight in all of them."""
+        # and solids and goals, but not grippers, which withdraw
+        mesh, start = self.task.physics.mesh, self.moments[0]
+        seen = [corners([*start.solids, *(marker for marker in start.markers if marker.kind == "sphere")])]
+        camera = framed(self.task.camera(), np.concatenate([*(moment.positions for moment in self.moments), *seen]))
+        uv = mesh.rest_positions[:, :2]
+        renderer = Renderer(mesh.triangles, uv, camera, size, size, antialias, threads=1, grid_shape=mesh.shape)
+
+        def draw(moment: Moment) -> NDArray[np.uint8]:
+            values = None
+            if color == "strain":
+                strain = structural_strain(mesh, moment.positions[None])
+                values = largest_at_particles(mesh, strain)[0] / np.float32(self.task.strain_shown)
+            return renderer.rgb(moment.positions, moment.solids, moment.markers, values)
+
+        return draw
+
+
+def played(env_id: str, seed: int, act: Any = None, options: dict[str, Any] | None = None, **kwargs: Any) -> Episode:
+    """An episode of an agent, ``act(env, observation)``; of the scripted expert by default."""
+    env: Any = gym.make(f"clothgym:{env_id}", **kwargs).unwrapped
+    task, moments = env.task, []
+
+    def look() -> None:
+        solids, markers = (list(map(drawn, things)) for things in (task.solids(0), task.markers(0)))
+        moments.append(Moment(len(moments) * task.physics.time_step, task.simulation.positions[0], solids, markers))
+
+    def move(*args: Any) -> None:
+        moved(*args)
+        look()
+
+    # a picking action is many control steps
+    moved, task.move = task.move, move
+    observation, _ = env.reset(seed=seed, options=options)
+    look()
+    over = False
+    while not over:
+        action = env.expert_action() if act is None else act(env, observation)
+        observation, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+    return Episode(task, moments)
+
+
+def careless(env: Any, observation: Any) -> Any:
+    """Straight to the goal, at full speed."""
+    return env.task.careless_actions()[0]
+
+
+# --- strips -------------------------------------------------------------------------------------------------------------
+
+
+class Row(NamedTuple):
+    """An episode as a row of moments: after these numbers of steps, and at its end."""
+
+    title: str
+    env_id: str
+    steps: tuple[int, ...]
+    seed: int
+    options: dict[str, Any] | None = None
+    act: Any = None
+    color: str = "fabric"
+    kwargs: dict[str, Any] = {}  # noqa: RUF012 - never written to
+
+    def draw(self) -> NDArray[np.uint8]:
+        """(height, width, 3)."""
+        episode = played(self.env_id, self.seed, self.act, self.options, **self.kwargs)
+        draw = episode.painter(SIZE, 3, self.color)
+        chosen = [episode.moments[step] for step in self.steps] + [episode.moments[-1]]
+        labels = [self.title] + [f"{moment.time:.1f} s" for moment in chosen[1:]]
+        return beside([labeled(draw(moment), label) for moment, label in zip(chosen, labels)])
+
+
+SHAPES = {shape: {"target": {"shape": shape, "center": (0.0, 0.0)}} for shape in ("sphere", "box", "post")}
+STRIPS: dict[str, list[Row]] = {
+    "drape.png": [Row(shape, "ClothDrape-v0", (0, 22, 34), 7, target) for shape, target in SHAPES.items()],
+    "gripper.png": [
+        Row("flat", "ClothDrapeGripper-v0", (0, 12, 28, 42), 9, {"rumpled": False}),
+        Row("rumpled", "ClothDrapeGripper-v0", (0, 14, 30, 46), 9, {"rumpled": True}),
+    ],
+    "strain.png": [
+        Row("scripted expert", "ClothStrain-v0", (0, 30, 50, 75), 7, color="strain"),
+        Row("straight, at full speed", "ClothStrain-v0", (0, 12, 22, 35), 7, act=careless, color="strain"),
+    ],
+    "hang.png": [
+        Row("ClothHang-v0", "ClothHang-v0", (0, 12, 18, 30), 7),
+        Row("ClothHang-Hard-v0", "ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
+    ],
+    "hook.png": [
+        Row("ClothHook-v0", "ClothHook-v0", (0, 24, 46, 60), 7),
+        Row("ClothHook-Hard-v0", "ClothHook-Hard-v0", (0, 30, 80, 112), 9, {"rumpled": True}),
+    ],
+    "flatten.png": [
+        Row("ClothFlatten-v0", "ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
+        Row("ClothFlatten-Hard-v0", "ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_000),
+    ],
+    "fling.png": [
+        Row("ClothFling-v0", "ClothFling-v0", (0, 40, 72, 78), 1_000_000),
+        Row("ClothFling-Hard-v0", "ClothFling-Hard-v0", (0, 44, 82, 90), 1_000_001),
+    ],
+    "reach.png": [Row("ClothReach-v0", "ClothReach-v0", (0, 6, 12, 18), 7)],
+    "fold.png": [
+        Row("in half", "ClothFold-v0", (0, 16, 30, 44), 7, kwargs={"fold": "half"}),
+        Row("diagonal", "ClothFold-v0", (0, 18, 36, 54), 7, kwargs={"fold": "diagonal"}),
+        Row("ClothFold-Hard-v0: twice", "ClothFold-Hard-v0", (0, 30, 60, 100), 8),
+    ],
+}
+
+
+def draw_strips(names: Iterable[str]) -> None:
+    for name in names:
+        picture = beside([row.draw() for row in STRIPS[name]], axis=0)
+        if STRIPS[name][0].color == "strain":
+            picture = np.concatenate([picture, scale_of_strain(picture.shape[1], 0.1)])
+        write_picture(HERE / name, picture)
+
+
+# --- films --------------------------------------------------------------------------------------------------------------
+
+
+def film(path: Path, episodes: Sequence[Episode], stride: int, color: str = "fabric") -> None:
+    """Episodes side by side, every so many moments of them; what has ended stands still."""
+    painters = [episode.painter(FILMED, 2, color) for episode in episodes]
+    step = episodes[0].task.physics.time_step
+    longest = max(len(episode.moments) for episode in episodes)
+    still: list[Any] = [None] * len(episodes)
+    frames = []
+    for k in range(0, longest + stride, stride):
+        for place, (episode, draw) in enumerate(zip(episodes, painters)):
+            if k - stride < len(episode.moments) - 1:
+                still[place] = draw(episode.moments[min(k, len(episode.moments) - 1)])
+        frames.append(beside(still))
+        if color == "strain":
+            frames[-1] = np.concatenate([frames[-1], scale_of_strain(frames[-1].shape[1], episodes[0].task.strain_shown)])
+    # the end stands for a second
+    write_video(path, frames + frames[-1:] * round(1 / step / stride), fps=1 / step / stride)
+
+
+def film_learned(env_id: str, path: Path) -> None:
+    """Three held-out episodes of a committed policy."""
+    policy = clothgym.policies.load(env_id)
+    kwargs = policy.about["env_kwargs"] | {"settling": "steps"}
+    episodes = [played(env_id, HELD_OUT + k, lambda env, seen: policy(seen), **kwargs) for k in range(3)]
+    film(path, episodes, 2, "strain" if env_id == "ClothStrain-v0" else "fabric")
+
+
+def film_expert(env_id: str, path: Path) -> None:
+    """Two held-out episodes of a scripted expert."""
+    film(path, [played(env_id, HELD_OUT + k) for k in range(2)], 4)
+
+
+def film_folds() -> None:
+    """The three folds."""
+    folds = (("ClothFold-v0", "half"), ("ClothFold-v0", "diagonal"), ("ClothFold-Hard-v0", "quarter"))
+    film(HERE / "fold.gif", [played(env_id, 7, fold=fold) for env_id, fold in folds], 4)
+
+
+# --- contact ------------------------------------------------------------------------------------------------------------
 
 
 def stool(width: float = 0.3, leg: float = 0.05, height: float = 0.25, thick: float = 0.04) -> tuple[Any, Any]:
@@ -138,68 +302,61 @@ def stool(width: float = 0.3, leg: float = 0.05, height: float = 0.25, thick: fl
 
 
 def draw_contact() -> None:
-    """A sheet over a stool and over the corner of a box; and a heap, without self-collision and with it, cut open."""
+    """A sheet over a stool and over the corner of a box; and a heap, without self-collision and with it."""
     mesh = grid(33, 33, 0.9, 0.9)
     above = mesh.rest_positions * [0.95, 0.95, 1] + [0, 0, 0.32]
     vertices, triangles = stool()
     on_corner = (0.88, 0.3647, -0.2798, 0.1159)  # a box whose diagonal stands upright
-    solids = [
-        MeshCollider(vertices=vertices, triangles=triangles, friction=0.4),
-        Box(center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner, friction=0.4),
-    ]
+    solids = {
+        "a stool": MeshCollider(vertices=vertices, triangles=triangles, friction=0.4),
+        "a box on its corner": Box(center=(0, 0, 0.05), half_sides=(0.12, 0.12, 0.12), rotation=on_corner, friction=0.4),
+    }
     camera = Camera(eye=(1.0, -1.1, 0.8), target=(0, 0, 0.1))
-    frames = []
-    for solid in solids:
+    images = []
+    for title, solid in solids.items():
         cloth = Simulation(mesh, colliders=[Plane(friction=0.5), solid], self_collision="strict")
         cloth.set_parameters(air_drag=1.0)
         cloth.reset(positions=above)
         cloth.step(150)
-        frames.append(picture(mesh, cloth.positions, camera, [solid]))
-    for mode in (False, "strict"):
+        images.append(labeled(picture(mesh, cloth.positions[0], camera, [solid]), title))
+    for title, mode in (("a heap, self_collision=False", False), ('a heap, self_collision="strict"', "strict")):
         heap = MANEUVERS["heap"](grid(33, 33, 1.0, 1.0), seeds=[3], self_collision=mode)
         while not heap.over:
             heap.step()
-        x = heap.simulation.positions - heap.simulation.positions[:, :, :2].mean(axis=1, keepdims=True) @ np.eye(2, 3)
-        frames.append(picture(heap.simulation.mesh, x, Camera(eye=(0.75, -0.8, 0.5), target=(0, 0, 0.02)), []))
-    iio.imwrite(HERE / "contact.png", np.concatenate(frames, axis=1))
+        x = heap.simulation.positions[0]
+        x = x - x[:, :2].mean(axis=0) @ np.eye(2, 3)
+        images.append(labeled(picture(heap.simulation.mesh, x, Camera(eye=(0.75, -0.8, 0.5), target=(0, 0, 0.02)), []), title))
+    write_picture(HERE / "contact.png", beside(images))
 
 
 def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any:
-    """One sheet, (height, width, 3)."""
-    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3, grid_shape=mesh.shape)
-    return renderer.rgb(positions[0], solids)
+    """One sheet, (height, width, 3), all of it in sight."""
+    uv = mesh.rest_positions[:, :2]
+    seen = framed(camera, positions)
+    return Renderer(mesh.triangles, uv, seen, SIZE, SIZE, antialias=3, grid_shape=mesh.shape).rgb(positions, solids)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--strips", nargs="+", choices=STRIPS, metavar="PNG", help="draw some strips alone")
     parser.add_argument(
         "--learned", nargs=2, metavar=("ENV", "GIF"), help="id whose committed policy is filmed, and the film's name"
     )
     parser.add_argument("--expert", nargs=2, metavar=("ENV", "GIF"), help="id whose scripted expert is filmed, and the film's name")
     parser.add_argument("--contact", action="store_true", help="draw contact alone")
-    parser.add_argument("--folds", action="store_true", help="draw and film the folds alone")
+    parser.add_argument("--folds", action="store_true", help="film the folds alone")
     options = parser.parse_args()
-    if options.contact:
-        draw_contact()
-        return
-    if options.folds:
-        draw_folds()
-        return
-    if options.learned is None and options.expert is None:
-        draw_strips()
-        draw_contact()
-        return
-    sys.path.insert(0, str(HERE.parent / "training"))
-    import drawing
-    import policies
-
-    if options.expert is not None:
-        env_id, name = options.expert
-        drawing.film(HERE / name, f"clothgym:{env_id}", policies.named("expert", env_id, 0), {}, episodes=2, stride=4)
-        return
-    env_id, name = options.learned
-    kwargs = policies.env_kwargs(policies.COMMITTED, env_id)
-    drawing.film(HERE / name, f"clothgym:{env_id}", policies.named(policies.COMMITTED, env_id, 0), kwargs, episodes=3, stride=2)
+    if options.learned is not None:
+        film_learned(options.learned[0], HERE / options.learned[1])
+    elif options.expert is not None:
+        film_expert(options.expert[0], HERE / options.expert[1])
+    elif options.folds:
+        film_folds()
+    else:
+        if not options.contact:
+            draw_strips(options.strips or STRIPS)
+        if not options.strips:
+            draw_contact()
 
 
 if __name__ == "__main__":
