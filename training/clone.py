@@ -21,25 +21,21 @@ from tqdm import tqdm
 Observations = NDArray | dict[str, NDArray]
 
 
-def demonstrations(
-    env: VecEnv, episodes: int, noise: float, seed: int, learner: PPO | None = None, careless: bool = False
-) -> tuple[Observations, NDArray]:
+def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner: PPO | None = None) -> tuple[Observations, NDArray]:
     """Observations and the expert's actions, (samples, size) each, from some episodes of each environment of a batch; of a goal
     task a dictionary of observations.
 
     noise: largest standard deviation of the disturbance; each environment draws its own for each of the rounds.
     learner: who acts in the expert's place, if anyone; what is noted is what the expert would do.
-    careless: whether the expert is ``ClothStrain-v0``'s that knows no constraint.
     """
     rng = np.random.default_rng(seed)
     task = env.unwrapped.env.task  # type: ignore[attr-defined]
-    expert = task.careless_actions if careless else task.expert
     observations, actions = [], []
     seen: Any = env.reset()
     for _ in tqdm(range(episodes), unit="episode of each", desc="demonstrations", leave=False, disable=None):
         strength = noise * rng.uniform(size=(env.num_envs, 1))
         for _ in range(task.most_steps()):
-            wanted = np.clip(expert(), -1, 1).astype(np.float32)
+            wanted = np.clip(task.expert(), -1, 1).astype(np.float32)
             # what is done while the sheet settles does not matter, and would only blur what does
             acting = task.episode["settling_since"] < 0
             observations.append({key: part[acting] for key, part in seen.items()} if isinstance(seen, dict) else seen[acting])

@@ -21,7 +21,6 @@ from clothgym.policies import Policy
 
 LEARNERS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "ppo_penalty": PPO, "ppo_lagrange": LagrangianPPO, "bc": PPO, "bc_ppo": PPO, "sac": SAC, "her": SAC,
-    "careless_ppo": PPO, "careless_penalty": PPO, "careless_lagrange": LagrangianPPO,
 }  # fmt: skip
 OWN_POLICIES = {one.__name__: one for one in (DepthPolicy,)}  # beside SB3's own, by the names that hyperparameter files have
 SCHEDULES = ("learning_rate", "clip_range")  # options that may be written lin_VALUE

@@ -287,9 +287,8 @@ def learn_from_expert(model: Any, config: Config) -> None:
     options = {name: value for name, value in config["clone"].items() if name not in ("critic_rollouts", "turns")}
     env: Any = model.env
     episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
-    careless = options.pop("careless", False)
     try:
-        samples = demonstrations(env, episodes, noise, config["seed"], careless=careless)
+        samples = demonstrations(env, episodes, noise, config["seed"])
     except NotImplementedError as missing:
         raise ValueError(str(missing)) from missing
     if "turns" in config["clone"]:
@@ -297,7 +296,7 @@ def learn_from_expert(model: Any, config: Config) -> None:
     torch.set_num_threads(config["threads"])
     for number in range(rounds + 1):
         if number:
-            samples = joined(samples, demonstrations(env, 1, noise, config["seed"] + number, model, careless))
+            samples = joined(samples, demonstrations(env, 1, noise, config["seed"] + number, model))
         error = clone(model, *samples, **options)
         print(f"cloned the expert from {len(samples[1]):,} samples: mean squared error {error:.4f}")
 

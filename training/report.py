@@ -44,8 +44,6 @@ ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
     "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
-    "careless_ppo": "clone of the careless expert, then PPO", "careless_penalty": "the same, fixed price",
-    "careless_lagrange": "the same, Lagrange multiplier",
 }  # fmt: skip
 # of learners in a picture of curves, told apart by the color-blind, too (Okabe and Ito)
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")

@@ -30,9 +30,6 @@ from clothgym import files
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
-Learner = Literal[
-    "ppo", "ppo_penalty", "ppo_lagrange", "bc", "bc_ppo", "sac", "her", "careless_ppo", "careless_penalty", "careless_lagrange"
-]  # fmt: skip
 # what these parts of the hyperparameters must have
 PARTS = {
     "clone": ("episodes", "noise", "epochs", "batch_size", "learning_rate"),
@@ -49,9 +46,9 @@ class Args:
     """Id of the environment."""
     seed: int = 0
     """Seed of the learner and of its environments."""
-    algo: Learner = "ppo"
+    algo: Literal["ppo", "ppo_penalty", "ppo_lagrange", "bc", "bc_ppo", "sac", "her"] = "ppo"
     """PPO; with a fixed price, or a Lagrange multiplier, on cost; a clone of the scripted expert, alone or before PPO; SAC, or SAC
-    with hindsight (HER) on a task of goals; a clone of the careless expert before PPO, alone, with a price or a multiplier."""
+    with hindsight (HER) on a task of goals."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
     run: Path | None = None
