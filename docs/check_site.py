@@ -98,7 +98,7 @@ def look(site: Path, pictures: Path) -> list[str]:
                     tab.goto(home + page.as_posix(), wait_until="load")
                     # pictures are loaded when they come into view
                     tab.evaluate("for (const i of document.images) i.loading = 'eager'")
-                    tab.wait_for_load_state("networkidle")
+                    tab.wait_for_function("[...document.images].every(picture => picture.complete)")
                     said += [f"{picture} is not shown" for picture in tab.evaluate(BROKEN)]
                     beyond = tab.evaluate(TOO_WIDE)
                     said += [f"{beyond} pixels wider than its window"] if beyond > 0 else []

@@ -7,6 +7,7 @@ below: which pages are files of the repository's root, and what the command line
 from __future__ import annotations
 
 import argparse
+import functools
 import re
 import shutil
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import clothgym
 from clothgym import cli
+from clothgym.registration import ENVIRONMENTS
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
@@ -34,10 +36,13 @@ myst_links_external_new_tab = False
 autodoc_mock_imports = ["torch", "stable_baselines3"]
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+autodoc_type_aliases = {name: name for name in ("ArrayLike", "NDArray", "Drawable", "Shape", "Color", "Held")}
+autodoc_preserve_defaults = True
+maximum_signature_line_length = 80
 autodoc_inherit_docstrings = False  # those of Gymnasium and NumPy are on their own pages
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
-nitpick_ignore_regex = [("py:.*", ".*")]
+nitpick_ignore_regex = [("py:class", ".*")]
 
 html_theme = "furo"
 html_title = "clothgym"
@@ -54,6 +59,7 @@ html_theme_options: dict[str, Any] = {
 # pages of the site that are files of the root; in docs/ a line stands in their place
 OF_THE_ROOT = {"about/changelog": "CHANGELOG.md", "about/contributing": "CONTRIBUTING.md"}
 DEMO = HERE / "demo" / "index.html"
+LINK_TO_DEMO = '<a class="demo" href="demo/index.html">See it move: episodes in your browser</a>'
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:
@@ -75,10 +81,9 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         # places in the table of contents for pages that there may be
         text = re.sub(r"^(\w+\*)\n", lambda place: place[0] if any(HERE.glob(f"{place[1]}.md")) else "", text, flags=re.MULTILINE)
     if page == "index" and DEMO.exists():
-        text = text.replace("<!-- demo -->", '<a class="demo" href="demo/index.html">See it move: episodes in your browser</a>')
+        text = text.replace("<!-- demo -->", LINK_TO_DEMO)
     if page == "tasks/README":
-        pages = sorted(path.stem for path in (HERE / "tasks").glob("Cloth*.md"))
-        text += "\n".join(["", "```{toctree}", ":hidden:", "", *pages, "```", ""])
+        text += "\n".join(["", "```{toctree}", ":hidden:", "", *ENVIRONMENTS, "```", ""])
     if page == "api/commands":
         text += help_of_commands()
     # a folder of the repository is no page
@@ -93,6 +98,7 @@ def help_of_commands() -> str:
     parts = []
     for name, command in commands.items():
         command.prog = f"python -m clothgym {name}"
+        command.formatter_class = functools.partial(argparse.HelpFormatter, width=90)
         lines = "\n".join(f"    {line}".rstrip() for line in command.format_help().splitlines())
         parts.append(f"\n{name}\n{'-' * len(name)}\n\n.. code-block:: none\n\n{lines}\n")
     return "".join(parts)
