@@ -2,6 +2,7 @@
 
 python benchmarks/materials.py            # table, docs/materials.png and results/materials.json: some minutes
 python benchmarks/materials.py --quick    # coarse specimens only, nothing written
+python benchmarks/materials.py --draw     # docs/materials.png alone
 """
 
 from __future__ import annotations
@@ -11,11 +12,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
-from numpy.typing import NDArray
 
-from clothgym.collisions import Capsule
+from clothgym.collisions import Capsule, MeshCollider
 from clothgym.lab.bench import machine
 from clothgym.lab.scenes import Drape, bending_length, cantilever, cusick_drape
 from clothgym.material import PRESETS, Material, rigidity_percentile
@@ -30,8 +29,23 @@ NAMES = [name for name in PRESETS if name != "cotton"]  # which is cotton_broad
 # published drape coefficients [%] and numbers of folds, see docs/materials.md: of the same piece, or a band of its class of fabrics
 PIECES = {"cotton_broad": (82.9, 2), "polyester_tropical": (50.7, 5), "wool_tropical": (49.8, 5), "polyester_faille": (28.3, 7)}
 BANDS = {"penava_cotton": (60, 76), "silk": (20, 40), "wool": (40, 70), "denim": (70, 90), "polyester": (20, 40)}
-HEIGHT = 0.1  # of the supporting disc in the picture [m]
-SIZE = 300
+HEIGHT = 0.17  # of the supporting disc in the picture [m]
+SIZE, GAP = 300, 4
+LARGE_DISC = 0.09  # radius of the disc [m]
+# how each looks in the picture: front, back, and width of a stripe of its gingham [m]; fine ones are seen as one color
+LOOKS = {
+    "median": ((158, 152, 142), (120, 115, 108), 0.010),
+    "cotton_broad": ((64, 112, 170), (64, 112, 170), 0.020),
+    "polyester_tropical": ((30, 120, 116), (30, 120, 116), 0.004),
+    "wool_tropical": ((150, 104, 60), (120, 84, 50), 0.006),
+    "polyester_faille": ((150, 50, 96), (120, 40, 80), 0.003),
+    "penava_cotton": ((206, 64, 50), (206, 64, 50), 0.025),
+    "knit": ((70, 136, 70), (70, 136, 70), 0.012),
+    "polyester": ((104, 74, 150), (90, 64, 130), 0.002),
+    "silk": ((226, 190, 120), (214, 170, 96), 0.0005),
+    "wool": ((84, 80, 76), (84, 80, 76), 0.007),
+    "denim": ((24, 48, 104), (140, 158, 190), 0.0012),
+}
 
 Row = dict[str, Any]
 
@@ -114,32 +128,59 @@ def table(rows: list[Row]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def draw(drapes: list[Drape]) -> NDArray[np.uint8]:
-    """The specimens in two lines, each from above and below that from the side, (height, width, 3)."""
-    mesh, columns = drapes[0].mesh, -(-len(drapes) // 2)
-    support = Capsule(center=(0.0, 0.0, HEIGHT / 2 - 0.005), radius=0.02, height=HEIGHT - 0.01)
-    picture = np.full((4 * SIZE, columns * SIZE, 3), 255, np.uint8)
-    for view, eye in enumerate(((0.0, -0.02, 0.72), (0.0, -0.52, 0.2))):
-        camera = Camera(eye, target=(0.0, 0.0, 0.06), vertical_fov=32.0)
-        renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3)
-        for number, drape in enumerate(drapes):
+def draw(drapes: dict[str, Drape]) -> None:
+    """The specimens by name in two lines, each from above and below that from the side, on the disc of the tester and its foot."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    columns = -(-len(drapes) // 2)
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    ring = LARGE_DISC * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    # a prism with two middles: the disc, closed
+    levels = [np.column_stack([ring, np.full(64, z)]) for z in (-0.006, 0.0)]
+    vertices = np.concatenate([*levels, [(0, 0, -0.006), (0, 0, 0)]])
+    k, n = np.arange(64), (np.arange(64) + 1) % 64
+    sides = [
+        np.stack(three, axis=1)
+        for three in ((k, n, 64 + n), (k, 64 + n, 64 + k), (n, k, 0 * k + 128), (64 + k, 64 + n, 0 * k + 129))
+    ]
+    disc = MeshCollider(vertices=vertices, triangles=np.concatenate(sides), center=(0.0, 0.0, HEIGHT - 0.004))
+    foot = Capsule(center=(0.0, 0.0, HEIGHT / 2), radius=0.012, height=HEIGHT - 0.02)
+    pixels = np.full((4 * (SIZE + GAP) - GAP, columns * (SIZE + GAP) - GAP, 3), 255, np.uint8)
+    for view, eye in enumerate(((0.0, -0.02, 0.86), (0.0, -0.78, 0.17))):
+        camera = Camera(eye, target=(0.0, 0.0, HEIGHT if view == 0 else 0.1), vertical_fov=28.0)
+        for number, (name, drape) in enumerate(drapes.items()):
+            front, back, check = LOOKS[name]
+            mesh = drape.mesh
+            renderer = Renderer(
+                mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3, front=front, back=back, check=check
+            )
             line, column = divmod(number, columns)
-            top, left = (2 * line + view) * SIZE, column * SIZE
-            picture[top : top + SIZE, left : left + SIZE] = renderer.rgb(drape.positions[0] + (0, 0, HEIGHT), [support])
-    return picture
+            top, left = (2 * line + view) * (SIZE + GAP), column * (SIZE + GAP)
+            seen = renderer.rgb(drape.positions[0] + (0, 0, HEIGHT), [(disc, (120, 124, 132)), (foot, (120, 124, 132))])
+            pixels[top : top + SIZE, left : left + SIZE] = seen
+    picture, font = Image.fromarray(pixels), ImageFont.load_default(17)
+    for number, name in enumerate(drapes):
+        line, column = divmod(number, columns)
+        place = (column * (SIZE + GAP) + 10, 2 * line * (SIZE + GAP) + 8)
+        ImageDraw.Draw(picture).text(place, name, (43, 45, 66), font)
+    picture.save(PICTURE, optimize=True)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="coarse specimens only, nothing written")
+    parser.add_argument("--draw", action="store_true", help="the picture alone")
     args = parser.parse_args()
+    if args.draw:
+        draw({name: cusick_drape(Material.preset(name), RINGS[-1], 1) for name in NAMES})
+        return
     measured = [measure(name, RINGS[:1] if args.quick else RINGS) for name in NAMES]
-    rows, drapes = [row for row, _ in measured], [drape for _, drape in measured]
+    rows = [row for row, _ in measured]
     print(table(rows))
     if not args.quick:
         about = {"overhang": OVERHANG, "rings": RINGS, "specimens": SPECIMENS}
         RESULT.write_text(json.dumps({"machine": machine(), "about": about, "rows": rows}, indent=1) + "\n")
-        iio.imwrite(PICTURE, draw(drapes))
+        draw(dict(zip(NAMES, (drape for _, drape in measured))))
 
 
 if __name__ == "__main__":

@@ -11,12 +11,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from clothgym.render import write_picture
 
 OUT = Path(__file__).with_suffix(".png")
 MODES = ("rgb", "depth", "rgbd", "heightmap", "pointcloud")
-SIZE, SCALE, GAP = 64, 3, 6  # pixels of a picture, and of each of its own; between pictures
+SIZE, SCALE, GAP, LINE = 64, 3, 6, 22  # pixels of a picture, and of each of its own; between pictures; of a line of labels
+LABELS = {"rgbd": "rgbd: color | depth"}
 STEPS = 62  # of the expert's episode
 
 
@@ -60,8 +62,15 @@ def main() -> None:
             row.append(np.kron(shown(mode, seen), np.ones((SCALE, SCALE, 1), np.uint8)))
         gap = np.full((SIZE * SCALE, GAP, 3), 255, np.uint8)
         rows.append(np.concatenate([part for one in row for part in (one, gap)][:-1], axis=1))
-    between = np.full((GAP, rows[0].shape[1], 3), 255, np.uint8)
-    write_picture(OUT, np.concatenate([rows[0], between, rows[1]]))
+    lines = []
+    for row, seen_from in zip(rows, ("from above", "by the task's camera")):
+        line = Image.new("RGB", (row.shape[1], LINE), "white")
+        for k, mode in enumerate(MODES):
+            # a height map is always from above
+            label = mode if mode == "heightmap" else f"{LABELS.get(mode, mode)}, {seen_from}" if k == 0 else LABELS.get(mode, mode)
+            ImageDraw.Draw(line).text((k * (SIZE * SCALE + GAP) + 2, 3), label, (43, 45, 66), ImageFont.load_default(13))
+        lines += [np.asarray(line), row]
+    write_picture(OUT, np.concatenate(lines))
 
 
 if __name__ == "__main__":

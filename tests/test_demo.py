@@ -34,8 +34,7 @@ def opened(tmp_path_factory):
         tab.on("console", lambda message: said.append(message.text))
         tab.on("pageerror", lambda error: said.append(str(error)))
         tab.goto((folder / "index.html").as_uri() + "#reach")
-        tab.wait_for_function("page.episode !== undefined")
-        tab.evaluate("page.play(false)")
+        tab.wait_for_function("page.episode !== undefined && (page.play(false), true)")
         yield tab, said
         browser.close()
 
@@ -86,9 +85,7 @@ def test_the_page_shows_what_the_committed_policy_does(opened):
 def test_every_episode_is_drawn_without_a_word_to_the_console(opened):
     tab, said = opened
     for name in record.EPISODES:
-        tab.evaluate("(name) => page.open(name)", name)
-        tab.wait_for_function("(name) => page.name === name && page.episode.id === page.viewer.episode.id", arg=name)
-        tab.evaluate("() => { page.play(false); page.seek(0); }")
+        tab.evaluate("(name) => page.open(name).then(() => page.play(false))", name)
         sheet = np.array(tab.evaluate("Array.from(page.viewer.sheet.positions)"))
         assert np.isfinite(sheet).all()
         if name == "fold":

@@ -57,7 +57,8 @@ def film(
     stride: int = 1,
     seed: int = evaluate.HELD_OUT,
 ) -> None:
-    """Some episodes, by default held-out ones, side by side, each one's end standing still; every so many frames of them."""
+    """Some episodes, by default held-out ones, side by side with white between, each one's end standing still; every so many frames
+    of them."""
     # a film shows how the sheet settles, too
     env_kwargs = env_kwargs | {"settling": "steps"}
     env = gym.make_vec(env_id, num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
@@ -65,11 +66,17 @@ def film(
     frames, running = [], np.ones(episodes, bool)
     still = [np.asarray(frame) for frame in env.render()]
     while running.any():
-        frames.append(np.concatenate(still, axis=1))
+        frames.append(_row(still))
         observations, _, terminated, truncated, _ = env.step(policy(env, observations))
         fresh = env.render()
         still = [new if on else old for new, old, on in zip(fresh, still, running)]
         running &= ~(terminated | truncated)
-    frames += [np.concatenate(still, axis=1)] * 15
+    frames += [_row(still)] * 15
     env.close()
     write_video(path, frames[::stride], fps=env.metadata["render_fps"] / stride)
+
+
+def _row(images: list[np.ndarray]) -> np.ndarray:
+    """Pictures beside each other, with four white columns between them."""
+    bordered = [np.pad(image, ((0, 0), (0, 4), (0, 0)), constant_values=255) for image in images]
+    return np.concatenate(bordered, axis=1)[:, :-4]
