@@ -32,7 +32,7 @@ highlight_language = "none"  # a block without a language is what is typed into 
 myst_heading_anchors = 4
 myst_links_external_new_tab = False
 
-# docstrings: their Args and Attributes; types as they are written, and no page of another project is fetched to link them
+# docstrings: their Args and Attributes, and types as they are written
 autodoc_mock_imports = ["torch", "stable_baselines3"]
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
@@ -42,7 +42,7 @@ maximum_signature_line_length = 80
 autodoc_inherit_docstrings = False  # those of Gymnasium and NumPy are on their own pages
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
-nitpick_ignore_regex = [("py:class", ".*")]
+nitpick_ignore_regex = [("py:class", ".*"), ("py:exc", r"gymnasium\..*")]  # no page of another project is fetched to link them
 
 html_theme = "furo"
 html_title = "clothgym"
