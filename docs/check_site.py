@@ -23,8 +23,8 @@ from typing import Any
 
 WIDTHS = {"wide": (1280, 800), "phone": (390, 844)}
 FLAGS = [
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync",
+    "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 BROWSERS = "chromium", "chromium-browser", "google-chrome"
 BROKEN = "[...document.images].filter(i => i.src && (!i.complete || !i.naturalWidth)).map(i => i.src)"

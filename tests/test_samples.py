@@ -1,12 +1,10 @@
 """What the pages show runs: Python samples and doctests are executed, and commands have the options that are named.
 
-The README's samples are executed by ``test_docs``.  Those of docs/clients.md need the library that they are about: without it they
-are skipped here, and ``make clients`` has them all.
+Some pages are run elsewhere, see ``ELSEWHERE``: those of other libraries need an environment of their own.
 """
 
 import contextlib
 import doctest
-import importlib.util
 import io
 import re
 import runpy
@@ -30,7 +28,8 @@ PAGES = {
 API = sorted((ROOT / "docs" / "api").glob("*.rst"))
 BLOCKS = {name: re.findall(r"^```(\w*)\n(.*?)^```", page, re.DOTALL | re.MULTILINE) for name, page in PAGES.items()}
 PYTHON = {name: [text for language, text in blocks if language == "python"] for name, blocks in BLOCKS.items()}
-SAMPLES = [name for name, blocks in PYTHON.items() if blocks and name not in ("README.md", "docs/clients.md")]
+ELSEWHERE = {"README.md": "test_docs.py", "docs/clients.md": "clients", "docs/cluster.md": "clients"}
+SAMPLES = [name for name, blocks in PYTHON.items() if blocks and name not in ELSEWHERE]
 
 # the same in fewer steps, of fewer environments, and of smaller batches
 SHORTER = (
@@ -68,19 +67,6 @@ def test_a_page_s_samples_run(page, tmp_path, monkeypatch, capsys):
         task = names["envs"].unwrapped.task
         middle = task.simulation.positions[:, 40, :2]  # of 9 x 9 particles
         assert names["terminated"].all() and abs(middle - task.episode["goal"]).max() < 0.05
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("sample", PYTHON["docs/clients.md"], ids=lambda text: re.sub(r"\W+", " ", text)[:60])
-def test_a_client_s_sample_runs(sample, tmp_path, monkeypatch):
-    for module in set(re.findall(r"^(?:from|import) (\w+)", sample, re.MULTILINE)) | set(
-        re.findall(r", (\w+)$", sample, re.MULTILINE)
-    ):
-        if importlib.util.find_spec(module) is None:
-            pytest.skip(f"needs {module}: make clients")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.chdir(tmp_path)
-    run("docs/clients.md", [sample])
 
 
 @pytest.mark.parametrize("page", API, ids=lambda page: page.name)
@@ -145,7 +131,10 @@ def help_of():
                         sys.path.insert(0, str((ROOT / program[0]).parent))
                         runpy.run_path(str(ROOT / program[0]), run_name="__main__")
             except ModuleNotFoundError:  # a library that is not here: what its source says
-                said.write((ROOT / program[0]).read_text())
+                source = (ROOT / program[0]).read_text()
+                said.write(
+                    source + "".join(f" --{name.replace('_', '-')}" for name in re.findall(r"^    (\w+): ", source, re.MULTILINE))
+                )
             finally:
                 sys.path[:], sys.argv[:] = path, argv
                 for name in set(sys.modules) - before:  # scripts of several folders have the same names
@@ -187,11 +176,12 @@ def test_targets_and_extras_exist():
 
 
 def test_every_id_that_is_named_exists():
+    assert all((ROOT / "tests" / place).exists() for place in ELSEWHERE.values())
     for name, page in PAGES.items():
         assert set(re.findall(r"\bCloth[A-Z]\w+(?:-Hard)?-v\d+", page)) <= set(ENVIRONMENTS), name
 
 
 def test_what_looks_like_python_is_marked_as_python():
     for name, blocks in BLOCKS.items():
-        for language, text in blocks:
+        for language, text in () if name in ELSEWHERE else blocks:
             assert language or not re.search(r"^(import|from|env|def|class) ?\b.*", text, re.MULTILINE), f"{name}: {text}"
