@@ -32,7 +32,8 @@ BANDS = {"penava_cotton": (60, 76), "silk": (20, 40), "wool": (40, 70), "denim":
 HEIGHT = 0.17  # of the supporting disc in the picture [m]
 SIZE, GAP = 300, 4
 LARGE_DISC = 0.09  # radius of the disc [m]
-# how each looks in the picture: front, back, and width of a stripe of its gingham [m]; fine ones are seen as one color
+PLAIN = 20.0  # width of a stripe that is wider than any specimen [m]; these lie in the middle of it, and of a yarn
+# how each looks in the picture: front, back, and width of a stripe of its gingham [m]
 LOOKS = {
     "median": ((158, 152, 142), (120, 115, 108), 0.010),
     "cotton_broad": ((64, 112, 170), (64, 112, 170), 0.020),
@@ -42,9 +43,9 @@ LOOKS = {
     "penava_cotton": ((206, 64, 50), (206, 64, 50), 0.025),
     "knit": ((70, 136, 70), (70, 136, 70), 0.012),
     "polyester": ((104, 74, 150), (90, 64, 130), 0.002),
-    "silk": ((226, 190, 120), (214, 170, 96), 0.0005),
+    "silk": ((232, 196, 120), (232, 196, 120), PLAIN),
     "wool": ((84, 80, 76), (84, 80, 76), 0.007),
-    "denim": ((24, 48, 104), (140, 158, 190), 0.0012),
+    "denim": ((46, 68, 122), (150, 166, 196), PLAIN),
 }
 
 Row = dict[str, Any]
@@ -150,10 +151,8 @@ def draw(drapes: dict[str, Drape]) -> None:
         camera = Camera(eye, target=(0.0, 0.0, HEIGHT if view == 0 else 0.1), vertical_fov=28.0)
         for number, (name, drape) in enumerate(drapes.items()):
             front, back, check = LOOKS[name]
-            mesh = drape.mesh
-            renderer = Renderer(
-                mesh.triangles, mesh.rest_positions[:, :2], camera, SIZE, SIZE, antialias=3, front=front, back=back, check=check
-            )
+            triangles, uv = drape.mesh.triangles, drape.mesh.rest_positions[:, :2] + 0.525 * PLAIN
+            renderer = Renderer(triangles, uv, camera, SIZE, SIZE, antialias=3, front=front, back=back, check=check)
             line, column = divmod(number, columns)
             top, left = (2 * line + view) * (SIZE + GAP), column * (SIZE + GAP)
             seen = renderer.rgb(drape.positions[0] + (0, 0, HEIGHT), [(disc, (120, 124, 132)), (foot, (120, 124, 132))])
