@@ -216,7 +216,9 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
         return "–"
     label, rows = max(found, key=lambda one: interquartile_mean(row["success_rate"] for row in one[1]))
     old = _old(all(is_present(row, digests) for row in rows))
-    return f"{label}: {interquartile_mean(row['success_rate'] for row in rows):.2f} in {max(_minutes(rows), 1):.0f} min{old}"
+    cost = f" at cost {statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else ""
+    success = interquartile_mean(row["success_rate"] for row in rows)
+    return f"{label}: {success:.2f}{cost} in {max(_minutes(rows), 1):.0f} min{old}"
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
