@@ -18,14 +18,18 @@ import socket
 import sys
 import traceback
 from collections.abc import Awaitable, Callable, Iterator
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, parse_qsl, quote, unquote, urlencode, urlsplit
 
 from clothgym.checks import shown
 from clothgym.playground.dress import dressed
 
 MOST_VISITS = 16
+PAGES = ("/", "/index.html")
+LONGEST, ASKED_FOR = 2000, 60  # letters of a query that are read, and how long a page has to ask for its websocket [s]
+ASKED: ContextVar[str] = ContextVar("asked", default="")  # the query of the page whose websocket is served in this context
 NOWHERE = "clothgym.invalid"  # a name that no server has
 # the rest of a request for a page, and of one for a websocket
 PAGE = "Connection: close\r\n"
@@ -75,7 +79,7 @@ class Access:
             return http.HTTPStatus.FORBIDDEN, f"A page of {shown(origins)} may not visit this server."
         if self.token and not self._has_token(path, headers):
             return http.HTTPStatus.FORBIDDEN, "Open the whole address that the server has printed, with its token."
-        entering = headers.get("Upgrade") is not None or urlsplit(path).path in ("/", "/index.html")
+        entering = headers.get("Upgrade") is not None or urlsplit(path).path in PAGES
         if entering and self._full(connections):
             return http.HTTPStatus.SERVICE_UNAVAILABLE, f"The playground is full, with {MOST_VISITS} visitors. Try again later."
         return None
@@ -97,6 +101,8 @@ class Access:
                 response.headers["Referrer-Policy"] = "no-referrer"
                 if self.token:
                     response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
+                if urlsplit(request.path).path in PAGES:
+                    response.headers["Set-Cookie"] = self._asked(request.path)
             return response
 
         return process_request
@@ -110,7 +116,12 @@ class Access:
 
         def serve(handler: Any, *args: Any, process_request: Any = None, **kwargs: Any) -> Any:
             asyncio.get_running_loop().set_exception_handler(lambda _, context: tell_of_a_message(context.get("exception")))
-            return plain(in_sentences(handler), *args, process_request=self.guarded(process_request), **kwargs)
+
+            async def telling(connection: Any) -> None:
+                ASKED.set(unquote("".join(in_cookies(connection.request.headers, f"{self._cookie}-asked"))[:LONGEST]))
+                await handler(connection)
+
+            return plain(in_sentences(telling), *args, process_request=self.guarded(process_request), **kwargs)
 
         server.serve = serve  # type: ignore[assignment,misc]
         try:
@@ -140,11 +151,20 @@ class Access:
 
     def _has_token(self, path: str, headers: Any) -> bool:
         offered = parse_qs(urlsplit(path).query).get("token", [])
-        for header in headers.get_all("Cookie"):
-            for part in header.split(";"):
-                name, _, value = part.strip().partition("=")
-                offered += [value] if name == self._cookie else []
+        offered += in_cookies(headers, self._cookie)
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in offered)
+
+    def _asked(self, path: str) -> str:
+        """The cookie with which the page's websocket, whose address has no query, tells what the page was asked for."""
+        told = urlencode([(name, value) for name, value in parse_qsl(urlsplit(path).query) if name != "token"])
+        kept = quote(told[:LONGEST], safe="")
+        return f"{self._cookie}-asked={kept}; Max-Age={ASKED_FOR if kept else 0}; HttpOnly; SameSite=Strict; Path=/"
+
+
+def in_cookies(headers: Any, wanted: str) -> list[str]:
+    """The values that a request's cookies have for a name."""
+    pairs = [part.strip().partition("=") for header in headers.get_all("Cookie") for part in header.split(";")]
+    return [value for name, _, value in pairs if name == wanted]
 
 
 def in_sentences(handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:

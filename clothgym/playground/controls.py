@@ -11,6 +11,7 @@ from clothgym.material import PRESETS as FABRICS
 from clothgym.playground import files
 from clothgym.playground.plots import Plots
 from clothgym.playground.presets import PRESETS
+from clothgym.playground.race import Race
 from clothgym.playground.show import MODES
 from clothgym.playground.stage import SceneStage, Stage
 from clothgym.playground.world import CLOTH, WORLD, Settings, number_within
@@ -47,6 +48,8 @@ class Controls(dict[str, Any]):
         self._add_sliders(gui, [slider for slider in WORLD if slider[0] in IN_SIGHT])
         self._menu(gui, "fabric", "fabric", FABRICS, "what the sheet is made of: measured fabrics")
         self._menu(gui, "integrator", "integrator", INTEGRATORS, "the method that moves the cloth on in time")
+        drop = add("drop", gui.add_button("Let go", hint="of the cloth: it falls, and is judged"))
+        self._ordered(drop, "drop")
         presets = add("presets", gui.add_button_group("", tuple(PRESETS)))
         self._ordered(presets, "preset")
         add("glance", gui.add_markdown(""))
@@ -73,6 +76,8 @@ class Controls(dict[str, Any]):
         with gui.add_folder("Save", expand_by_default=False):
             kinds = add("kind", gui.add_dropdown("as", tuple(files.KINDS.values()), initial_value=files.KINDS["png"]))
             names = {label: kind for kind, label in files.KINDS.items()}
+            hint = "copy it: it opens the page with what is shown now, its settings, seed and pins"
+            add("link", gui.add_text("link", "", hint=hint))
             self._ordered(add("save", gui.add_button("Save")), "save", lambda _: names.get(kinds.value, "png"))
         gui.main_panel.dock_right()
         gui.main_panel.set_width(WIDTH)
@@ -87,7 +92,7 @@ class Controls(dict[str, Any]):
         self["scene"].value = next(title for title, name in self._choices.items() if name == stage.name)
         for name in ("gravity", "wind", "fabric", "integrator", "World", "Cloth", "Method"):
             self[name].visible = simulated
-        self["presets"].visible = True
+        self["drop"].visible = isinstance(stage, Race)
         self["Compare"].visible = self["click"].visible = scene
         self["compare"].value = self["unlimited"].value = False
         self["seed"].value = stage.seed

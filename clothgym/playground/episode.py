@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import indices, known, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.envs.episode import FAILURES, within_ball
+from clothgym.envs.episode import within_ball
 from clothgym.material import PRESETS
+from clothgym.playground.judgement import judgement
 from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
 from clothgym.playground.sheets import Attachment, Stability, set_in_place, stability, visible, within_view
 from clothgym.playground.stage import Stage
@@ -55,14 +56,24 @@ class EpisodeStage(Stage):
         env_id: a registered id, with or without its namespace.
         policies: who may act, by name, besides those of ``POLICIES``.
         policy: who does at first.
+        name: under which it was asked for, the id if it is empty.
+
+    Attributes:
+        info: of the last step.
+        played: what the environment observed, was told and gave in each step of the episode.
 
     Raises:
         ValueError: no such environment or policy.
     """
 
-    def __init__(self, env_id: str, policies: Mapping[str, Policy] | None = None, policy: str = "expert", seed: int = 0) -> None:
+    def __init__(
+        self, env_id: str, policies: Mapping[str, Policy] | None = None, policy: str = "expert", seed: int = 0, name: str = ""
+    ) -> None:
         super().__init__()
-        self.name, self.seed = checked_id(env_id), seed
+        self.env_id, self.seed = checked_id(env_id), seed
+        self.name = name or self.env_id
+        self.info: Mapping[str, Any] = {}
+        self.played: list[tuple[Any, NDArray, float]] = []
         self.policies = {**POLICIES, **(policies or {})}
         self._given: dict[str, Any] | None = None
         self.choose(policy)
@@ -78,11 +89,11 @@ class EpisodeStage(Stage):
         self.about = f"{(type(self.env).__doc__ or '').strip().splitlines()[0]}"
         s = task.simulation
         self._own = self.settings = settings_of(s, task.wind)
-        self.recording = Recording(self.name, s.mesh, s.time_step, task.camera(), (s.integrator.name,), task.strain_shown)
+        self.recording = Recording(self.env_id, s.mesh, s.time_step, task.camera(), (s.integrator.name,), task.strain_shown)
         self.reset()
 
     def _made(self) -> Any:
-        return gym.make(self.name, **self._options).unwrapped
+        return gym.make(self.env_id, **self._options).unwrapped
 
     @property
     def simulation(self) -> Simulation:
@@ -91,6 +102,16 @@ class EpisodeStage(Stage):
     @property
     def over(self) -> bool:
         return self._over
+
+    @property
+    def env_kwargs(self) -> Mapping[str, Any]:
+        """With which the environment was made at first."""
+        return self._given or {}
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether the settings are the environment's own."""
+        return self.settings == self._own
 
     def choose(self, policy: str) -> None:
         """Use another policy from now on; if it was trained with other options, in a new environment with these.
@@ -113,6 +134,8 @@ class EpisodeStage(Stage):
         # an episode starts with the task's own parameters
         set_in_place(self.simulation, self._own, self.settings)
         self._dragged: dict[int, NDArray] = {}
+        self._grabbed: dict[int, NDArray] = {}  # ways from the visitor's pointer to the attachments that follow it [m]
+        self.played, self.info = [], {}
         self._closed = np.full(
             len(self.attachments()), self.env.task.actions_per_attachment > 3 and not len(self.simulation.grippers)
         )
@@ -132,13 +155,16 @@ class EpisodeStage(Stage):
         if self._dragged:
             action = self._steered(action)
         begun = time.perf_counter()
+        before = self._observation
         self._observation, reward, terminated, truncated, info = self.env.step(action)
+        self.played.append((before, action, float(reward)))
+        self.info = info
         self._cost = time.perf_counter() - begun
         self._time += self.simulation.time_step
         self.total += reward
         self._over = terminated or truncated
         if self._over:
-            self.notes["evaluation"] = _evaluation(info, self.total)
+            self.notes["evaluation"] = judgement(info, self.total)
         terms = {key.removeprefix("reward/"): value for key, value in info.items() if key.startswith("reward/")}
         return self._keep(self._look(terms))
 
@@ -225,6 +251,28 @@ class EpisodeStage(Stage):
         else:
             self._dragged[attachment] = within_view(vector("place", place))
 
+    def grab(self, place: ArrayLike) -> None:
+        """Take the attachment that is nearest to where the visitor holds the sheet."""
+        where = within_view(vector("place", place))
+        attachments = self.attachments()
+        able = [k for k, attachment in enumerate(attachments) if attachment.draggable]
+        if able:
+            nearest = min(able, key=lambda k: float(((attachments[k].position - where) ** 2).sum()))
+            self.grab_these([nearest], where)
+
+    def grab_these(self, which: Sequence[int], where: NDArray) -> None:
+        """Let these attachments follow the visitor's pointer, which is at a position [m], (3,)."""
+        self._grabbed = {k: self.attachments()[k].position - where for k in which}
+
+    def pull(self, place: ArrayLike) -> None:
+        for attachment, away in self._grabbed.items():
+            self.drag(attachment, vector("place", place) + away)
+
+    def let_go(self) -> None:
+        for attachment in self._grabbed:
+            self.drag(attachment, None)
+        self._grabbed = {}
+
     def hold(self, attachment: int, holds: bool) -> None:
         indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")
         self._closed[attachment] = holds
@@ -282,10 +330,3 @@ def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
         self_collision=simulation.self_collision or "off",
         substeps=simulation.substeps,
     )
-
-
-def _evaluation(info: Mapping[str, Any], total: float) -> str:
-    if info["failure"]:
-        return f"The episode failed: {FAILURES[info['failure']].replace('_', ' ')}. Return {total:.2f}."
-    outcome = "a success" if info["is_success"] else "no success"
-    return f"Evaluated: {outcome}, performance {info['normalized_performance']:.2f}, return {total:.2f}."

@@ -11,7 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from clothgym.playground import demonstrations
+from clothgym.playground.episode import EpisodeStage
 from clothgym.playground.pictures import joined, painter, together, write_moving_mesh
+from clothgym.playground.race import Race
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.stage import Stage
 from clothgym.render import Camera, MeshSequence
@@ -24,6 +27,7 @@ KINDS = {
     "obj": "meshes (OBJ, zipped)",
     "glb": "moving mesh (glTF)",
     "npz": "recording (NPZ)",
+    "demo": "demonstration (NPZ)",
 }
 PICTURE, FILM = 960, 480  # pixels of a side
 LONGEST = 300  # frames of a film or of meshes, the last of the recording
@@ -44,7 +48,8 @@ def made(
     recording = stage.recording
     frames = recording.frames[max(0, moment + 1 - LONGEST) : moment + 1]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{stage.name}.{kind}"
+        name = stage.name.replace("/", "_")
+        path = Path(folder) / f"{name}.{kind}"
         if kind == "png":
             write_picture(path, painter(recording, PICTURE, 3, color, _seen(camera))(frames[-1]))
         elif kind in ("gif", "mp4"):
@@ -52,10 +57,16 @@ def made(
             write_video(path, map(draw, _wanted(frames, left)), fps=1 / recording.time_step)
         elif kind == "glb":
             write_moving_mesh(path, recording, frames, 1 / recording.time_step)
+        elif kind == "demo":
+            played = stage.mine if isinstance(stage, Race) else stage
+            if not isinstance(played, EpisodeStage):
+                raise ValueError("a demonstration is of an environment: choose one, and play it")
+            path = path.with_name(f"{name}_demonstration.npz")
+            demonstrations.save(path, played)
         elif kind == "npz":
             recording.save(path)
         else:
-            return f"{stage.name}_obj.zip", _zipped(_sequence(Path(folder) / "frames", recording, _wanted(frames, left)))
+            return f"{name}_obj.zip", _zipped(_sequence(Path(folder) / "frames", recording, _wanted(frames, left)))
         return path.name, path.read_bytes()
 
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from clothgym.playground import files
+from clothgym.playground import files, hands, link
 from clothgym.playground.controls import ATTACHMENTS, CLICKS, Controls
 from clothgym.playground.presets import AGAIN, PRESETS
+from clothgym.playground.race import Race
 from clothgym.playground.readings import glance, legend, readings_table
 from clothgym.playground.show import MODES, Show
 from clothgym.playground.stage import REBUILDS, SceneStage, Stage
@@ -39,6 +40,7 @@ class Page:
         choices: names of scenes and environments, by title.
         start: the name shown first.
         left: whether the visitor has left.
+        asked: query of the page's address, see ``link``; address: of the page, to which the link leads.
 
     ``tick`` is called by one thread only; a visitor's actions come in a queue.  A browser may send anything, and may change a
     control's range: what it sends is checked here, against ranges of our own.
@@ -51,7 +53,10 @@ class Page:
         choices: Mapping[str, str],
         start: str,
         left: Callable[[], bool] = lambda: False,
+        asked: str = "",
+        address: str = "",
     ) -> None:
+        self._address = address
         self._left = left
         self.client, self._open_stage, self.choices = client, open_stage, dict(choices)
         self._orders: Queue[tuple[str, Any]] = Queue(MOST_ORDERS)
@@ -60,12 +65,41 @@ class Page:
         self._stale = True  # whether the view must be drawn again
         self._waiting: Any = None  # notification that the next frame takes a while
         self._fresh = False  # whether the stage has not advanced since it was built, and may have to compile first
-        self.stage = self._open_stage(start)
+        asked_for, refused = self._asked_for(asked)
+        self.stage = self._open_stage(asked_for.scene or start)
         self.controls = Controls(client.gui, self.order, lambda: self.stage.settings, self.choices)
         self.plots = self.controls.plots
         for modifier in (None, "shift"):
             client.scene.on_click(modifier=modifier)(self._clicked)
         self._begin()
+        if refused:
+            self.client.add_notification("Not possible", refused, color="orange", auto_close_seconds=12.0)
+        self._do(lambda: self._go_to(asked_for))
+
+    def _asked_for(self, query: str) -> tuple[link.Link, str]:
+        """What a link says, and why it cannot be followed."""
+        try:
+            asked = link.read(query)
+        except ValueError as error:
+            return link.Link(), f"The link is not understood: {error}."
+        if asked.scene and asked.scene not in self.choices.values():
+            return link.Link(), f"The link is to {asked.scene[:40]!r}, which is not shown here."
+        return asked, ""
+
+    def _go_to(self, asked: link.Link) -> None:
+        """Change the stage that has been opened to what a link says."""
+        if asked.policy in getattr(self.stage, "policies", ()):
+            self._choose(asked.policy)
+            self.controls["policy"].value = asked.policy
+        self._change(asked.changes)
+        if asked.compared and isinstance(self.stage, SceneStage):
+            self._show_compared(asked.compared)
+        if asked.seed is not None:
+            self.controls["seed"].value = asked.seed
+            self._press("reset")
+        for particle in asked.pins[: hands.PINS]:
+            if isinstance(self.stage, SceneStage):
+                self.stage.pin_particle(particle)
 
     # --- what a visitor does --------------------------------------------------------------------------------------------
 
@@ -280,6 +314,11 @@ class Page:
                 self.stage.grab(start)
             self.stage.pull(end)
 
+    def _drop(self, _: Any = None) -> None:
+        """Let go of the cloth in a race."""
+        if isinstance(self.stage, Race):
+            self.stage.drop()
+
     @property
     def _touchable(self) -> bool:
         """Whether a click can mean the sheet as it is now."""
@@ -332,7 +371,7 @@ class Page:
             self.show.draw(frames[self.moment], mode, bool(self.controls["diagonals"].value), self.client.camera.position)
             if self.moment == len(frames) - 1:
                 self.show.draw_held(self.stage.attachments(), bool(self.controls["handles"].value), self.stage.pinned())
-            self.show.say(self.stage.notes.get("burst", ""), frames[self.moment])
+            self.show.say(self.stage.saying if self.moment == len(frames) - 1 else "", frames[self.moment])
         state = "■ over: reset to start again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
         if self.controls["state"].content != state:
             self.controls["state"].content = state
@@ -353,4 +392,5 @@ class Page:
         controls["legend"].content = legend(self.stage.recording, frame, mode, self.show.scale)
         for number, attachment in enumerate(self.stage.attachments()[:ATTACHMENTS]):
             controls[f"attachment {number}"].value = attachment.holds
+        controls["link"].value = f"{self._address}{'&' if '?' in self._address else '?'}{link.write(self.stage)}"
         self.plots.draw(frames[: self.moment + 1])

@@ -33,4 +33,5 @@ PRESETS: dict[str, Preset] = {
         changes={"gravity": GRAVITY, "fabric": "denim", "integrator": "semi_implicit_euler", "self_collision": "off", "substeps": 4}
     ),
     "silk and denim": Preset(scene="flag", changes={"wind": 5.0, "gust": 1.5}, compared=("silk", "denim")),
+    "race": Preset(scene="race"),
 }

@@ -12,7 +12,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from clothgym import policies
 from clothgym.adapters import runs
 from clothgym.checks import known
-from clothgym.playground.access import MOST_VISITS, Access, is_loopback
+from clothgym.playground import race
+from clothgym.playground.access import ASKED, MOST_VISITS, Access, is_loopback
 from clothgym.playground.episode import EpisodeStage, Policy, Replay
 from clothgym.playground.page import Page
 from clothgym.playground.recording import Recording
@@ -53,7 +54,14 @@ class Gallery:
         actor: str = "expert",
     ) -> None:
         self.recording, self.policies, self.actor = recording, policies or {}, actor
-        self.titles = {title: name for name, title in TITLES.items()} | {env_id: env_id for env_id in ENVIRONMENTS}
+        self.titles = {title: name for name, title in TITLES.items()} | {race.TITLE: race.RACE}
+        learned = available()
+        for env_id in ENVIRONMENTS:
+            self.titles[env_id] = env_id
+            # a committed policy in one click
+            for learner in learned.get(env_id, ()):
+                if f"learned, {learner}" in committed_policies(env_id):
+                    self.titles[f"{env_id}, {learner}"] = f"{env_id}/{learner}"
         if recording is not None:
             self.titles = {f"recording of {recording.title}": REPLAY} | self.titles
 
@@ -81,24 +89,34 @@ class Gallery:
             return Replay(self.recording, REPLAY)
         if name in SCENES:
             return SceneStage(name)
-        own = self.policies.get(name, {})
-        return EpisodeStage(name, {**committed_policies(name), **own}, next(iter(own), self.actor))
+        if name == race.RACE:
+            return race.Race(committed_policies(race.TASK))
+        env_id, _, learner = name.partition("/")
+        own = self.policies.get(env_id, {})
+        actor = f"learned, {learner}" if learner else next(iter(own), self.actor)
+        return EpisodeStage(env_id, {**committed_policies(env_id), **own}, actor, name=name)
 
 
 class Visit:
-    """One visitor's page and the thread that it lives in, until they leave."""
+    """One visitor's page and the thread that it lives in, until they leave.
 
-    def __init__(self, client: Any, gallery: Gallery, start: str) -> None:
+    asked: query of the page's address; address: of the page, for its link.
+    """
+
+    def __init__(self, client: Any, gallery: Gallery, start: str, asked: str = "", address: str = "") -> None:
         self.page: Page | None = None
         self.frames = 0
         self.closed = threading.Event()
         self._client, self._gallery, self._start = client, gallery, start
+        self._asked, self._address = asked, address
         self.thread = threading.Thread(target=self._live, name=f"visit {client.client_id}", daemon=True)
         self.thread.start()
 
     def _live(self) -> None:
         try:
-            self.page = Page(self._client, self._gallery.open, self._gallery.titles, self._start, self.closed.is_set)
+            self.page = Page(
+                self._client, self._gallery.open, self._gallery.titles, self._start, self.closed.is_set, self._asked, self._address
+            )
             due = time.monotonic()
             while not self.closed.is_set():
                 self.page.tick()
@@ -158,7 +176,7 @@ class Playground:
         if self._busy() >= MOST_VISITS:  # several came at once
             client.add_notification("The playground is full", f"It has {MOST_VISITS} visitors. Try again later.", color="orange")
             return
-        self.visits[client.client_id] = Visit(client, self.gallery, self.start)
+        self.visits[client.client_id] = Visit(client, self.gallery, self.start, ASKED.get(), self.url)
 
     async def _go(self, client: Any) -> None:
         visit = self.visits.pop(client.client_id, None)
@@ -197,10 +215,17 @@ def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[s
     return start, found
 
 
+@cache
+def available() -> dict[str, list[str]]:
+    """The learners of committed policies, by environment id."""
+    return policies.available()
+
+
+@cache
 def committed_policies(env_id: str) -> dict[str, Policy]:
     """The policies that come with the project, by name; without those that pick and place, in steps too long to watch."""
     found: dict[str, Policy] = {}
-    for learner in policies.available().get(env_id, []):
+    for learner in available().get(env_id, []):
         policy = policies.load(env_id, learner)
         # a sheet settles before the visitor's eyes
         kwargs = {name: value for name, value in policy.about["env_kwargs"].items() if name != "settling"}

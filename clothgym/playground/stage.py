@@ -69,6 +69,11 @@ class Stage:
         return self.recording.frames[-1]
 
     @property
+    def saying(self) -> str:
+        """What stands over the sheets: why one has burst, or how an episode ended."""
+        return self.notes.get("burst", "") or self.notes.get("evaluation", "")
+
+    @property
     def over(self) -> bool:
         """Whether nothing more happens until a reset."""
         return False
@@ -362,15 +367,24 @@ class SceneStage(Stage):
             pin for pin in np.flatnonzero(sheet.hand.held)
             if pin != hands.HAND and np.linalg.norm(sheet.hand.goals[pin] - where) < hands.CLICK
         ]  # fmt: skip
-        loose = next((k for k, p in enumerate(sheet.simulation.anchors) if p == particle), None)
-        for one in self.sheets:
-            if near:
-                one.hand.let_go(int(near[0]))
-            elif loose is None:
-                free = np.flatnonzero(~one.hand.held[1:])
-                one.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
-        if loose is not None and not near:
-            self.hold(loose, True)
+        for one in self.sheets if near else ():
+            one.hand.let_go(int(near[0]))
+        if not near:
+            self.pin_particle(particle)
+
+    def pin_particle(self, particle: int) -> None:
+        """Pin a particle of all sheets where it is, with the scene's own anchor where it has one.
+
+        Raises:
+            ValueError: there is no such particle.
+        """
+        indices("pins", [particle], self.scene.mesh.num_particles, "the particles of this sheet")
+        own_anchor = next((k for k, first in enumerate(self.sheets[0].simulation.anchors) if first == particle), None)
+        if own_anchor is not None:
+            return self.hold(own_anchor, True)
+        for sheet in self.sheets:
+            free = np.flatnonzero(~sheet.hand.held[1:])
+            sheet.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
 
     def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
         seen = self._seen(origin, direction)
