@@ -27,8 +27,8 @@ from clothgym.playground.server import LOOPBACK, serve  # noqa: E402
 DEADLINE = 90.0  # seconds for what is waited for: kernels may have to be compiled, beside other tests
 REBOUND = "--host-resolver-rules=MAP evil.example 127.0.0.1"
 FLAGS = [REBOUND, "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]
-# another library's word on its own dependency
-KNOWN = ("THREE.Clock",)
+# other libraries' words on their own dependencies
+KNOWN = ("THREE.Clock", "Unable to preventDefault inside passive event listener")
 
 
 def until(what, deadline=DEADLINE):
@@ -87,7 +87,7 @@ def second_browser():
 class Visitor:
     """A tab, the server's side of it, and what the console said."""
 
-    def __init__(self, playground, browser, width=1000, height=620):
+    def __init__(self, playground, browser, width=1000, height=620, query=""):
         known = set(playground.visits)
         self.said, self.asked = [], []
         self.tab = browser.new_page()
@@ -95,9 +95,9 @@ class Visitor:
         self.tab.on("console", lambda message: self.said.append((message.type, message.text)))
         self.tab.on("pageerror", lambda error: self.said.append(("error", str(error))))
         self.tab.on("request", lambda request: self.asked.append(request.url))
-        self.tab.goto(playground.url, timeout=1e3 * DEADLINE)
+        self.tab.goto(playground.url + "/" * bool(query) + query, timeout=1e3 * DEADLINE)
         self.visit = until(lambda: self._arrived(playground, known))
-        self.tab.get_by_text("gravity m/s²").wait_for(timeout=1e3 * DEADLINE)
+        self.tab.get_by_text("gravity m/s²").first.wait_for(state="attached", timeout=1e3 * DEADLINE)
 
     def _arrived(self, playground, known):
         self.tab.wait_for_timeout(20)
@@ -134,9 +134,26 @@ class Visitor:
         self.box(label).click()
         self.tab.get_by_role("option", name=option, exact=True).click()
 
+    def drawn(self):
+        """Wait until the browser has drawn what has been sent."""
+        frames = (
+            "() => new Promise(done => { let n = 0; (function next() { n++ < 3 ? requestAnimationFrame(next) : done(); })(); })"
+        )
+        self.tab.evaluate(frames)
+
+    def on_screen(self, place):
+        """Where a position [m] is seen in the window [pixels]."""
+        camera, box = self.page.client.camera, self.tab.locator("canvas").first.bounding_box()
+        eye, ahead = np.array(camera.position), np.subtract(camera.look_at, camera.position)
+        ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(ahead, (0, 0, 1)) / np.linalg.norm(np.cross(ahead, (0, 0, 1)))
+        away, scale = (place - eye) @ ahead, box["height"] / 2 / np.tan(camera.fov / 2)
+        across, up = scale * ((place - eye) @ right) / away, scale * ((place - eye) @ np.cross(right, ahead)) / away
+        return box["x"] + box["width"] / 2 + across, box["y"] + box["height"] / 2 - up
+
     def picture(self):
-        """What the middle of the window shows, between the panels, (height, width, 3)."""
-        clip = {"x": 280, "y": 190, "width": 370, "height": 420}
+        """What the window shows beside the panel, (height, width, 3)."""
+        clip = {"x": 0, "y": 120, "width": 640, "height": 480}
         return iio.imread(self.tab.screenshot(clip=clip), extension=".png")[:, :, :3].astype(int)
 
 
@@ -154,50 +171,134 @@ def test_it_loads_from_this_machine_alone_without_an_error_in_the_console(visito
     assert not outside
 
 
+def test_the_page_has_its_own_title_and_icon_and_opens_alive_with_five_controls_in_sight(visitor):
+    assert visitor.tab.title() == "clothgym"
+    icon = visitor.tab.locator('link[rel="icon"]').get_attribute("href")
+    assert "ce4032" in icon and "ec1c24" not in icon  # coral gingham, not the library's logo
+    x = visitor.stage.frame.positions[0]
+    visitor.until(lambda: np.abs(visitor.stage.frame.positions[0] - x).max() > 0.01)
+    for label in ("scene", "gravity m/s²", "wind m/s", "fabric", "integrator"):
+        assert visitor.box(label).is_visible()
+    for label in ("gusts m/s", "substeps", "seed", "color by"):
+        assert not visitor.tab.get_by_text(label, exact=True).first.is_visible()
+
+
 def test_the_gravity_slider_moves_the_cloth_and_its_pins_stay_to_the_last_bit(visitor):
     start, pins = visitor.stage.recording.frames[0].positions[0], list(visitor.stage.scene.anchors)
-    assert np.abs(visitor.stage.frame.positions[0] - start).max() < 1e-6
     before = visitor.picture()
     visitor.set_number("gravity m/s²", 9.81)
-    visitor.until(lambda: visitor.stage.frame.positions[0, :, 2].min() < 0.5)
+    visitor.until(lambda: visitor.stage.frame.positions[0, :, 2].min() < 0.35)
     assert np.array_equal(visitor.stage.frame.positions[0][pins], start[pins])
-    # the sheet has left where it lay flat, seen from above, and hangs where there was floor; the rest of the room is as it was
-    visitor.until(lambda: np.mean(np.abs(visitor.picture() - before).max(axis=2) > 25) > 0.1)
-    after = visitor.picture()
-    assert np.mean(np.abs(after - before).max(axis=2)[-40:] > 40) < 0.05
+    visitor.until(lambda: np.mean(np.abs(visitor.picture() - before).max(axis=2) > 25) > 0.05)
 
 
-def test_the_most_strained_thread_that_the_page_names_is_the_cores(visitor):
-    visitor.tab.get_by_text("play / pause").click()
+def test_the_stretch_that_the_page_reads_is_the_cores_and_the_threads_there_light_up(visitor):
+    visitor.page.order("press", "play / pause")
     visitor.until(lambda: not visitor.page.playing)
     s, mesh = visitor.stage.sheets[0].simulation, visitor.stage.scene.mesh
     strain = s.strain()[0]
-    # the sheet is symmetric: several are the most strained, but for rounding
-    most = mesh.springs.particles[mesh.springs.kind < 3][strain > strain.max() - 2e-5]
-    named = [visitor.tab.get_by_role("cell", name=f"{i} to {j}", exact=True) for i, j in most]
-    visitor.until(lambda: sum(cell.count() for cell in named) == 1)
-    visitor.until(lambda: visitor.tab.get_by_role("cell", name=f"{100 * strain.max():.2f} %", exact=True).count() == 1)
-    # what was sent to the browser is red where the core is most strained
-    node = visitor.page.show._yarns[0]
-    springs = yarns(mesh)
-    loud = np.argsort(strain)[-6:]
-    assert np.array_equal(node.points[loud], s.positions[0][mesh.springs.particles[springs[loud]]])
-    assert np.all(node.colors[loud, :, 0] > 150) and np.all(node.colors[loud, :, 1] < 40)
-    visitor.tab.get_by_text("play / pause").click()
+    visitor.tab.get_by_text(f"{100 * strain.max():.2f} %", exact=True).first.wait_for(timeout=1e3 * DEADLINE)
+    # what was sent to the browser is drawn, and is red, where the core is most strained
+    node, springs = visitor.page.show.threads[0], yarns(mesh)
+    loud, idle = np.argsort(strain)[-6:], strain < 0.2 * strain.max()
+    drawn = np.linalg.norm(node.points[:, 1] - node.points[:, 0], axis=1)
+    ends = s.positions[0][mesh.springs.particles[springs[loud]]]
+    assert np.linalg.norm(node.points[loud] - ends, axis=2).max() < 0.0031 and not drawn[idle].any()
+    assert np.all(node.colors[loud, :, 0] > 150) and np.all(node.colors[loud, :, 1] < 130)
+    visitor.page.order("press", "play / pause")
+
+
+def test_the_cloth_is_grabbed_thrown_and_pinned_with_the_mouse(visitor):
+    visitor.page.order("preset", "start again")
+    visitor.until(lambda: visitor.stage.settings.gravity == 0 and visitor.stage.frame.time > 0.2)
+    particle, mouse = 144, visitor.tab.mouse
+
+    def now():
+        return visitor.stage.frame.positions[0, particle].astype(float)
+
+    # a sheet that stands still, so that it is where the browser draws it
+    visitor.page.order("press", "play / pause")
+    visitor.until(lambda: not visitor.page.playing)
+    visitor.drawn()
+    across, down = visitor.on_screen(now())
+    place = now()
+    mouse.move(across, down)
+    mouse.down()
+    for step in range(1, 9):
+        mouse.move(across, down - 10 * step)
+    hand = visitor.stage.sheets[0].hand
+    visitor.until(lambda: hand.held[0] or visitor.page._orders.qsize())
+    visitor.page.order("press", "play / pause")
+    visitor.until(lambda: hand.held[0] and hand.goals[0, 2] > place[2] + 0.05)
+    visitor.until(lambda: now()[2] > place[2] + 0.04)
+    held = int(
+        np.argmin(((visitor.stage.sheets[0].simulation.grippers.positions[0, 0] - visitor.stage.frame.positions[0]) ** 2).sum(1))
+    )
+    assert np.abs(np.subtract(divmod(held, 17), divmod(particle, 17))).max() <= 1  # the mouse had the thread that was under it
+    mouse.move(across, down - 160)
+    mouse.up()
+    visitor.until(lambda: not hand.held.any())
+    # thrown: it rises beyond where it was let go, and comes back
+    visitor.until(lambda: visitor.stage.frame.positions[0, held, 2] < place[2] + 0.05)
+    visitor.page.order("press", "play / pause")
+    visitor.until(lambda: not visitor.page.playing)
+    visitor.drawn()
+    mouse.click(*visitor.on_screen(now()))
+    visitor.until(lambda: hand.held[1:].any())
+    (pinned,) = visitor.stage.pinned()
+    assert np.linalg.norm(pinned - now()) < 0.08
+    visitor.page.order("press", "play / pause")
+
+
+def test_a_race_is_run_with_the_mouse_and_judged(visitor):
+    visitor.page.order("preset", "race")
+    visitor.until(lambda: visitor.stage.name == "race")
+    race, mouse = visitor.stage, visitor.tab.mouse
+    visitor.drawn()
+    assert race.frame.time == 0  # time waits for the visitor
+    start = race.frame.positions[0, 16 * 17 + 8 - 4 * 17].astype(float)
+    across, down = visitor.on_screen(start)
+    mouse.move(across, down)
+    mouse.down()
+    for step in range(1, 9):
+        mouse.move(across + 12 * step, down - 6 * step)
+    visitor.until(lambda: race.frame.time > 0.3)
+    moved = np.mean([one.position for one in race.mine.attachments()], axis=0) - race.mine.recording.frames[0].positions[0].mean(
+        axis=0
+    )
+    assert moved[1] > 0.05
+    mouse.up()
+    visitor.tab.get_by_role("button", name="Let go").click()
+    visitor.until(lambda: race.over)
+    assert "Yours: Evaluated" in race.notes["evaluation"] and race.theirs.info["normalized_performance"] > 0.5
+    visitor.tab.get_by_text("Yours: Evaluated").first.wait_for(timeout=1e3 * DEADLINE)
+
+
+def test_a_link_opens_the_page_with_its_settings_and_a_phone_shows_the_sheet_alone(playground, chromium):
+    other = Visitor(playground, chromium, 390, 844, "?scene=sphere&gravity=2.5&fabric=silk")
+    assert other.stage.name == "sphere" and (other.stage.settings.gravity, other.stage.settings.fabric) == (2.5, "silk")
+    other.until(lambda: not other.tab.get_by_text("gravity m/s²").first.is_visible())
+    box = other.tab.locator("canvas").first.bounding_box()
+    assert (box["width"], box["height"]) == (390, 844)
+    assert not [text for kind, text in other.said if kind == "error" and not text.startswith(KNOWN)]
+    other.tab.close()
 
 
 def test_menus_switch_the_integrator_and_the_colors(visitor):
+    visitor.page.order("open", "Pinned patch")
+    visitor.until(lambda: visitor.stage.name == "patch")
     visitor.choose("integrator", "verlet")
     visitor.until(lambda: visitor.stage.sheets[0].simulation.integrator.name == "verlet")
-    visitor.tab.get_by_text("verlet", exact=True).first.wait_for(timeout=1e3 * DEADLINE)
-    dark = visitor.picture()
-    visitor.choose("color by", "fabric")
+    visitor.drawn()
+    red = visitor.picture()
+    visitor.tab.get_by_text("Hands and colors").click()
+    visitor.choose("color by", "strain")
 
-    def reddish():
-        red = visitor.picture() - dark
-        return np.mean((red[:, :, 0] > 50) & (red[:, :, 0] > red[:, :, 2] + 30)) > 0.05
+    def darker():
+        gone = red - visitor.picture()
+        return np.mean((gone[:, :, 0] > 50) & (gone[:, :, 0] > gone[:, :, 2] + 30)) > 0.02
 
-    visitor.until(reddish)
+    visitor.until(darker)
 
 
 def test_two_visitors_have_a_cloth_each_and_a_killed_browser_leaves_the_server_well(playground, visitor):
@@ -207,8 +308,9 @@ def test_two_visitors_have_a_cloth_each_and_a_killed_browser_leaves_the_server_w
         frames = len(visitor.stage.recording.frames)
         assert other.stage is not visitor.stage
         other.until(lambda: len(other.stage.recording.frames) > 5)
-        assert np.abs(other.stage.frame.positions[0] - other.stage.scene.start).max() < 1e-6
-        assert np.abs(visitor.stage.frame.positions[0] - visitor.stage.scene.start).max() > 0.1
+        visitor.page.order("change", {"gravity": 9.81})
+        visitor.until(lambda: visitor.stage.frame.positions[0, :, 2].min() < 0.4)
+        assert other.stage.settings.gravity == 0 and other.stage.frame.positions[0, :, 2].min() > 0.5
         thread = other.visit.thread
         os.killpg(process.pid, signal.SIGKILL)
         until(lambda: other.visit not in playground.visits.values())

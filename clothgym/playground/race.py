@@ -21,13 +21,14 @@ TITLE = f"Race a policy at {TASK}"
 YOU = "you"
 SLOWLY = 2.0  # times slower than time itself: the task gives a hand two seconds
 APART = 0.95  # between the lanes [m]
-CAMERA = Camera(eye=(2.6, -0.25, 1.75), target=(0.0, -0.12, 0.12), vertical_fov=34.0)  # beside both lanes: the way is to the right
+CAMERA = Camera(eye=(2.35, -1.55, 1.4), target=(0.05, -0.2, 0.26), vertical_fov=33.0)  # the way is to the right
 
 
 class Race(Stage):
     """Two environments with the same seed, the visitor's in front.
 
-    Time passes while the visitor drags their sheet, and when they have let go of it: ``drop``.
+    Time passes while the visitor drags their sheet, and when they have let go of it: ``drop``.  A pointer moves in the plane of
+    the screen, so the visitor says how far and how high; sideways the lane leads the sheet to the middle of the target.
 
     Args:
         policies: what is raced against, by name; the first one at first.
@@ -91,11 +92,17 @@ class Race(Stage):
 
     def grab(self, place: ArrayLike) -> None:
         self._pulled = True
-        self.mine.grab_these(self._holding, within_view(vector("place", place)) - self._offsets[0])
+        self._from = within_view(vector("place", place)) - self._offsets[0]
+        self.mine.grab_these(self._holding, self._from)
+        held = [attachment.position for attachment in self.mine.attachments()]
+        self._way = self.mine.env.task.episode["top"][0] - np.mean(held, axis=0)
 
     def pull(self, place: ArrayLike) -> None:
         if self._pulled:
-            self.mine.pull(within_view(vector("place", place)) - self._offsets[0])
+            where = within_view(vector("place", place)) - self._offsets[0]
+            share = np.clip((where[1] - self._from[1]) / max(self._way[1], 0.01), 0.0, 1.0)
+            where[0] = self._from[0] + share * self._way[0]
+            self.mine.pull(where)
 
     def let_go(self) -> None:
         """The visitor's pointer lets go: the sheet is still held where it is."""

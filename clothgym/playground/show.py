@@ -124,7 +124,7 @@ class Show:
             nodes = self._solids[shape]
             if used[shape] == len(nodes):
                 mesh = shape.mesh()
-                name = f"/solids/{len(self._solids)}_{len(nodes)}"
+                name = f"/solids/{sum(map(len, self._solids.values()))}"
                 nodes.append(
                     self.scene.add_mesh_simple(
                         name, mesh.positions - INSET * mesh.normals, mesh.triangles, color=solid.color, flat_shading=False
