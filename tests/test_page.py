@@ -91,13 +91,15 @@ class Visitor:
         known = set(playground.visits)
         self.said, self.asked = [], []
         self.tab = browser.new_page()
+        self.tab.set_default_timeout(1e3 * DEADLINE)
         self.tab.set_viewport_size({"width": width, "height": height})
         self.tab.on("console", lambda message: self.said.append((message.type, message.text)))
         self.tab.on("pageerror", lambda error: self.said.append(("error", str(error))))
         self.tab.on("request", lambda request: self.asked.append(request.url))
         self.tab.goto(playground.url + "/" * bool(query) + query, timeout=1e3 * DEADLINE)
         self.visit = until(lambda: self._arrived(playground, known))
-        self.tab.get_by_text("gravity m/s²").first.wait_for(state="attached", timeout=1e3 * DEADLINE)
+        # a phone does not show the controls at first
+        self.tab.get_by_text("gravity m/s²" if width > 576 else "clothgym").first.wait_for(timeout=1e3 * DEADLINE)
 
     def _arrived(self, playground, known):
         self.tab.wait_for_timeout(20)

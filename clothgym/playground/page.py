@@ -220,7 +220,7 @@ class Page:
             self.open(name)
 
     def _preset(self, label: str) -> None:
-        preset = PRESETS.get(label)
+        preset = PRESETS.get(label) if isinstance(label, str) else None
         if preset is None:  # only a browser of a stranger sends this
             return
         if label == AGAIN:
