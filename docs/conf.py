@@ -71,7 +71,7 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         text = re.sub(r"\]\((?!\w+:|#)", f"]({folders}../", text)
     text = re.sub(r"\]\((?:\.\./)+docs/", f"]({folders}", text)
     for place, name in {**OF_THE_ROOT, "index": "README.md"}.items():
-        text = text.replace(f"]({folders}../{name})", f"]({folders}{place}.md)")
+        text = re.sub(rf"\]\({folders}\.\./{re.escape(name)}(#[\w-]+)?\)", f"]({folders}{place}.md)", text)
     if page == "peers":
         readme = (ROOT / "README.md").read_text()
         table = re.search(r"^## Beside other projects\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
@@ -86,8 +86,9 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         text += "\n".join(["", "```{toctree}", ":hidden:", "", *ENVIRONMENTS, "```", ""])
     if page == "api/commands":
         text += help_of_commands()
-    # a folder of the repository is no page
-    source[0] = re.sub(r"\[([^\]]+)\]\(((?:\.\./)+[\w/]+)\)", r"\1", text)
+    # the demo is a page that Sphinx does not know; folders and other texts of the repository are no pages
+    text = re.sub(r"\[([^\]]+)\]\(((?:\.\./)*demo/index\.html)\)", r'<a href="\2">\1</a>', text)
+    source[0] = re.sub(rf"\[([^\]]+)\]\({folders}\.\./[\w/]+(?:\.md)?\)", r"\1", text)
 
 
 def help_of_commands() -> str:

@@ -62,11 +62,12 @@ def test_pages_have_what_is_elsewhere_in_the_repository(scripts, monkeypatch, tm
     assert all(f"\n{env_id}\n" in prepared("tasks/README") for env_id in ENVIRONMENTS)
     said = prepared("api/commands", "")
     assert all(f"\n{name}\n---" in said for name in ("view", "export", "bench")) and "--integrators NAME" in said
-    # a folder is no page, a file is; places for pages are kept where these are
-    assert (
-        prepared("learning", "[a](../training/hyperparams) [b](../LICENSE.txt) [c](../README.md)")
-        == "a [b](../LICENSE.txt) [c](index.md)"
-    )
+    # folders and other texts of the repository are no pages, files are downloads, and the demo is a page of its own
+    links = "[a](../training/hyperparams) [b](../CITATION.cff) [c](../README.md#train) [d](../CODE.md)"
+    assert prepared("learning", links) == "a [b](../CITATION.cff) [c](index.md) d"
+    links = "[a](../demo/index.html) [b](../physics.md) [c](../../envs/drape.py)"
+    assert prepared("tasks/x", links) == '<a href="../demo/index.html">a</a> [b](../physics.md) [c](../../envs/drape.py)'
+    # places for pages are kept where these are
     assert prepared("index", "phys*\nnone*\n<!-- demo -->") in ("phys*\n<!-- demo -->", "phys*\n" + conf.LINK_TO_DEMO)
     monkeypatch.setattr(conf, "DEMO", tmp_path / "index.html")
     (tmp_path / "index.html").touch()
