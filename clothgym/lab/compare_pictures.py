@@ -85,17 +85,17 @@ def draw_work_precision(results: Row, path: Path) -> None:
 
 
 def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting, Row, NDArray | None]], path: Path) -> None:
-    """Draw the reference, and the sheet of each integrator in its color.  An unstable one gets an empty picture.
+    """Draw the reference, and the sheet of each integrator in its color; an unstable one as it bursts, from above.
 
-    reference, sheets: positions [m], (particles, 3).
+    reference, sheets: positions [m], (particles, 3); None for an unstable one of an older record.
     """
     plt = pyplot()
     labels, pictures = ["converged reference\n"], [_picture(scene, reference, REFERENCE)]
     for setting, row, sheet in sheets:
-        outcome = f"{row['error_mm']:.3g} mm off" if row["stable"] else "unstable"
+        outcome = f"{row['error_mm']:.3g} mm off" if row["stable"] else "bursts"
         detail = setting.variant or f"{setting.substeps} substeps"
         labels.append(f"{setting.integrator}\n{detail}, {outcome}")
-        pictures.append(_picture(scene, sheet if sheet is not None else None, INTEGRATORS[setting.integrator].color))
+        pictures.append(_picture(scene, sheet, INTEGRATORS[setting.integrator].color, burst=not row["stable"]))
     across = min(ACROSS, len(pictures))
     down = -(-len(pictures) // across)
     figure = plt.figure(figsize=(across * PANEL / DPI, down * (PANEL + 52) / DPI), facecolor="white")
@@ -116,14 +116,14 @@ def draw_sheets(scene: Scene, reference: NDArray, sheets: Sequence[tuple[Setting
     plt.close(figure)
 
 
-def _picture(scene: Scene, sheet: NDArray | None, color: str) -> NDArray[np.uint8]:
-    """A sheet above the floor, or the floor alone, (PANEL, PANEL, 3)."""
+def _picture(scene: Scene, sheet: NDArray | None, color: str, burst: bool = False) -> NDArray[np.uint8]:
+    """A sheet above the floor, or the floor alone, (PANEL, PANEL, 3); one that has burst as a whole, from above."""
     front = tuple(int(color[place : place + 2], 16) for place in (1, 3, 5))
     back = tuple(round(0.6 * value) for value in front)
     renderer = Renderer(
         scene.mesh.triangles,
         scene.mesh.rest_positions[:, :2],
-        Camera(eye=scene.eye, target=scene.target),
+        _above(sheet, scene) if burst and sheet is not None else Camera(eye=scene.eye, target=scene.target),
         PANEL,
         PANEL,
         antialias=3,
@@ -136,3 +136,17 @@ def _picture(scene: Scene, sheet: NDArray | None, color: str) -> NDArray[np.uint
         return renderer.rgb(np.full_like(scene.mesh.rest_positions, -9.0))  # far below the floor
     pins = [(tuple(sheet[p]), (43, 45, 66)) for p in scene.held if len(scene.held) <= 4]
     return renderer.rgb(sheet, markers=pins)  # type: ignore[arg-type]
+
+
+def _above(sheet: NDArray, scene: Scene) -> Camera:
+    """A camera that sees all of a sheet obliquely from above, from the side of the scene's own."""
+    middle = (sheet.min(axis=0) + sheet.max(axis=0)) / 2
+    radius = float(np.linalg.norm(sheet - middle, axis=1).max())
+    side = np.subtract(scene.eye, scene.target)[:2]
+    way = np.append(side / np.linalg.norm(side), 1.1)
+    distance = 3.2 * radius
+    return Camera(
+        eye=tuple(middle + distance * way / np.linalg.norm(way)),
+        target=tuple(middle),
+        vertical_fov=2 * float(np.degrees(np.arcsin(radius / distance))),
+    )

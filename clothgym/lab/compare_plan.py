@@ -35,6 +35,12 @@ class Setting(NamedTuple):
     def simulation(self, scene: Scene, num_envs: int = 1) -> Simulation:
         return scene.simulation({"name": self.integrator, **self.options}, self.substeps, self.variant, num_envs)
 
+    def in_substeps(self, scene: Scene) -> Simulation:
+        """The same, each of whose steps is one of these substeps."""
+        return scene.simulation(
+            {"name": self.integrator, **self.options}, 1, self.variant, time_step=scene.seconds / scene.frames / self.substeps
+        )
+
 
 class Plan(NamedTuple):
     """A scene and the integrators to try on it.  With ``quick``, fewer settings are tried."""

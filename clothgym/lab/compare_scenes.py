@@ -92,8 +92,9 @@ class Scene:
         variant: str = "",
         num_envs: int = 1,
         dtype: str = "float32",
+        time_step: float = FRAME,
     ) -> Simulation:
-        """The scene at its start, in vacuum and on one thread."""
+        """The scene at its start, in vacuum and on one thread; ``time_step`` is that of its substeps together [s]."""
         model: dict[str, Any] = {"bending": self.bending} | (dict(self.variants[variant]) if variant else {})
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # substeps beyond a method's stability bound are part of the comparison
@@ -102,7 +103,7 @@ class Scene:
                 self.material,
                 num_envs,
                 integrator,
-                FRAME,
+                time_step,
                 substeps,
                 gravity=(0, 0, -self.gravity),
                 air_density=0,
