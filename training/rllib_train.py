@@ -259,7 +259,7 @@ def build(args: Args, env_kwargs: dict[str, Any], done: int) -> Any:
         num_env_runners=args.runners, num_envs_per_env_runner=config["num_envs"] // runners,
         num_cpus_per_env_runner=args.cpus_per_runner, gym_env_vectorize_mode="vector_entry_point",
         rollout_fragment_length=given["n_steps"],
-        sample_timeout_s=None,  # a runner may be slow; one that is lost is reported by Ray
+        sample_timeout_s=600.0,  # a runner may be slow; one that is lost is mostly reported by Ray long before
     )  # fmt: skip
     made.learners(num_learners=args.learners)
     made.training(
@@ -274,6 +274,7 @@ def build(args: Args, env_kwargs: dict[str, Any], done: int) -> Any:
     made.fault_tolerance(
         restart_failed_env_runners=True, num_consecutive_env_runner_failures_tolerance=10**6,
         env_runner_health_probe_timeout_s=1.0,  # each iteration waits so long for a runner that is not back
+        env_runner_restore_timeout_s=60.0,  # and so long for one that is back to take the network: it may be lost again
     )  # fmt: skip
     made.callbacks(on_episode_end=note_success).debugging(seed=seed, log_level="ERROR")
     return made.build_algo()
@@ -315,7 +316,10 @@ def cluster(args: Args) -> Iterator[None]:
         here = (
             {"num_cpus": max(args.runners * args.cpus_per_runner + args.learners, 1), "include_dashboard": False} if local else {}
         )
-        ray.init(address=args.address, logging_level="ERROR", log_to_driver=False, **here)
+        try:
+            ray.init(address=args.address, logging_level="ERROR", log_to_driver=False, **here)
+        except Exception as error:  # a bare one, if it has not started within half a minute
+            raise OSError(f"Ray: {error}") from error
     try:
         yield
     except ray.exceptions.RayError as error:
