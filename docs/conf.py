@@ -77,9 +77,6 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         table = re.search(r"^## Beside other projects\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
         assert table, "README.md has no table of other projects"
         text = text.replace("\n## ", f"\n{table[1]}\n## ", 1)
-    if page == "index":
-        # places in the table of contents for pages that there may be
-        text = re.sub(r"^(\w+\*)\n", lambda place: place[0] if any(HERE.glob(f"{place[1]}.md")) else "", text, flags=re.MULTILINE)
     if page == "index" and DEMO.exists():
         text = text.replace("<!-- demo -->", LINK_TO_DEMO)
     if page == "tasks/README":

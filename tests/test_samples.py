@@ -88,7 +88,9 @@ def test_the_reference_has_every_public_name():
         | {f"envs.{name}" for name in clothgym.envs.__all__}
         | {f"render.{name}" for name in clothgym.render.__all__}
     )
-    public |= {f"policies.{name}" for name in ("load", "available", "read", "Policy")} | {"adapters.sb3.make_sb3_vec_env"}
+    public |= {f"policies.{name}" for name in ("load", "available", "read", "Policy")} | {
+        f"adapters.{name}" for name in ("sb3.make_sb3_vec_env", "lagrange.LagrangianPPO", "pixels.DepthPolicy")
+    }
     assert public <= described, sorted(public - described)
     for env_id, (name, _) in ENVIRONMENTS.items():
         assert f"clothgym.envs.{name}Env(" in text and f"</tasks/{env_id}>" in text

@@ -182,13 +182,14 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
         "policy": f"{label}{_old(all(is_present(row, digests) for row in rows))}",
         "seeds": str(len(rows)),
         "success": f"{interquartile_mean(rates):.3f} [{low:.3f}, {high:.3f}]",
-        "median": f"{statistics.median(rates):.3f}",
-        "worst": f"{min(rates):.3f}",
+        "median": f"{statistics.median(rates):.3f}" if len(rows) > 1 else "",
+        "worst": f"{min(rates):.3f}" if len(rows) > 1 else "",
         "performance": f"{statistics.median(row['normalized_performance'] for row in rows):.3f}",
         "cost": f"{statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else "",
         "safe": f"{statistics.median(row['safe_success_rate'] for row in rows):.3f}" if "cost" in rows[0] else "",
         "torn / diverged": _counts(rows),
-        "steps": f"{steps / 1e6:.2f} M",
+        # a clone's samples are no steps of its own
+        "steps": f"{steps / 1e6:.2f} M" if steps else "",
         "training": f"{_minutes(rows):.1f} min of one core{_collecting(rows)}",
     }
 
@@ -265,7 +266,8 @@ def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
             _draw_seeds(panels[row, column], [[(line[key] / unit, line[what]) for line in seed] for seed in seeds], color, label)
         panels[row, column].spines[["top", "right"]].set_visible(False)
         panels[row, column].set(xlim=(0, None))
-    panels[0, 0].set(ylabel="success", ylim=(0, 1.02), title=env_id)
+    figure.suptitle(env_id, fontsize=11)
+    panels[0, 0].set(ylabel="success", ylim=(0, 1.02))
     if "cost" in shown:
         # an untrained policy's cost of 100 and the limit of 0.3 are both to be seen
         panels[1, 0].set_yscale("symlog", linthresh=1.0)
@@ -274,7 +276,7 @@ def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
         )
     for panel, text in zip(panels[-1], ("environment steps [millions]", "training time [minutes of one core]")):
         panel.set(xlabel=text)
-    panels[0, 1].legend(frameon=False, fontsize=8, loc="lower right")
+    figure.legend(*panels[0, 1].get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower center", ncols=3)
     picture = io.BytesIO()
     # without the version in it the same curves make the same file; by what is drawn a check knows it
     figure.savefig(picture, dpi=110, metadata={"Software": None, "Comment": drawn_from(env_id, results)})
@@ -288,12 +290,15 @@ def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, 
     # (seeds, evaluations, 2)
     points = np.array([seed[:common] for seed in seeds])
     if common == 1:
-        panel.plot(*points[:, 0].T, ls="", marker="o", ms=4, color=color, label=label)
+        panel.plot(*points[:, 0].T, ls="", marker="o", ms=4, color=color, label=f"{label} ({len(seeds)})", clip_on=False, zorder=5)
         return
     for curve in points:
         panel.plot(*curve.T, color=color, lw=0.7, alpha=0.5)
     middle = np.median(points, axis=0)
-    panel.fill_between(middle[:, 0], points[:, :, 1].min(axis=0), points[:, :, 1].max(axis=0), color=color, alpha=0.15, lw=0)
+    # from the lowest to the highest of all seeds at each moment at which all of them were learning
+    moments = np.linspace(points[:, 0, 0].max(), points[:, -1, 0].min(), 100)
+    between = [np.interp(moments, *curve.T) for curve in points]
+    panel.fill_between(moments, np.min(between, axis=0), np.max(between, axis=0), color=color, alpha=0.15, lw=0)
     panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=f"{label} ({len(seeds)})")
 
 

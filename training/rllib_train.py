@@ -20,7 +20,7 @@ import re
 import time
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -323,7 +323,7 @@ def cluster(args: Args) -> Iterator[None]:
     try:
         yield
     except ray.exceptions.RayError as error:
-        raise OSError(f"Ray: {str(error).strip().splitlines()[-1]}") from error
+        raise OSError(f"Ray: {(str(error).strip() or type(error).__name__).splitlines()[-1]}") from error
     finally:
         ray.shutdown()
 
@@ -385,6 +385,16 @@ def learn(args: Args, algo: Any, state: dict[str, Any] | None, until: int) -> di
     return state
 
 
+def drop_unkept(path: Path, done: int) -> None:
+    """Leave the lines of iterations up to the checkpoint; a run that was killed has others, and perhaps a half one."""
+    whole = []
+    for text in path.read_text(errors="replace").splitlines() if path.exists() else ():
+        with suppress(ValueError, KeyError, TypeError):
+            if json.loads(text)["timesteps"] <= done:
+                whole.append(text)
+    files.write(path, "".join(f"{text}\n" for text in whole))
+
+
 def core_seconds(algo: Any) -> float:
     """Processors' time of this process and of the runners that are there [s]."""
     return time.process_time() + sum(
@@ -433,6 +443,7 @@ def main(args: Args) -> None:
         # what the run has exported before is of another policy now
         for name in (POLICY, EVALUATION):
             (args.folder / name).unlink(missing_ok=True)
+        drop_unkept(args.folder / PROGRESS, done)
         with cluster(args):
             state = train(args, state)
     assert state is not None

@@ -1,7 +1,7 @@
 """The episodes of the demo: committed policies, recorded into files that docs/demo/index.html plays without a server.
 
 python docs/demo/record.py                          # all of them, in a minute
-python docs/demo/record.py drape-post strain        # some
+python docs/demo/record.py drape-box strain         # some
 
 A file is one line of JavaScript, so that a page opened from a disk may load it: a call with base64 of gzip.  Unpacked, it holds
 the length of a JSON header (uint32), the header, and all positions as int16 in steps of ``QUANTUM``: first the high bytes of all
@@ -39,6 +39,7 @@ LEARNERS = {
     "bc_ppo": "clone of the expert, then PPO",
     "ppo": "PPO",
     "ppo_lagrange": "PPO, Lagrange multiplier",
+    "sac": "SAC",
 }
 
 

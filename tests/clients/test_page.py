@@ -4,7 +4,7 @@ import re
 
 from page import PAGE, ROOT, SECTIONS, run, script
 
-PACKAGES = {"RL Baselines3 Zoo": "rl_zoo3", "Stable-Baselines3": "stable_baselines3", "Ray RLlib": "ray"}
+PACKAGES = {"RL Baselines3 Zoo": "rl_zoo3", "Stable-Baselines3": "stable_baselines3"}
 
 
 def test_headings_name_the_versions_of_the_constraints():
@@ -20,7 +20,7 @@ def test_headings_name_the_versions_of_the_constraints():
 def test_every_script_is_run():
     tests = "".join(path.read_text() for path in (ROOT / "tests" / "clients").glob("test_*.py"))
     scripted = {name for name in SECTIONS if "```" in SECTIONS[name]}
-    run_here = set(re.findall(r"(?:run|script)\(\"([^\"]+)\"\)", tests)) | {"By hand", "Ray RLlib"}
+    run_here = set(re.findall(r"(?:run|script)\(\"([^\"]+)\"\)", tests)) | {"By hand"}
     assert all(any(name.startswith(heading) for heading in run_here) for name in scripted), scripted
     assert PAGE.count("```") == 2 * len(scripted)
 
