@@ -98,9 +98,11 @@ def alone(folder: Path) -> dict[str, Any]:
 
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     run = Run(cluster.address, 1, folder)
-    run.wait(lambda lines: len(lines) >= WARM_UP + PHASE)
-    run.stop()
-    cluster.shutdown()
+    try:
+        run.wait(lambda lines: len(lines) >= WARM_UP + PHASE)
+    finally:
+        run.stop()
+        cluster.shutdown()
     return speeds(run.lines()[WARM_UP:])
 
 
@@ -111,14 +113,16 @@ def with_a_lost_node(folder: Path) -> dict[str, Any]:
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
     node = joined(cluster)
     run = Run(cluster.address, 2, folder)
-    run.wait(lambda lines: len(lines) >= WARM_UP + PHASE)
-    killed_at, processes = len(run.lines()), kill(node)
-    run.wait(lambda lines: sum(line["runners"] == 1 for line in lines) >= PHASE)
-    joined_at = len(run.lines())
-    joined(cluster)
-    run.wait(lambda lines: len(lines) > joined_at + PHASE and all(line["runners"] == 2 for line in lines[-PHASE:]))
-    run.stop()
-    cluster.shutdown()
+    try:
+        run.wait(lambda lines: len(lines) >= WARM_UP + PHASE)
+        killed_at, processes = len(run.lines()), kill(node)
+        run.wait(lambda lines: sum(line["runners"] == 1 for line in lines) >= PHASE)
+        joined_at = len(run.lines())
+        joined(cluster)
+        run.wait(lambda lines: len(lines) > joined_at + PHASE and all(line["runners"] == 2 for line in lines[-PHASE:]))
+    finally:
+        run.stop()
+        cluster.shutdown()
     lines = run.lines()
     before, during = lines[WARM_UP:killed_at], [line for line in lines[killed_at + 1 : joined_at] if line["runners"] == 1]
     steps = [line["timesteps"] for line in lines]

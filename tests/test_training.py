@@ -65,6 +65,8 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
     folder, options = trained
     again = run("train.py", "--run", folder / "run", *options, cwd=folder)
     assert again.returncode == 2 and "holds a run already" in said(again.stderr)
+    other = run("train.py", "--resume", folder / "run", "--seed", 5, cwd=folder)
+    assert other.returncode == 2 and "--seed 5: the run that --resume goes on with has 0: drop --seed" in said(other.stderr)
     resumed = run("train.py", "--resume", folder / "run", "--timesteps", 1600, *options[2:], cwd=folder)
     assert resumed.returncode == 0, resumed.stderr
     assert "at 800 of 1,600 steps" in resumed.stdout

@@ -115,6 +115,18 @@ def _about(name: str, env_id: str) -> dict[str, Any]:
         raise ValueError(str(error)) from error
 
 
+def same_as(config: Config, args: Any, *names: str) -> None:
+    """What is given beside ``--resume`` must be what the run has.
+
+    Raises:
+        ValueError: it is neither that, nor the default.
+    """
+    for name in names:
+        given = getattr(args, name)
+        if given not in (config[name], type(args).__dataclass_fields__[name].default):
+            raise ValueError(f"--{name} {given}: the run that --resume goes on with has {config[name]}: drop --{name}")
+
+
 def parsed_kwargs(text: str) -> dict[str, Any]:
     """Keyword arguments of an environment from JSON.
 

@@ -101,6 +101,7 @@ class Args:
             raise ValueError(f"--resume {folder}: it is of {config['algo']}, not of this script: go on with train.py --resume")
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
+        policies.same_as(config, self, "env", "seed")
         return folder, config
 
     def new_run(self) -> tuple[Path, dict[str, Any]]:

@@ -91,6 +91,7 @@ class Args:
             raise ValueError(f"--resume {folder}: it is of RLlib: go on with  python training/rllib_train.py --resume {folder}")
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
+        policies.same_as(config, self, "env", "seed", "algo")
         if self.timesteps is not None:
             config["timesteps"] = self.timesteps
         return folder, config

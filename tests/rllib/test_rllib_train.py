@@ -152,3 +152,10 @@ def test_a_killed_runner_comes_back_and_its_share_is_not_missing():
     whole, killed = done.stdout.splitlines()
     assert whole == f"({STEPS}, 2)"
     assert killed == f"{STEPS} 1 2"
+
+
+def test_lines_after_the_checkpoint_and_half_ones_are_dropped(module, tmp_path):
+    path = tmp_path / "progress.jsonl"
+    path.write_text('{"iteration": 1, "timesteps": 1280}\n{"iteration": 2, "timesteps": 2560}\n[]\n{"iteration": 3, "times')
+    module.drop_unkept(path, 1280)
+    assert path.read_text() == '{"iteration": 1, "timesteps": 1280}\n'
