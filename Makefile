@@ -3,7 +3,7 @@
 # make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
 # make oldest: tests with the oldest dependencies; each of these in an environment of its own
-# make release: wheel and sdist of what is committed, checked and tried out      make notebook: runs notebooks/
+# make release: wheel and sdist of what is committed, checked and tried out      make notebook: runs docs/notebooks/
 # make site: the documentation as a site in build/site, from the pages, the docstrings and the command line's help
 PYTHON ?= python3
 PYTHONS ?= $(PYTHON)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-PATH = Path(__file__).parents[2] / "notebooks" / "first_steps.ipynb"
+PATH = Path(__file__).parents[2] / "docs" / "notebooks" / "first_steps.ipynb"
 # what is run after it: the slider is pulled, and the sheet comes to rest
 PULL = """
 gravity.value = 20.0
