@@ -149,9 +149,8 @@ def test_a_killed_runner_comes_back_and_its_share_is_not_missing():
         command, capture_output=True, text=True, timeout=300, env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
     )
     assert done.returncode == 0, done.stderr
-    whole, killed = done.stdout.splitlines()
-    assert whole == f"({STEPS}, 2)"
-    assert killed == f"{STEPS} 1 2"
+    # Ray has lines of its own there
+    assert {f"({STEPS}, 2)", f"{STEPS} 1 2"} <= set(done.stdout.splitlines()), done.stdout
 
 
 def test_lines_after_the_checkpoint_and_half_ones_are_dropped(module, tmp_path):
