@@ -267,6 +267,23 @@ def test_a_replay_buffer_is_filled_with_what_the_expert_did(env_id, scripts):
     assert model._n_updates > 0 and model.num_timesteps == 9
 
 
+def test_the_first_weights_are_the_same_on_machines_of_any_number_of_cores(scripts, tmp_path):
+    import torch
+    from learners import build
+
+    config = {
+        "env": "ClothReach-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "num_envs": 2, "threads": 1,
+        "hyperparameters": {"policy": "MlpPolicy", "n_steps": 8, "batch_size": 16, "policy_kwargs": {"net_arch": [128, 128]}},
+        "seed": 0,
+    }  # fmt: skip
+    found = []
+    for threads in (1, 2):
+        # as torch begins on a machine of so many cores
+        torch.set_num_threads(threads)
+        found.append(build(tmp_path, config, 0, 0).policy.state_dict())
+    assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
+
+
 def test_turned_samples_are_what_the_expert_does_with_turned_sheets(scripts):
     from types import SimpleNamespace
 

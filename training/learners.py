@@ -34,6 +34,8 @@ def environments(config: Config, env_kwargs: dict[str, Any], seed: int) -> VecMo
 
 def build(folder: Path, config: Config, seed: int, done: int) -> BaseAlgorithm:
     """The learner of a configuration, on its own batch of environments; done: environment steps of the run so far."""
+    # the first weights come from a factorization whose rounding depends on the number of threads
+    torch.set_num_threads(config["threads"])
     options = dict(config["hyperparameters"])
     policy = OWN_POLICIES.get(options["policy"], options["policy"])
     del options["policy"]
