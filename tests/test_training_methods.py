@@ -201,7 +201,7 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
     import learning
     from learners import build
 
-    config = {"env": "ClothReach-v0", "algo": "ppo", "num_envs": 4, "env_kwargs": {}, "seed": 0, "hyperparameters": {
+    config = {"env": "ClothReach-v0", "algo": "ppo", "num_envs": 4, "env_kwargs": {}, "seed": 0, "threads": 1, "hyperparameters": {
         "policy": "MlpPolicy", "n_steps": 8, "batch_size": 32, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}},
         "curriculum": {"n_timesteps": 64, "env_kwargs": {"physics": "fast"}}}  # fmt: skip
     model = build(learning.Path("unused"), config, 0, 0)
