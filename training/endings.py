@@ -5,6 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+from clothgym.adapters.runs import CONFIG
 
 
 @contextmanager
@@ -28,3 +31,8 @@ def stopped(remedy: Callable[[], str] = lambda: "") -> Iterator[None]:
     except OSError as error:
         print(f"error: {error}{remedy()}", file=sys.stderr)
         raise SystemExit(1) from None
+
+
+def going_on(script: str, folder: Path) -> str:
+    """The remedy of a run that has begun: how to go on with it."""
+    return f": go on with  python training/{script} --resume {folder}" if (folder / CONFIG).exists() else ""

@@ -23,7 +23,7 @@ import numpy as np
 import policies
 import tyro
 import yaml
-from endings import refused, stopped
+from endings import going_on, refused, stopped
 
 import clothgym
 from clothgym import files
@@ -159,10 +159,5 @@ def main(args: Args) -> None:
 if __name__ == "__main__":
     np.seterr(all="ignore")
     given = tyro.cli(Args)
-
-    def remedy() -> str:
-        left = (given.folder / policies.CONFIG).exists()
-        return f": go on with  python training/train.py --resume {given.folder}" if left else ""
-
-    with stopped(remedy):
+    with stopped(lambda: going_on("train.py", given.folder)):
         main(given)
