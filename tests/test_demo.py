@@ -1,7 +1,10 @@
 """The demo: what was recorded, what its files hold, and what the page makes of them in a headless Chromium."""
 
+import base64
+import gzip
 import json
 import shutil
+import struct
 import sys
 from pathlib import Path
 
@@ -115,6 +118,18 @@ def test_files_are_small_and_complete():
     listed = json.loads(record.INDEX.read_text().removeprefix("const EPISODES = ").removesuffix(";\n"))
     assert [one["name"] for one in listed] == list(record.EPISODES)
     assert {chosen.env_id for chosen in record.EPISODES.values()} == set(clothgym.policies.available())
+
+
+@pytest.mark.parametrize("name", record.EPISODES)
+def test_an_episode_is_of_the_policy_that_is_committed_now(name):
+    """Where it is not, ``python docs/demo/record.py NAME`` records it again."""
+    content = gzip.decompress(base64.b64decode((record.FOLDER / f"{name}.js").read_text().split('"')[3]))
+    (length,) = struct.unpack_from("<I", content)
+    header, about = json.loads(content[4 : 4 + length]), clothgym.policies.load(record.EPISODES[name].env_id).about
+    assert header["learner"] == record.LEARNERS[about["learner"]]
+    assert {key: header[key] for key in ("success_rate", "episodes", "digest")} == {
+        key: about[key] for key in ("success_rate", "episodes", "digest")
+    }
 
 
 def test_solids_that_come_and_go_are_followed():
