@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
 from clothgym.checks import shown
-from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.definition import Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.flattening import (
     SpreadingTask,
@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
 CLOSING = 4  # steps in which the fingers close on the corners as an episode begins
-STILL = 3e-3  # by which a tip that rests may move in a step: less than a twentieth of its speed [m]
-LONGEST = 60  # steps after which it does not matter any more how long the tips have been moving
+STILL = 1e-4  # by which a tip that stands still may move in a step [m]
 NOT_MADE = -1.0  # coverage after a throw that has not been made
 # the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
 BOX = (0.9, 0.3, 1.25)
@@ -129,10 +128,9 @@ def _account_fling(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe_fling(own, rules, sheet, seen):
-    """Grippers, time, coverage, the throws that are left, and how far a throw is."""
+    """Grippers, time, coverage, and the throws that are left."""
     observe_spread(own, rules, sheet, seen)
     seen.throws_left = 1 - own.throws / THROWS
-    seen.rested, seen.moving = own.rested / rules.side, min(own.moving, LONGEST) / LONGEST
 
 
 class FlingTask(SpreadingTask):
@@ -157,12 +155,7 @@ class FlingTask(SpreadingTask):
         ("throws", np.int64),
         *[(f"coverage_after_{i + 1}", float) for i in range(THROWS)],
     )
-    observations = (
-        *SpreadingTask.observations,
-        Observation("throws_left", "share of the throws that is left"),
-        Observation("rested", "height of the lower tip when both last rested, at less than 0.09 m/s", (), "L", POSITION_BOUND),
-        Observation("moving", "steps since then, at most 60, over 60"),
-    )
+    observations = (*SpreadingTask.observations, Observation("throws_left", "share of the throws that is left"))
     ranges: ClassVar = {
         **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
         "barred": (0, 1), "moving": (0, 10_000), "rested": (0.0, 10.0),
