@@ -142,6 +142,18 @@ def test_three_lines_play_a_committed_policy():
     assert clothgym.policies is policies
 
 
+def test_of_several_learners_the_best_is_loaded_and_where_steps_cost_the_one_that_is_safe(tmp_path, monkeypatch):
+    monkeypatch.setattr(policies, "FOLDER", tmp_path)
+    scores = {"ppo": (1.0, 0.0), "bc": (0.9, 0.6), "sac": (0.8, 0.7)}
+    for learner, (success, safe) in scores.items():
+        for env_id, score in (("ClothReach-v0", {}), ("ClothStrain-v0", {"safe_success_rate": safe})):
+            policy = policy_of()
+            policy.about |= {"env": env_id, "learner": learner, "success_rate": success, **score}
+            policy.save(tmp_path / f"{env_id}_{learner}.npz")
+    assert policies.available() == {"ClothReach-v0": ["ppo", "bc", "sac"], "ClothStrain-v0": ["sac", "bc", "ppo"]}
+    assert policies.load("ClothStrain-v0").about["learner"] == "sac" and policies.load("ClothReach-v0").about["learner"] == "ppo"
+
+
 COMMITTED = [(env_id, learner) for env_id, learners in policies.available().items() for learner in learners]
 
 
@@ -176,3 +188,4 @@ def test_what_a_committed_policy_says_is_in_the_table(env_id, learner, scripts):
     about = policies.load(env_id, learner).about
     rows = [row for row in report.learned() if (row["env"], row["learner"], row["seed"]) == (env_id, learner, about["seed"])]
     assert [(row["success_rate"], row["digest"]) for row in rows] == [(about["success_rate"], about["digest"])]
+    assert rows[0].get("safe_success_rate") == about.get("safe_success_rate")

@@ -332,7 +332,8 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     evaluate.write_json(folder / EVALUATION, own)
     if policy is not None:
         # the file says what it scores
-        policy.about |= {name: own[name] for name in ("success_rate", "normalized_performance", "episodes")}
+        said = ("success_rate", "safe_success_rate", "normalized_performance", "episodes")
+        policy.about |= {name: own[name] for name in said if name in own}
         policy.about["first_successes"] = int(episodes["is_success"][:FIRST].sum())
         policy.save(path)
     draw_learning_curve(folder, watch.lines, {name: scores[name]["success_rate"] for name in ("noop", "expert") if name in scores})

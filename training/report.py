@@ -211,11 +211,13 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
 
 
 def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
-    """How an environment is learned best, in a few words."""
+    """How an environment is learned best, in a few words; where steps cost, only a success at none counts."""
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
     if not found:
         return "–"
-    label, rows = max(found, key=lambda one: interquartile_mean(row["success_rate"] for row in one[1]))
+    label, rows = max(
+        found, key=lambda one: interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in one[1])
+    )
     old = _old(all(is_present(row, digests) for row in rows))
     cost = f" at cost {statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else ""
     success = interquartile_mean(row["success_rate"] for row in rows)

@@ -128,16 +128,19 @@ def check_layers(layers: Sequence[tuple[NDArray, NDArray]]) -> None:
 
 
 def available() -> dict[str, list[str]]:
-    """The learners of which policies are committed, best first, by environment id."""
+    """The learners of which policies are committed, best first, by environment id.
+
+    By success rate; where steps cost, only a success at no cost counts.
+    """
     found: dict[str, list[tuple[float, str]]] = {}
     for path in sorted(FOLDER.glob("*.npz")):
         about = read(path).about
-        found.setdefault(about["env"], []).append((-about["success_rate"], about["learner"]))
+        found.setdefault(about["env"], []).append((-about.get("safe_success_rate", about["success_rate"]), about["learner"]))
     return {env_id: [learner for _, learner in sorted(learners)] for env_id, learners in found.items()}
 
 
 def load(env_id: str, learner: str | None = None) -> Policy:
-    """The committed policy of an environment; of several learners' that with the highest success rate, or that which is named.
+    """The committed policy of an environment; of several learners' the best, see ``available``, or that which is named.
 
     Raises:
         ValueError: no such environment, or none of it is committed; the message says which are.
