@@ -215,13 +215,11 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
     if not found:
         return "–"
-    label, rows = max(
-        found, key=lambda one: interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in one[1])
-    )
+    means = [interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in rows) for _, rows in found]
+    success, (label, rows) = max(zip(means, found), key=lambda one: one[0])
     old = _old(all(is_present(row, digests) for row in rows))
-    cost = f" at cost {statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else ""
-    success = interquartile_mean(row["success_rate"] for row in rows)
-    return f"{label}: {success:.2f}{cost} in {max(_minutes(rows), 1):.0f} min{old}"
+    at = " at no cost" if "safe_success_rate" in rows[0] else ""
+    return f"{label}: {success:.2f}{at} in {max(_minutes(rows), 1):.0f} min{old}"
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
