@@ -1,6 +1,7 @@
 """The scripted expert of ``ClothFling-v0``: take an edge by its corners, lift it, wait, swing, and lay the sheet down.
 
-It sees the whole state, and has no memory: how long its hands have been moving, since they rested above, says how far a throw is.
+It sees the whole state, and has no memory: throws begin at given steps, and where the hands are says how far one is.  So what it
+does is a continuous function of what is observed, but for the step at which it begins, and can be cloned.
 """
 
 from __future__ import annotations
@@ -14,27 +15,36 @@ from clothgym.envs.episode import length
 from clothgym.envs.flatten_expert import EDGES, OPPOSITE, places_to_take
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
-CALM = 0.12  # rms speed at which it throws [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 TEARING = 0.5  # strain at which it lets go
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 REST = 0.1  # rms speed at which it judges what it has thrown [m/s]
 DONE = 0.903  # coverage with which it is content
-LONG = 45  # steps of a throw, at most: with less time left it throws without being calm
-AGAIN = 90  # steps that another throw takes
+LATE = 4  # steps by which a throw may be late
+TIMED = 0.01  # sides that a step's difference from the time counts for, beside the distance from the way
+ASTRAY = 0.2  # distance from the way at which there is no throw, in sides
+STEP = 0.25  # of the search along the way, in control steps
+AGAIN = 52  # steps before a throw at which it still takes what lies there
 FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corners are out of reach, and the tips' height [m/s], [m]
 
 
 class Throw(NamedTuple):
-    """The way of the hands in a throw, from where they rest before it.
+    """When throws begin, and the way of the hands in one, from where they rest before it.
 
-    steps: control steps after which they are at each further place, (places,).  along, above: that and where they begin, along y
+    starts: steps of the episode at which one begins.  steps: control steps after which they are at each further place, (places,).  along, above: that and where they begin, along y
     from the origin and above the floor, in sides, (1 + places,).
     """
 
+    starts: tuple[int, ...]
     steps: tuple[float, ...]
     along: tuple[float, ...]
     above: tuple[float, ...]
+
+    def way(self) -> tuple[NDArray, NDArray]:
+        """Times in control steps, (times,), and the places along y and above the floor then, in sides, (times, 2)."""
+        steps = (0.0, *self.steps)
+        times = np.arange(0, steps[-1] + STEP, STEP)
+        return times, np.stack([np.interp(times, steps, self.along), np.interp(times, steps, self.above)], axis=1)
 
 
 def fling_actions(task: Any) -> NDArray:
@@ -50,15 +60,15 @@ def fling_actions(task: Any) -> NDArray:
     looking = (held[:, 0] == 0) | (held[:, 1] == 0)
     takes[looking], others[looking] = places_to_take(x[looking], corners, near_corner)
     low, high = task.arena()
+    latest = task.throw.starts[-1] - AGAIN
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
     for e in range(n):
         own = task.episode[e]
-        left = task.acting_steps - own["step"]
         free = held[e] == 0
         if free.all():
             if own["throws"] == 0 and own["step"] < 6:
                 grip[e] = -1
-            elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < DONE and left > AGAIN:
+            elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < DONE and own["step"] < latest:
                 move[e], grip[e] = _take(x[e], tips[e], takes[e], others[e], corners, low, high, mesh.grid_shape)
             else:
                 move[e, :, 2] = np.where(tips[e, :, 2] < 0.25 * side, 0.4, 0)
@@ -84,7 +94,7 @@ def fling_actions(task: Any) -> NDArray:
             continue
         hands = [np.flatnonzero(holder[e] == k) for k in range(2)]
         strain = float(task.info["strain_max"][e])
-        move[e], grip[e] = _throw(task.throw, tips[e], rest, hands, side, own, speed[e], left, high, strain)
+        move[e], grip[e] = _throw(task.throw, tips[e], rest, hands, side, int(own["step"]), high, strain)
     # fingers that have closed on nothing open again
     grip[(grippers.openings == 0) & (held == 0)] = 1
     limit = task.physics.attachment_speed
@@ -131,38 +141,35 @@ def _within(x: Any, ends: Any, far: Any, low: Any, high: Any, shape: Any) -> Any
     return np.array(places)
 
 
-def _throw(
-    throw: Throw, tips: Any, rest: Any, held: Any, side: float, own: Any, speed: float, left: int, high: Any, strain: float
-) -> Any:
+def _throw(throw: Throw, tips: Any, rest: Any, held: Any, side: float, step: int, high: Any, strain: float) -> Any:
     """Lift the edge, wait, swing it and lay the sheet down."""
     between = rest[held[0]][:, None] - rest[held[1]]
     taut = TAUT * np.linalg.norm(between, axis=2).min()
     middle, grip = tips.mean(axis=0), -np.ones(2)
-    aside = float(np.clip(middle[0], -(high[0] - 0.55 * side), high[0] - 0.55 * side))
-    apart = np.array([[-taut / 2, 0, 0], [taut / 2, 0, 0]])
     if strain > TEARING:
         return np.zeros((2, 3)), -grip
-    top = throw.above[0] * side
-    if own["rested"] < top - 0.001:
-        goal = apart + (aside, throw.along[0] * side, top)
-        if np.abs(goal - tips).max() < 0.005:
-            return 30 * (goal - tips), grip
-        move = 12 * (goal - tips)
-        # upward before aside
-        move[:, :2] *= 0.6
-        move /= np.maximum(length(move) / LIFTING, 1)[:, None]
-        # never farther apart than the cloth between them is long
-        way = tips[1] + move[1] / 30 - tips[0] - move[0] / 30
-        beyond = max(np.linalg.norm(way) - max(taut, 0.01), 0.0)
-        pull = 15 * beyond * way / max(np.linalg.norm(way), 1e-9)
-        return (move + np.stack([pull, -pull])) * np.clip(1.3 - 2 * strain, 0, 1), grip
-    # it rests until the sheet is calm
-    now = int(own["moving"])
-    if now == 0 and speed > CALM and left > LONG:
-        return np.zeros((2, 3)), grip
-    steps = (0.0, *throw.steps)
-    if now >= steps[-1]:
-        return np.zeros((2, 3)), -grip
-    y, z = (side * np.interp(now + 1, steps, way) for way in (throw.along, throw.above))
-    goal = np.stack([tips[:, 0], [y, y], [z, z]], axis=1)
-    return 30 * (goal - tips), grip
+    # of the throw that is on or comes next
+    times, way = throw.way()
+    elapsed = step - next((start for start in throw.starts if step <= start + times[-1] + LATE), step + 1)
+    off = np.linalg.norm(way - middle[1:] / side, axis=1)
+    nearest = int((off**2 + (TIMED * (times - elapsed)) ** 2).argmin())
+    if elapsed >= 0 and off[nearest] < ASTRAY:
+        now = times[nearest]
+        if now > times[-1] - 1:
+            return np.zeros((2, 3)), -grip
+        y, z = (side * np.interp(now + 1, times, way[:, c]) for c in range(2))
+        return 30 * (np.stack([tips[:, 0], [y, y], [z, z]], axis=1) - tips), grip
+    aside = float(np.clip(middle[0], -(high[0] - 0.55 * side), high[0] - 0.55 * side))
+    apart = np.array([[-taut / 2, 0, 0], [taut / 2, 0, 0]])
+    goal = apart + (aside, throw.along[0] * side, throw.above[0] * side)
+    if np.abs(goal - tips).max() < 0.005:
+        return 30 * (goal - tips), grip
+    move = 12 * (goal - tips)
+    # upward before aside
+    move[:, :2] *= 0.6
+    move /= np.maximum(length(move) / LIFTING, 1)[:, None]
+    # never farther apart than the cloth between them is long
+    ahead = tips[1] + move[1] / 30 - tips[0] - move[0] / 30
+    beyond = max(np.linalg.norm(ahead) - max(taut, 0.01), 0.0)
+    pull = 15 * beyond * ahead / max(np.linalg.norm(ahead), 1e-9)
+    return (move + np.stack([pull, -pull])) * np.clip(1.3 - 2 * strain, 0, 1), grip

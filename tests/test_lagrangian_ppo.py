@@ -203,6 +203,19 @@ def test_dual_ascent_starts_where_it_is_told_and_turns_at_its_bound():
     assert seen == [0.5, 2.5, 12.5, 15.0, 14.0, 12.0]
 
 
+def test_the_limit_is_tightened_by_a_factor_and_the_excess_is_over_that_of_now():
+    """Of three steps at a cost of 1 the limits after each quarter of a training are 6 (1/4)^(1/2), and then 6/4."""
+    model = learner(Steps(1, cost=lambda action: 1.0), cost_limit=1.5, initial_cost_limit=6.0, tightening=0.5, multiplier_rate=0.1)
+    seen = []
+    note = lambda *_: seen.append((model.present_limit(), model.multiplier)) or True  # noqa: E731
+    assert model.present_limit() == 6
+    learn(model, 4, callback=note)
+    note()
+    # the last of three steps, before the multiplier moves, and after the last rollout
+    assert np.array(seen[2::3]) == pytest.approx(np.array([(6.0, 0.0), (3.0, 0.0), (1.5, 0.15), (1.5, 0.3)]))
+    assert seen[-1] == pytest.approx((1.5, 0.45)) and model.logger.name_to_value["constraint/limit"] == 1.5
+
+
 def test_it_moves_when_episodes_have_ended_by_their_whole_cost():
     env = Steps(1, cost=lambda action: 1 + action**2)
     model = learner(env, n_steps=2, cost_limit=1.0, multiplier_rate=0.5)
@@ -293,6 +306,13 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing():
         ({"cost_limit": "low"}, "cost_limit='low': must be a finite number"),
         ({"multiplier_rate": 0.0}, "multiplier_rate=0.0: must be positive"),
         ({"multiplier_rate": float("inf")}, "multiplier_rate=inf: must be a finite number"),
+        ({"tightening": 0.0}, "tightening=0.0: must be greater than 0, and at most 1"),
+        ({"initial_cost_limit": 0.0}, "initial_cost_limit=0.0: must be positive"),
+        ({"initial_cost_limit": 0.25}, "cost_limit=0.5: must be greater than 0 and at most initial_cost_limit=0.25"),
+        (
+            {"initial_cost_limit": 1.0, "cost_limit": 0.0},
+            "cost_limit=0.0: must be greater than 0 and at most initial_cost_limit=1.0",
+        ),
         ({"kp": -0.1}, "kp=-0.1: must be zero or positive"),
         ({"kd": -0.1}, "kd=-0.1: must be zero or positive"),
         ({"multiplier_start": -1.0}, "multiplier_start=-1.0: must be zero or positive"),

@@ -14,7 +14,9 @@ Hyperparameters are read from hyperparams/ALGO.yml, in the format of rl_zoo3.
 
 from __future__ import annotations
 
+import json
 import platform
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -120,7 +122,7 @@ class Args:
             "algo": self.algo,
             "clone": hyperparameters.pop("clone", {}),
             "demonstrations": hyperparameters.pop("demonstrations", {}),
-            "curriculum": hyperparameters.pop("curriculum", self.curriculum()),
+            "curriculum": hyperparameters.pop("curriculum") if "curriculum" in hyperparameters else self.curriculum(),
             "env_kwargs": hyperparameters.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs),
             "num_envs": hyperparameters.pop("n_envs"),
             "timesteps": self.timesteps if self.timesteps is not None else int(hyperparameters["n_timesteps"]),
@@ -137,11 +139,14 @@ class Args:
         return folder, config
 
     def curriculum(self) -> dict[str, Any]:
-        """What a run with our own hyperparameters begins with, if anything; a file of one's own says that itself."""
-        if self.hyperparams is not None:
-            return {}
+        """What a run with our own hyperparameters begins with, if anything; a file of one's own says that itself, or is told."""
         table = yaml.safe_load((HERE / "hyperparams" / "curricula.yml").read_text())
-        return dict(table.get(self.algo, {}).get(self.env, {}))
+        ours = dict(table.get(self.algo, {}).get(self.env, {}))
+        if self.hyperparams is None or not ours:
+            return ours
+        part = f"curriculum: {{n_timesteps: {ours['n_timesteps']}, env_kwargs: {json.dumps(ours['env_kwargs'])}}}"
+        print(f"{self.hyperparams} has no curriculum for {self.env}; to begin as ours does, add  {part}", file=sys.stderr)
+        return {}
 
 
 def main(args: Args) -> None:

@@ -11,6 +11,11 @@ Reinforcement Learning by PID Lagrangian Methods, Algorithm 2, where J' is the m
     e = J - d        I <- (I + e)_+        lambda <- (K_P e + K_I I + K_D (J - J')_+)_+
 
 With K_P = K_D = 0 this is dual ascent at the rate K_I.
+
+A policy that has not learned its task pays for it all the same, and a price that would keep it within the limit keeps it from
+moving.  So the limit may begin at d_0, and be tightened to d geometrically over a share f of the training: at the share s of it
+
+    d(s) = d_0^(1 - min(s/f, 1)) d^min(s/f, 1)
 """
 
 from __future__ import annotations
@@ -86,12 +91,14 @@ class LagrangianPPO(PPO):
     the features that the policy's own critic sees.  It trains apart from the policy, and does not move the features.  As long as
     the multiplier is 0, the learner does what PPO does, bit for bit.
 
-    Logs ``constraint/multiplier``, ``constraint/cost``, the mean of the episodes that ended in the rollout, and
-    ``constraint/cost_value_loss``.
+    Logs ``constraint/multiplier``, ``constraint/limit``, ``constraint/cost_value_loss``, and ``constraint/cost``, the mean of the
+    episodes that ended in the rollout.
 
     Args:
         policy, env: as of PPO.
         cost_limit: mean cost of an episode that is allowed.
+        initial_cost_limit: what is allowed at first, d_0; with None ``cost_limit`` holds from the beginning.
+        tightening: share of the training over which the limit falls from there to ``cost_limit``, f.
         multiplier_rate: K_I, rate of the dual ascent, in multiplier per unit of excess cost and rollout.
         kp, kd: K_P and K_D of the PID controller, in multiplier per unit of cost; with 0 there is only dual ascent.
         multiplier_start: the multiplier at first.
@@ -115,6 +122,8 @@ class LagrangianPPO(PPO):
         *,
         # None only while SB3 loads a learner, whose limit then comes from the file
         cost_limit: float | None = None,
+        initial_cost_limit: float | None = None,
+        tightening: float = 0.5,
         multiplier_rate: float = 0.05,
         kp: float = 0.0,
         kd: float = 0.0,
@@ -128,6 +137,7 @@ class LagrangianPPO(PPO):
         **kwargs: Any,
     ) -> None:
         self.cost_limit, self.multiplier_rate, self.kp, self.kd = cost_limit, multiplier_rate, kp, kd
+        self.initial_cost_limit, self.tightening = initial_cost_limit, tightening
         self.multiplier_start, self.multiplier_most, self.excess_clip = multiplier_start, multiplier_most, excess_clip
         self.cost_gamma, self.cost_gae_lambda = cost_gamma, cost_gae_lambda
         self.cost_learning_rate, self.cost_net_arch = cost_learning_rate, cost_net_arch
@@ -160,6 +170,15 @@ class LagrangianPPO(PPO):
             not_negative(name, getattr(self, name))
         for name in ("multiplier_rate", "multiplier_most", "excess_clip", "cost_learning_rate"):
             positive(name, getattr(self, name))
+        if not 0 < number("tightening", self.tightening) <= 1:
+            raise ValueError(f"tightening={shown(self.tightening)}: must be greater than 0, and at most 1")
+        if self.initial_cost_limit is not None:
+            positive("initial_cost_limit", self.initial_cost_limit)
+            if not 0 < self.cost_limit <= self.initial_cost_limit:
+                raise ValueError(
+                    f"cost_limit={shown(self.cost_limit)}: must be greater than 0 and at most initial_cost_limit="
+                    f"{shown(self.initial_cost_limit)}: the limit is tightened by a factor"
+                )
         if self.multiplier_start > self.multiplier_most:
             raise ValueError(
                 f"multiplier_start={self.multiplier_start!r}: must be at most multiplier_most={self.multiplier_most!r}"
@@ -215,6 +234,7 @@ class LagrangianPPO(PPO):
             mean = float(np.mean(rollout.ended))
             self.update_multiplier(mean)
             self.logger.record("constraint/cost", mean)
+        self.logger.record("constraint/limit", self.present_limit())
         self.logger.record("constraint/multiplier", self.multiplier)
 
         self.policy.set_training_mode(False)
@@ -226,14 +246,21 @@ class LagrangianPPO(PPO):
         super().train()
         self._train_cost_critic()
 
+    def present_limit(self) -> float:
+        """The mean cost of an episode that is allowed now, d(s)."""
+        assert self.cost_limit is not None
+        if self.initial_cost_limit is None:
+            return self.cost_limit
+        tightened = min((1 - self._current_progress_remaining) / self.tightening, 1.0)
+        return float(self.initial_cost_limit ** (1 - tightened) * self.cost_limit**tightened)
+
     def update_multiplier(self, cost: float) -> None:
         """Move the multiplier by Algorithm 2 of Stooke et al. (2020); cost: mean of the episodes that ended in a rollout, J.
 
         The excess is clipped, and the integral ends where the multiplier does: what it gathered beyond would have to be undone
         before the multiplier could fall.
         """
-        assert self.cost_limit is not None
-        excess = min(cost - self.cost_limit, self.excess_clip)
+        excess = min(cost - self.present_limit(), self.excess_clip)
         rise = max(cost - self.last_cost, 0.0)
         self.integral = float(np.clip(self.integral + self.multiplier_rate * excess, 0.0, self.multiplier_most))
         self.multiplier = float(np.clip(self.kp * excess + self.integral + self.kd * rise, 0.0, self.multiplier_most))
