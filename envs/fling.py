@@ -134,7 +134,7 @@ class FlingTask(SpreadingTask):
     acting_steps = 300
     # the expert's, see ``fling_expert``
     throw: ClassVar[Throw] = Throw(
-        (80, 190, 262),
+        (95, 200, 266),
         (10.7, 20.0, 21.8, 29.2, 33.7),
         (0.05, -0.29, 0.29, 0.254, -0.108, -0.17),
         (1.2, 1.212, 1.064, 1.24, 0.515, 0.02),

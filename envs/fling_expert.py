@@ -23,6 +23,7 @@ DONE = 0.903  # coverage with which it is content
 LATE = 4  # steps by which a throw may be late
 TIMED = 0.01  # sides that a step's difference from the time counts for, beside the distance from the way
 ASTRAY = 0.2  # distance from the way at which there is no throw, in sides
+BACK = 20.0  # speed toward the way, for each meter from it [1/s]
 STEP = 0.25  # of the search along the way, in control steps
 AGAIN = 52  # steps before a throw at which it still takes what lies there
 FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corners are out of reach, and the tips' height [m/s], [m]
@@ -157,8 +158,11 @@ def _throw(throw: Throw, tips: Any, rest: Any, held: Any, side: float, step: int
         now = times[nearest]
         if now > times[-1] - 1:
             return np.zeros((2, 3)), -grip
-        y, z = (side * np.interp(now + 1, times, way[:, c]) for c in range(2))
-        return 30 * (np.stack([tips[:, 0], [y, y], [z, z]], axis=1) - tips), grip
+        # along the way, and back to it
+        here, next_ = (side * np.array([np.interp(t, times, way[:, c]) for c in range(2)]) for t in (now, now + 1))
+        move = np.zeros((2, 3))
+        move[:, 1:] = 30 * (next_ - here) + BACK * (here - tips[:, 1:])
+        return move, grip
     aside = float(np.clip(middle[0], -(high[0] - 0.55 * side), high[0] - 0.55 * side))
     apart = np.array([[-taut / 2, 0, 0], [taut / 2, 0, 0]])
     goal = apart + (aside, throw.along[0] * side, throw.above[0] * side)
