@@ -32,8 +32,8 @@ FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corne
 class Throw(NamedTuple):
     """When throws begin, and the way of the hands in one, from where they rest before it.
 
-    starts: steps of the episode at which one begins.  steps: control steps after which they are at each further place, (places,).  along, above: that and where they begin, along y
-    from the origin and above the floor, in sides, (1 + places,).
+    starts: steps of the episode at which one begins.  steps: control steps after which they are at each further place, (places,).
+    along, above: that and where they begin, along y from the origin and above the floor, in sides, (1 + places,).
     """
 
     starts: tuple[int, ...]
