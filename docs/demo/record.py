@@ -65,6 +65,7 @@ EPISODES = {
     "fold-goal": Chosen("Fold to goals", "ClothFoldGoal-v0"),
     "strain": Chosen("Carry without strain", "ClothStrain-v0"),
     "reach": Chosen("Swing to a goal", "ClothReach-v0"),
+    "fling": Chosen("Fling flat", "ClothFling-v0"),
     "flatten": Chosen("Flatten", "ClothFlatten-v0", stride=2),
 }
 
