@@ -74,7 +74,7 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet --constraint .ci/constraints.txt "torch==2.13.0"
-	$(BIN)/pip install --quiet --constraint .ci/constraints.txt --editable ".[all,dev]"
+	$(BIN)/pip install --quiet --constraint .ci/constraints.txt --editable ".[all,tune,dev]"
 	ln -sfn ../envs clothgym/envs
 	touch $@
 

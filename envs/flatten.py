@@ -21,7 +21,7 @@ from clothgym.envs.flattening import (
     spread_potential,
 )
 from clothgym.envs.gripper_task import close_or_open, stop_at_floor
-from clothgym.envs.manipulation import CORNERS, PHYSICS, WAYS, observe_ways
+from clothgym.envs.manipulation import PHYSICS
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.single import ClothEnv
@@ -35,13 +35,10 @@ if TYPE_CHECKING:
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """What both spreading tasks observe; the ways to the corners, which of them a gripper holds, and how high it has been since."""
+    """What both spreading tasks observe, and how high a gripper has been since it took hold."""
     observe_spread(own, rules, sheet, seen)
-    observe_ways(rules, sheet, seen)
     for tip in range(sheet.holds.shape[0]):
         seen.raised[tip] = own.raised[tip] / rules.side
-        for k in range(CORNERS):
-            seen.corners_held[tip, k] = sheet.holder[rules.corners[k]] == tip
 
 
 class FlattenTask(SpreadingTask):
@@ -64,8 +61,6 @@ class FlattenTask(SpreadingTask):
     bank: ClassVar[Bank] = CRUMPLED
     observations = (
         *SpreadingTask.observations,
-        WAYS,
-        Observation("corners_held", "for each gripper whether it holds each of the corners", (2, CORNERS)),
         Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
     )
 
@@ -73,9 +68,6 @@ class FlattenTask(SpreadingTask):
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
-
-    def constants(self) -> dict[str, Any]:
-        return super().constants() | {"corners": np.array(self.physics.mesh.corners)}
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side

@@ -1,7 +1,6 @@
 """The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
 
-It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  A gripper
-takes all particles within its reach, so it nears a corner from where no other cloth is within reach.
+It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.
 """
 
 from __future__ import annotations
@@ -11,17 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
 from clothgym.envs.episode import length
-from clothgym.envs.manipulation import REACH
-from clothgym.envs.measures import distance
 from clothgym.envs.pick_place import STEPS
+from clothgym.envs.taking import places_to_take
 
 # corners of each edge, and of the opposite one, as places in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
 OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
-AWAY = 0.85 * REACH  # distance of a tip from the corner that it is to take [m]
-CLEAR = 1.1 * REACH  # distance from it within which no other cloth may be [m]
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 LIFT, LIFT_ONE = 1.22, 0.95  # how high an edge is lifted, and a corner alone, in sides
 CALM, CALM_ONE = 0.5, 0.7  # rms speed at which the sheet is laid down, and the other corner taken [m/s]
@@ -37,45 +32,6 @@ PULLED = 0.98  # share of their distance in the flat sheet to which corners are 
 LIFT_EDGE, LIFT_CORNER = 0.5, 0.2  # in sides
 
 
-def _directions() -> NDArray:
-    """From a corner to where a tip may be: straight up, and in rings, (directions, 3), of length 1."""
-    rings = [(0.0, 0.0, 1.0)]
-    for up, count in ((0.75, 6), (0.35, 8), (0.0, 8)):
-        angles = 2 * np.pi * (np.arange(count) + 0.5 * (up > 0.5)) / count
-        out = np.sqrt(1 - up**2)
-        rings += [(out * np.cos(a), out * np.sin(a), up) for a in angles]
-    return np.array(rings)
-
-
-@kernel
-def _count_others(x, corners, allowed, tips, others):
-    """Count the particles within reach of each place for a tip, (sheets, 4, directions), beside those that may be taken along."""
-    for sheet in range(x.shape[0]):
-        for c in range(4):
-            for p in range(x.shape[1]):
-                # those near the corner alone can be
-                if allowed[c, p] or distance(x[sheet, p], x[sheet, corners[c]]) >= AWAY + CLEAR:
-                    continue
-                for d in range(tips.shape[2]):
-                    others[sheet, c, d] += distance(tips[sheet, c, d], x[sheet, p]) < CLEAR
-
-
-def places_to_take(x: NDArray, corners: NDArray, allowed: NDArray) -> tuple[NDArray, NDArray]:
-    """Where tips take each corner [m], (sheets, 4, 3), and how many other particles they would take, (sheets, 4).
-
-    x: [m], (sheets, particles, 3).  allowed: particles that may be taken along, (4, particles).
-    """
-    tips = x[:, corners][:, :, None] + AWAY * _directions()
-    tips[..., 2] = np.maximum(tips[..., 2], 0.012)
-    others = np.zeros(tips.shape[:3], np.int64)
-    _count_others(x, corners, allowed, tips, others)
-    reached = length(tips - x[:, corners][:, :, None]) < 0.95 * REACH
-    # straight up is best, where it is as good
-    worth = others + np.where(reached, 0, 1000) + 0.02 * np.arange(tips.shape[2])
-    best = worth.argmin(axis=2)[..., None]
-    return np.take_along_axis(tips, best[..., None], axis=2)[:, :, 0], np.take_along_axis(worth, best, axis=2)[..., 0] // 1
-
-
 def flatten_actions(task: Any) -> NDArray:
     """Actions of all environments, (num_envs, 8)."""
     mesh, side, grippers = task.physics.mesh, task.physics.side, task.simulation.grippers
@@ -84,11 +40,10 @@ def flatten_actions(task: Any) -> NDArray:
     v = task.simulation.velocities.astype(np.float64)
     speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
     holder, n = grippers.holder, task.num_envs
-    near_corner = np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)
     # where corners can be taken, of the sheets of which one is to be
     takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
     looking = np.logical_or.reduce(grippers.held == 0, axis=1)
-    takes[looking], others[looking] = places_to_take(x[looking], corners, near_corner)
+    takes[looking], others[looking] = places_to_take(x[looking], mesh)
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
     for e in range(n):
         own = task.episode[e]

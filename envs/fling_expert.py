@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.flatten_expert import EDGES, OPPOSITE, places_to_take
+from clothgym.envs.flatten_expert import EDGES, OPPOSITE
+from clothgym.envs.taking import places_to_take
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
@@ -56,10 +57,9 @@ def fling_actions(task: Any) -> NDArray:
     v = task.simulation.velocities.astype(np.float64)
     speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
     holder, held = grippers.holder, grippers.held
-    near_corner = np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)
     takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
     looking = (held[:, 0] == 0) | (held[:, 1] == 0)
-    takes[looking], others[looking] = places_to_take(x[looking], corners, near_corner)
+    takes[looking], others[looking] = places_to_take(x[looking], mesh)
     low, high = task.arena()
     latest = task.throw.starts[-1] - AGAIN
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))

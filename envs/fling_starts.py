@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.flatten_expert import CLEAR, EDGES, places_to_take
+from clothgym.envs.flatten_expert import EDGES
 from clothgym.envs.pick_place import LOWEST
 from clothgym.envs.rumpled import Bank, rumpled_sheets
+from clothgym.envs.taking import CLEAR, beside_corners, places_to_take
 from clothgym.mesh import grid
 
 APART = 0.15  # least distance of the tips as an episode begins, in sides
@@ -32,10 +33,8 @@ def held_sheets(rows: int, columns: int, side: float, bank: Bank) -> tuple[NDArr
     If there is none, those at which they take the least.
     """
     sheets, mesh = rumpled_sheets(rows, columns, side, bank), grid(rows, columns, side, side)
-    corners, rest = np.array(mesh.corners), mesh.rest_positions
-    near = np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)
-    at = sheets[:, corners]
-    takes = at + NEARER * (places_to_take(sheets, corners, near)[0] - at)
+    near, at = beside_corners(mesh) > 0, sheets[:, list(mesh.corners)]
+    takes = at + NEARER * (places_to_take(sheets, mesh)[0] - at)
     takes[..., 2] = np.maximum(takes[..., 2], LOWEST)
     # what is taken beside the corners, (sheets, 4)
     others = ((length(takes[:, :, None] - sheets[:, None]) < CLEAR) & ~near).sum(axis=2)

@@ -1,0 +1,48 @@
+"""The search for hyperparameters: where it begins, and that a study goes on."""
+
+import importlib
+
+import pytest
+from training_runs import run
+
+optuna = pytest.importorskip("optuna")
+
+
+@pytest.fixture
+def tune(scripts):
+    return importlib.import_module("tune")
+
+
+def test_the_first_trial_is_the_committed_configuration(tune):
+    config = tune.Args(env="ClothReach-v0", timesteps=1000).config
+    again = tune.proposed(optuna.trial.FixedTrial(tune.starting_point(config)), config)
+    # what the file leaves to SB3 is said
+    assert again["hyperparameters"].pop("clip_range") == 0.2
+    assert again == config
+
+
+def test_what_is_found_can_be_trained_with(tune):
+    import yaml
+
+    config = tune.Args(env="ClothReach-v0", timesteps=1000).config
+    trial = tune.starting_point(config) | {"n_envs": 16, "minibatches": 8, "n_steps": 20, "learning_rate": 0.00123456}
+    found = yaml.safe_load(tune.as_yaml(tune.proposed(optuna.trial.FixedTrial(trial), config)))["ClothReach-v0"]
+    assert (found["n_envs"], found["n_timesteps"], found["n_steps"], found["batch_size"]) == (16, 1000, 20, 40)
+    assert found["learning_rate"] == "lin_0.00123" and found["policy_kwargs"]["net_arch"] == [64, 64]
+
+
+def test_a_study_goes_on(tmp_path):
+    journal = tmp_path / "study.log"
+    common = ("--env", "ClothReach-v0", "--timesteps", 640, "--episodes", 2, "--seeds", 1, "--study", journal)
+    refused = run("tune.py", *common, "--show", cwd=tmp_path)
+    # its frame breaks lines
+    assert refused.returncode == 2 and "there is no such study" in " ".join(refused.stderr.replace("│", " ").split())
+    for trials in (1, 2):
+        done = run("tune.py", *common, "--trials", trials, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    backend = optuna.storages.journal.JournalFileBackend(str(journal))
+    study = optuna.load_study(study_name="ClothReach-v0", storage=optuna.storages.JournalStorage(backend))
+    first, second = study.trials
+    assert first.params["n_envs"] == 32 and second.params != first.params
+    assert first.user_attrs["core_seconds"] > 0 and (tmp_path / "study.png").stat().st_size > 5000
+    assert "ClothReach-v0:" in done.stdout
