@@ -21,11 +21,12 @@ from clothgym.envs.flattening import (
     spread_potential,
 )
 from clothgym.envs.gripper_task import close_or_open, stop_at_floor
-from clothgym.envs.manipulation import PHYSICS
+from clothgym.envs.manipulation import CORNERS, PHYSICS, WAYS, observe_ways
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
+from clothgym.envs.taking import EDGES, NEXT, OPPOSITE, beside_corners, observe_next
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
@@ -35,10 +36,25 @@ if TYPE_CHECKING:
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """What both spreading tasks observe, and how high a gripper has been since it took hold."""
+    """What both spreading tasks observe; what grippers take next; how high they have been since they took hold; the far edge."""
     observe_spread(own, rules, sheet, seen)
+    observe_ways(rules, sheet, seen)
+    observe_next(rules, sheet, seen)
+    seen.far[:] = 0
+    seen.facing = 0
     for tip in range(sheet.holds.shape[0]):
         seen.raised[tip] = own.raised[tip] / rules.side
+        for k in range(CORNERS):
+            seen.corners_held[tip, k] = sheet.holder[rules.corners[k]] == tip
+    for e in range(len(EDGES)):
+        for crossed in range(2):
+            first, second = EDGES[e, crossed], EDGES[e, 1 - crossed]
+            if sheet.holder[rules.corners[first]] == 0 and sheet.holder[rules.corners[second]] == 1:
+                seen.facing = 1 - 2 * crossed
+                for tip in range(2):
+                    corner = rules.corners[OPPOSITE[e, tip ^ crossed]]
+                    for c in range(3):
+                        seen.far[tip, c] = (sheet.x[c, corner] - sheet.attachments[tip, c]) / rules.side
 
 
 class FlattenTask(SpreadingTask):
@@ -61,6 +77,17 @@ class FlattenTask(SpreadingTask):
     bank: ClassVar[Bank] = CRUMPLED
     observations = (
         *SpreadingTask.observations,
+        WAYS,
+        Observation("corners_held", "for each gripper whether it holds each of the corners", (2, CORNERS)),
+        NEXT,
+        Observation(
+            "far",
+            "while both hold the corners of an edge, the way from each tip to the far corner of its side",
+            (2, 3),
+            "L",
+            POSITION_BOUND,
+        ),
+        Observation("facing", "and 1 if these corners go around the sheet in the order of its corners, -1 if not; else 0"),
         Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
     )
 
@@ -68,6 +95,10 @@ class FlattenTask(SpreadingTask):
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+
+    def constants(self) -> dict[str, Any]:
+        mesh = self.physics.mesh
+        return super().constants() | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side

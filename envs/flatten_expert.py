@@ -12,11 +12,8 @@ from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
 from clothgym.envs.pick_place import STEPS
-from clothgym.envs.taking import places_to_take
+from clothgym.envs.taking import EDGES, OPPOSITE, next_takes_of
 
-# corners of each edge, and of the opposite one, as places in ``mesh.corners``
-EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
-OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 LIFT, LIFT_ONE = 1.22, 0.95  # how high an edge is lifted, and a corner alone, in sides
 CALM, CALM_ONE = 0.5, 0.7  # rms speed at which the sheet is laid down, and the other corner taken [m/s]
@@ -40,10 +37,7 @@ def flatten_actions(task: Any) -> NDArray:
     v = task.simulation.velocities.astype(np.float64)
     speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
     holder, n = grippers.holder, task.num_envs
-    # where corners can be taken, of the sheets of which one is to be
-    takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
-    looking = np.logical_or.reduce(grippers.held == 0, axis=1)
-    takes[looking], others[looking] = places_to_take(x[looking], mesh)
+    goals, others = next_takes_of(task)
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
     for e in range(n):
         own = task.episode[e]
@@ -62,11 +56,11 @@ def flatten_actions(task: Any) -> NDArray:
             move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
             grip[e] = 1 if strain > TEARING else grip[e]
         elif corner[0] >= 0 or corner[1] >= 0:
-            move[e], grip[e] = _take_other(x[e], tips[e], takes[e], others[e], corner, side, own, speed[e])
+            move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
         elif own["coverage"] >= DONE or own["step"] > task.acting_steps - AGAIN:
             move[e, :, 2] = np.where(tips[e, :, 2] < 0.3, 0.5, 0)
         else:
-            move[e], grip[e] = _take_first(x[e], tips[e], takes[e], others[e], corners, side)
+            move[e], grip[e] = _take_first(tips[e], goals[e], others[e], side)
     # fingers that have closed on nothing open again
     grip[(grippers.openings == 0) & (grippers.held == 0)] = 1
     move /= np.maximum(length(move) / SPEED, 1)[..., None]
@@ -109,52 +103,36 @@ def _to(goal: NDArray, tip: NDArray) -> NDArray:
     return (goal - tip) * 15
 
 
-def _take_first(x: Any, tips: Any, takes: Any, others: Any, corners: Any, side: float) -> Any:
+def _take_first(tips: Any, goals: Any, others: Any, side: float) -> Any:
     """An edge by both corners where they lie free; else the corner that lies freest."""
-    apart = np.linalg.norm(x[corners[EDGES[:, 0]]] - x[corners[EDGES[:, 1]]], axis=1)
-    pairs = np.stack([EDGES, EDGES[:, ::-1]], axis=1)  # edges, and which gripper takes which end
-    ways = np.linalg.norm(tips[None, None] - takes[pairs], axis=3).sum(axis=2)
-    worth = others[EDGES].sum(axis=1) + 3 * (apart < 0.25 * side) + 0.1 * ways.min(axis=1) / side
-    edge = int(worth.argmin())
-    move, grip = np.zeros((2, 3)), np.ones(2)
-    if worth[edge] < 1:
-        goal = takes[pairs[edge, ways[edge].argmin()]]
-        near = np.linalg.norm(goal - tips, axis=1)
-        move = _to(goal, tips)
-        if near.max() < NEAR:
-            grip[:] = -1
-        return move, grip
-    way = np.linalg.norm(tips[:, None] - takes, axis=2)
-    which = int((others + 0.3 * way.min(axis=0) / side - 2 * x[corners, 2] / side).argmin())
-    k = int(way[:, which].argmin())
-    move[k] = _to(takes[which], tips[k])
-    move[1 - k, 2] = 0.5 if tips[1 - k, 2] < 0.4 * side else 0.0
-    grip[k] = -1 if way[k, which] < NEAR else 1
+    move, grip = _to(goals, tips), np.ones(2)
+    near = np.linalg.norm(goals - tips, axis=1) < NEAR
+    for k in range(2):
+        if others[k] < 0:
+            move[k] = (0.0, 0.0, 0.5 if tips[k, 2] < 0.4 * side else 0.0)
+        else:
+            # both at once
+            grip[k] = -1 if near[others >= 0].all() else 1
     return move, grip
 
 
-def _take_other(x: Any, tips: Any, takes: Any, others: Any, corner: Any, side: float, own: Any, speed: float) -> Any:
+def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, own: Any, speed: float) -> Any:
     """Lift the corner that is held; then take a neighbor of it, in the air."""
     k = 0 if corner[0] >= 0 else 1
     move, grip = np.zeros((2, 3)), np.ones(2)
     grip[k] = -1
-    # the neighbor that is free, and near
-    neighbors = [i for i in range(4) if i != corner[k] and i != 3 - corner[k]]
-    ways = np.array([np.linalg.norm(takes[i] - tips[1 - k]) for i in neighbors])
-    best = int((others[neighbors] + 0.5 * ways / side).argmin())
-    close = ways[best] < 0.05 and others[neighbors[best]] < 1
+    goal, way = goals[1 - k], np.linalg.norm(goals[1 - k] - tips[1 - k])
+    close = way < 0.05 and others[1 - k] < 1
     up = own["raised"][k] > LIFT_ONE * side - 0.03
-    goal = np.array([0.0, 0.0, LIFT_ONE * side])
     if not up and not close:
-        move[k] = _to(goal, tips[k])
+        move[k] = _to(np.array([0.0, 0.0, LIFT_ONE * side]), tips[k])
         move[k, :2] *= 0.5
-        move[1 - k] = _to(takes[neighbors[best]] + (0, 0, 0.1), tips[1 - k])
-    elif speed < CALM_ONE or close:
-        move[1 - k] = _to(takes[neighbors[best]], tips[1 - k])
-        grip[1 - k] = -1 if ways[best] < NEAR else 1
+    if close or (up and speed < CALM_ONE):
+        move[1 - k] = _to(goal, tips[1 - k])
+        grip[1 - k] = -1 if way < NEAR else 1
     else:
         # it waits beside
-        move[1 - k] = _to(takes[neighbors[best]] + (0, 0, 0.1), tips[1 - k])
+        move[1 - k] = _to(goal + (0, 0, 0.1), tips[1 - k])
     return move, grip
 
 

@@ -11,9 +11,8 @@ from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.gripper_task import measure_grips
-from clothgym.envs.manipulation import CORNERS, WAYS, ManipulationTask, follow, observe_grippers, observe_ways
+from clothgym.envs.manipulation import ManipulationTask, follow, observe_grippers
 from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
-from clothgym.envs.taking import beside_corners, take_corners
 
 HOLDING = 0.1  # share of the potential that is for holding the sheet
 HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
@@ -83,18 +82,9 @@ def account_spread(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def observe_spread(own, rules, sheet, seen):
-    """Grippers, time, and coverage; the ways to the corners, and to where they can be taken; and which of them a gripper holds."""
+    """Grippers, time, and coverage."""
     observe_grippers(own, rules, sheet, seen)
     seen.coverage = own.coverage
-    observe_ways(rules, sheet, seen)
-    # places first, then the ways there
-    take_corners(sheet.x, rules.corners, rules.beside_corners, seen.takes[0], seen.crowding)
-    for k in range(CORNERS):
-        seen.crowding[k] /= 1 + seen.crowding[k]
-        for tip in range(sheet.holds.shape[0] - 1, -1, -1):
-            seen.corners_held[tip, k] = sheet.holder[rules.corners[k]] == tip
-            for c in range(3):
-                seen.takes[tip, k, c] = (seen.takes[0, k, c] - sheet.attachments[tip, c]) * (10 / rules.side)
 
 
 class SpreadingTask(ManipulationTask):
@@ -110,14 +100,7 @@ class SpreadingTask(ManipulationTask):
     observations: ClassVar[tuple[Observation, ...]] = (
         *ManipulationTask.observations,
         Observation("coverage", "share of the sheet's area that it covers"),
-        WAYS,
-        Observation("corners_held", "for each gripper whether it holds each of the corners", (2, CORNERS)),
-        Observation(
-            "takes", "for each gripper the ways from its tip to where it takes each corner with the least other cloth", WAYS.shape,
-            WAYS.unit, WAYS.bound,
-        ),
-        Observation("crowding", "for each corner n/(1 + n), where n particles of other cloth are taken along with it", (CORNERS,)),
-    )  # fmt: skip
+    )
     ranges: ClassVar = {
         **ManipulationTask.ranges, "coverage": (0.0, 1.0), "coverage_start": (0.0, 1.0), "raised": (0.0, 10.0),
     }  # fmt: skip
@@ -129,4 +112,4 @@ class SpreadingTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        return super().constants() | own | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
+        return super().constants() | own

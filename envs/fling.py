@@ -264,7 +264,7 @@ class ClothFlingEnv(ClothEnv):
     let go, it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps they
     open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
-    The id fixes the physics: that of ``ClothDrape-v0``, with the short cuts of ``physics="fast"``.
+    The id fixes the physics, that of ``ClothDrape-v0``; ``physics="fast"`` has the same short cuts as there.
 
     ## Action Space
     ``Box(-1, 1, (8,))``; for each gripper:

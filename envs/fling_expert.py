@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.flatten_expert import EDGES, OPPOSITE
-from clothgym.envs.taking import places_to_take
+from clothgym.envs.taking import EDGES, OPPOSITE, places_to_take
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.flatten_expert import EDGES
 from clothgym.envs.pick_place import LOWEST
 from clothgym.envs.rumpled import Bank, rumpled_sheets
-from clothgym.envs.taking import CLEAR, beside_corners, places_to_take
+from clothgym.envs.taking import CLEAR, EDGES, beside_corners, places_to_take
 from clothgym.mesh import grid
 
 APART = 0.15  # least distance of the tips as an episode begins, in sides

@@ -1,16 +1,19 @@
-"""Where a gripper can take hold of a corner of a rumpled sheet, and how much other cloth it would take along.
+"""Which corners of a rumpled sheet two grippers take next, and where: an edge by both ends, or one corner and then a neighbor.
 
 A gripper takes all particles within its reach, so a corner is neared from where no other cloth is within reach.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import apart, inlined, kernel
+from clothgym.envs.definition import Observation
 from clothgym.envs.manipulation import CORNERS, REACH
-from clothgym.envs.measures import squared_distance
+from clothgym.envs.measures import distance, length_of, squared_distance
 from clothgym.mesh import ClothMesh
 
 AWAY = 0.85 * REACH  # distance of a tip from the corner that it is to take [m]
@@ -18,6 +21,13 @@ CLEAR = 1.1 * REACH  # distance from it within which no other cloth may be [m]
 LOWEST_TIP = 0.012  # height of a tip [m]
 REACHED = 0.95 * REACH  # distance at which a tip that the floor has moved still takes the corner [m]
 NOT_REACHED = 1000  # particles that one counts for from which the corner is farther
+# corners of each edge, and of the opposite one, side by side, as places in ``mesh.corners``
+EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
+OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
+TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
+NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
+# what a way of one side, and a height of one side, count for in particles that are taken along
+WAY_TO_EDGE, WAY_TO_NEIGHBOR, WAY_TO_CORNER, HEIGHT_OF_CORNER = 0.1, 0.5, 0.3, 2.0
 
 
 def _directions() -> NDArray:
@@ -66,6 +76,111 @@ def take_corners(x, corners, beside, places, others):
             places[k, c] = tips[best, c]
 
 
+@inlined
+def _free_edge(x, corners, tips, places, others, side, goals, count):
+    """Both ends of the nearest edge whose corners lie free; returns whether there is one."""
+    least, best, crossed = 1.0, -1, 0
+    for e in range(EDGES.shape[0]):
+        a, b = EDGES[e, 0], EDGES[e, 1]
+        if others[a] + others[b] > 0 or distance(x[:, corners[a]], x[:, corners[b]]) < TOO_CLOSE * side:
+            continue
+        straight = distance(tips[0], places[a]) + distance(tips[1], places[b])
+        across = distance(tips[0], places[b]) + distance(tips[1], places[a])
+        way = WAY_TO_EDGE * min(straight, across) / side
+        if way < least:
+            least, best, crossed = way, e, int(across < straight)
+    if best < 0:
+        return False
+    for k in range(2):
+        corner = EDGES[best, k ^ crossed]
+        count[k] = others[corner]
+        for c in range(3):
+            goals[k, c] = places[corner, c]
+    return True
+
+
+@apart
+def next_takes(x, corners, beside, holder, tips, side, goals, count):
+    """Where each gripper takes hold next [m], (2, 3), and how many other particles it takes there, or -1 for none, (2,), out.
+
+    Both go to the nearest edge whose corners lie free.  If there is none, one goes to the corner that lies freest.  While one holds
+    a corner, the other goes to a neighbor of it.
+
+    x: a sheet [m], (3, particles).  holder: which gripper holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].
+    """
+    places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
+    take_corners(x, corners, beside, places, others)
+    own = np.full(2, -1)
+    holding = np.zeros(2, np.bool_)
+    for p in range(len(holder)):
+        if holder[p] >= 0:
+            holding[holder[p]] = True
+    for i in range(CORNERS):
+        if holder[corners[i]] >= 0:
+            own[holder[corners[i]]] = i
+    count[:] = -1
+    # both hold something, or one of them something else
+    if (holding[0] and holding[1]) or (holding[0] and own[0] < 0) or (holding[1] and own[1] < 0):
+        return
+    taker, which, least = -1, -1, np.inf
+    if holding[0] or holding[1]:
+        # the neighbor of a corner that lies freest and nearest
+        taker = 1 if holding[0] else 0
+        for i in range(CORNERS):
+            if i == own[1 - taker] or i == CORNERS - 1 - own[1 - taker]:
+                continue
+            cost = others[i] + WAY_TO_NEIGHBOR * distance(places[i], tips[taker]) / side
+            if cost < least:
+                least, which = cost, i
+    elif not _free_edge(x, corners, tips, places, others, side, goals, count):
+        # the corner that lies freest, highest and nearest
+        for i in range(CORNERS):
+            ways = distance(tips[0], places[i]), distance(tips[1], places[i])
+            cost = others[i] + WAY_TO_CORNER * min(ways[0], ways[1]) / side - HEIGHT_OF_CORNER * x[2, corners[i]] / side
+            if cost < least:
+                least, which, taker = cost, i, int(ways[1] < ways[0])
+    if taker >= 0:
+        count[taker] = others[which]
+        for c in range(3):
+            goals[taker, c] = places[which, c]
+
+
+@inlined
+def observe_next(rules, sheet, seen):
+    """Where each gripper takes hold next."""
+    seen.next[:] = 0
+    next_takes(
+        sheet.x, rules.corners, rules.beside_corners, sheet.holder, sheet.attachments, rules.side, seen.next[:, :3], seen.next[:, 3]
+    )
+    for tip in range(sheet.holds.shape[0]):
+        others = seen.next[tip, 3]
+        seen.next[tip, 3] = 1 / (1 + others) if others >= 0 else 0.0
+        if others >= 0:
+            for c in range(3):
+                seen.next[tip, c] -= sheet.attachments[tip, c]
+            # what is near counts most: a direction, times a number that rises from 0 to 1
+            far = length_of(seen.next[tip]) + NEXT_TO
+            for c in range(3):
+                seen.next[tip, c] /= far
+
+
+@kernel
+def _all_next_takes(x, corners, beside, holder, tips, side, goals, count):
+    """``next_takes`` of many sheets, (sheets, 3, particles)."""
+    for sheet in range(x.shape[0]):
+        next_takes(x[sheet], corners, beside, holder[sheet], tips[sheet], side, goals[sheet], count[sheet])
+
+
+def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
+    """Where each gripper of a task takes hold next [m], (num_envs, 2, 3), and ``count`` of ``next_takes``, (num_envs, 2)."""
+    simulation, mesh = task.simulation, task.physics.mesh
+    x, tips = simulation.positions.transpose(0, 2, 1).astype(np.float64), simulation.grippers.positions.astype(np.float64)
+    goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
+    corners, holder = np.array(mesh.corners), np.ascontiguousarray(simulation.grippers.holder)
+    _all_next_takes(np.ascontiguousarray(x), corners, beside_corners(mesh), holder, tips, task.physics.side, goals, count)
+    return goals, count
+
+
 @kernel
 def _take_all(x, corners, beside, places, others):
     """``take_corners`` of many sheets, (sheets, 3, particles)."""
@@ -82,3 +197,11 @@ def places_to_take(x: NDArray, mesh: ClothMesh) -> tuple[NDArray, NDArray]:
     across = np.ascontiguousarray(x.transpose(0, 2, 1))
     _take_all(across, np.array(mesh.corners), beside_corners(mesh), places, others)
     return places, others
+
+
+# what ``observe_next`` writes
+NEXT = Observation(
+    "next",
+    "for each gripper d/(|d| + 1 cm), d the way to where it takes hold next; and 1/(1 + n) of the n other particles there",
+    (2, 4),
+)

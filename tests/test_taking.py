@@ -6,7 +6,7 @@ import pytest
 
 import clothgym  # noqa: F401
 from clothgym.envs.manipulation import REACH
-from clothgym.envs.taking import AWAY, CLEAR, DIRECTIONS, beside_corners, places_to_take
+from clothgym.envs.taking import AWAY, CLEAR, beside_corners, next_takes, places_to_take
 from clothgym.mesh import grid
 
 MESH = grid(17, 17, 0.6, 0.6)
@@ -48,26 +48,117 @@ def test_where_there_is_no_free_place_the_least_is_taken():
     assert places_to_take(x[None], MESH)[1][0].tolist() == [0, 0, 3, 0]
 
 
-@pytest.mark.parametrize("env_id", ["ClothFlatten-v0", "ClothFling-v0"])
-def test_what_is_observed_is_the_best_of_all_directions(env_id):
-    env = gym.make_vec(f"clothgym:{env_id}", num_envs=3)
+def taken_next(x, tips, holder=None):
+    """Where grippers take hold next, and of how many other particles."""
+    holder = np.full(MESH.num_particles, -1) if holder is None else holder
+    goals, count = np.full((2, 3), np.nan), np.empty(2, np.int64)
+    across = np.ascontiguousarray(x.T)
+    next_takes(across, np.array(MESH.corners), beside_corners(MESH), holder, np.array(tips, float), 0.6, goals, count)
+    return goals, count.tolist()
+
+
+def above(x, corner):
+    return x[MESH.corners[corner]] + (0, 0, AWAY)
+
+
+def covered(x, corner):
+    """Three particles of the middle lie on a corner."""
+    x[[8 * 17 + 7, 8 * 17 + 8, 8 * 17 + 9]] = x[MESH.corners[corner]] + (0, 0, 0.001)
+    return x
+
+
+def test_both_go_to_the_nearest_edge_and_do_not_cross():
+    x = lying_flat()
+    # above the edge of the corners 1 and 3, at whichever end they are
+    ends = x[MESH.corners[1]] + (0.05, 0.1, 0.3), x[MESH.corners[3]] + (0.05, -0.1, 0.3)
+    for order in ([0, 1], [1, 0]):
+        goals, count = taken_next(x, [ends[i] for i in order])
+        assert count == [0, 0]
+        np.testing.assert_allclose(goals, [above(x, (1, 3)[i]) for i in order], atol=1e-6)
+
+
+def test_an_edge_with_a_covered_corner_is_left_for_the_opposite_one():
+    x = covered(lying_flat(), 1)
+    ends = x[MESH.corners[1]] + (0.05, 0.1, 0.3), x[MESH.corners[3]] + (0.05, -0.1, 0.3)
+    goals, count = taken_next(x, ends)
+    assert count == [0, 0]
+    # of the two edges without corner 1 that of 3 and 2 is as near as that of 2 and 0 is far
+    taken = {int(np.linalg.norm(goal - [above(x, i) for i in range(4)], axis=1).argmin()) for goal in goals}
+    assert taken == {2, 3}
+
+
+def test_of_covered_corners_one_gripper_takes_the_freest():
+    x = lying_flat()
+    for corner, particles in enumerate(([100, 101, 102], [110, 111, 112], [140, 141, 142], [120, 121])):
+        x[particles] = x[MESH.corners[corner]] + (0, 0, 0.001)
+    goals, count = taken_next(x, [(0, 0, 0.3), (0.1, 0.1, 0.3)])
+    # of corner 3 it takes two others; the other gripper has nothing to take
+    assert sorted(count) == [-1, 2]
+    one = count.index(2)
+    assert np.linalg.norm(goals[one] - x[MESH.corners[3]]) < REACH and np.isnan(goals[1 - one]).all()
+
+
+def test_while_one_holds_a_corner_the_other_takes_its_nearer_neighbor():
+    x, holder = lying_flat(), np.full(MESH.num_particles, -1)
+    holder[[0, 1, 17, 18]] = 1
+    for nearest, corner in ((1, 1), (2, 2), (3, None)):
+        goals, count = taken_next(x, [x[MESH.corners[nearest]] + (0, 0, 0.2), x[0]], holder)
+        assert count == [0, -1]
+        # never the far end of a diagonal
+        expected = [above(x, i) for i in ((corner,) if corner else (1, 2))]
+        assert min(np.linalg.norm(goals[0] - one) for one in expected) < 1e-6
+
+
+def test_nothing_is_taken_beside_what_is_held_by_mistake():
+    x, holder = lying_flat(), np.full(MESH.num_particles, -1)
+    holder[8 * 17 + 8] = 0
+    assert taken_next(x, [x[144], (0, 0, 0.3)], holder)[1] == [-1, -1]
+
+
+def test_what_is_observed_says_where_the_expert_goes():
+    env = gym.make_vec("clothgym:ClothFlatten-v0", num_envs=8)
     seen, _ = env.reset(seed=5)
-    for _ in range(12):
-        seen, *_ = env.step(env.unwrapped.task.expert().astype(np.float32))
     task = env.unwrapped.task
-    slices, side = task.observation_slices, task.physics.side
-    takes, crowding = seen[:, slices["takes"]].reshape(3, 2, 4, 3), seen[:, slices["crowding"]]
-    assert crowding.max() > 0 or env_id == "ClothFling-v0"
-    tips, x = task.simulation.grippers.positions.astype(float), task.simulation.positions.astype(float)
-    rest = MESH.rest_positions
-    for e in range(3):
-        for k, corner in enumerate(MESH.corners):
-            others = x[e, np.linalg.norm(rest - rest[corner], axis=1) > 0.06]
-            at = x[e, corner] + AWAY * DIRECTIONS
-            at[:, 2] = np.maximum(at[:, 2], 0.012)
-            counts = (np.linalg.norm(at[:, None] - others, axis=2) < CLEAR).sum(axis=1)
-            counts[np.linalg.norm(at - x[e, corner], axis=1) > 0.0285] += 1000
-            assert crowding[e, k] == pytest.approx(counts.min() / (1 + counts.min()), abs=1e-6)
-            for tip in range(2):
-                assert takes[e, tip, k] * side / 10 + tips[e, tip] == pytest.approx(at[counts.argmin()], abs=1e-5)
+    at = task.observation_slices["next"]
+    approached = 0
+    for _ in range(20):
+        now, wanted = seen[:, at].reshape(8, 2, 4).astype(float), task.expert().reshape(8, 2, 4)
+        # the way is that of length q to 1 - q of a centimeter; the expert goes there, at most at 0.9 m/s
+        length = np.linalg.norm(now[..., :3], axis=2)
+        way = 0.01 * now[..., :3] / (1 - length)[..., None]
+        speed = np.minimum(15 * np.linalg.norm(way, axis=2), 0.9)[..., None]
+        toward = speed * way / np.maximum(np.linalg.norm(way, axis=2), 1e-9)[..., None]
+        both = (now[..., 3] == 1).all(axis=1)
+        assert toward[both] == pytest.approx(wanted[both][..., :3], abs=2e-3)
+        approached += both.sum()
+        seen, *_ = env.step(wanted.reshape(8, 8).astype(np.float32))
+    assert approached > 30
+    env.close()
+
+
+def test_the_far_edge_is_observed_while_an_edge_is_held():
+    env = gym.make_vec("clothgym:ClothFlatten-v0", num_envs=16)
+    seen, _ = env.reset(seed=5)
+    task = env.unwrapped.task
+    slices, corners, found = task.observation_slices, np.array(MESH.corners), 0
+    # corners beside each other, going around
+    around = [0, 1, 3, 2]
+    for _ in range(60):
+        seen, *_ = env.step(task.expert().astype(np.float32))
+        holder, tips, x = task.simulation.grippers.holder, task.simulation.grippers.positions, task.simulation.positions
+        for e in range(16):
+            held = [next((i for i in range(4) if holder[e, corners[i]] == k), None) for k in range(2)]
+            far, facing = seen[e, slices["far"]].reshape(2, 3), seen[e, slices["facing"]].item()
+            if None in held or sum(held) == 3:
+                assert facing == 0 and not far.any()
+                continue
+            step = (around.index(held[1]) - around.index(held[0])) % 4
+            assert facing == {1: 1, 3: -1}[step]
+            for k in range(2):
+                # the neighbor that the other gripper does not hold
+                i = around.index(held[k])
+                beside = next(j for j in (around[i - 1], around[(i + 1) % 4]) if j != held[1 - k])
+                assert far[k] == pytest.approx((x[e, corners[beside]] - tips[e, k]) / 0.6, abs=1e-5)
+            found += 1
+    assert found > 50
     env.close()
