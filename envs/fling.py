@@ -30,6 +30,7 @@ from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
+from clothgym.envs.taking import NEXT, beside_corners, observe_next
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
 CLOSING = 4  # steps in which the fingers close on the corners as an episode begins
+PERIODS = (12, 36, 108)  # of the waves that are observed [steps]
 NOT_MADE = -1.0  # coverage after a throw that has not been made
 # the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
 BOX = (0.9, 0.3, 1.25)
@@ -118,9 +120,14 @@ def _account_fling(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe_fling(own, rules, sheet, seen):
-    """Grippers, time, coverage, and the throws that are left."""
+    """Grippers, time, coverage, the throws that are left, what grippers take next; and waves that tell steps of a throw apart."""
     observe_spread(own, rules, sheet, seen)
+    observe_next(rules, sheet, seen)
     seen.throws_left = 1 - own.throws / THROWS
+    for i in range(len(PERIODS)):
+        period = PERIODS[i]
+        for quarter in range(2):
+            seen.clock[i, quarter] = 4 * abs((own.step + quarter * period // 4) % period / period - 0.5) - 1
 
 
 class FlingTask(SpreadingTask):
@@ -148,7 +155,14 @@ class FlingTask(SpreadingTask):
         ("throws", np.int64),
         *[(f"coverage_after_{i + 1}", float) for i in range(THROWS)],
     )
-    observations = (*SpreadingTask.observations, Observation("throws_left", "share of the throws that is left"))
+    observations = (
+        *SpreadingTask.observations,
+        Observation("throws_left", "share of the throws that is left"),
+        NEXT,
+        Observation(
+            "clock", "triangle waves over the steps, of periods 12, 36 and 108, each of them also a quarter earlier", (3, 2)
+        ),
+    )
     ranges: ClassVar = {
         **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
         "barred": (0, 1),
@@ -163,6 +177,10 @@ class FlingTask(SpreadingTask):
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+
+    def constants(self) -> dict[str, Any]:
+        mesh = self.physics.mesh
+        return super().constants() | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
 
     def arena(self) -> tuple[NDArray, NDArray]:
         half = self.physics.side * np.array(BOX)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.taking import EDGES, OPPOSITE, places_to_take
+from clothgym.envs.taking import EDGES, OPPOSITE, next_takes_of, places_to_take
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
@@ -59,6 +59,7 @@ def fling_actions(task: Any) -> NDArray:
     takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
     looking = (held[:, 0] == 0) | (held[:, 1] == 0)
     takes[looking], others[looking] = places_to_take(x[looking], mesh)
+    goals, count = next_takes_of(task)
     low, high = task.arena()
     latest = task.throw.starts[-1] - AGAIN
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
@@ -69,7 +70,11 @@ def fling_actions(task: Any) -> NDArray:
             if own["throws"] == 0 and own["step"] < 6:
                 grip[e] = -1
             elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < DONE and own["step"] < latest:
-                move[e], grip[e] = _take(x[e], tips[e], takes[e], others[e], corners, low, high, mesh.grid_shape)
+                # an edge that lies free, or what there is
+                goal = goals[e] if count[e].min() >= 0 and goals[e, 1, 0] - goals[e, 0, 0] > 0.1 else None
+                if goal is None:
+                    goal = _reachable(x[e], tips[e], takes[e], others[e], corners, low, high, mesh.grid_shape)
+                move[e], grip[e] = _take(tips[e], goal, low, high)
             else:
                 move[e, :, 2] = np.where(tips[e, :, 2] < 0.25 * side, 0.4, 0)
             continue
@@ -102,8 +107,9 @@ def fling_actions(task: Any) -> NDArray:
     return np.concatenate([move / limit, grip[..., None]], axis=2).reshape(n, -1)
 
 
-def _take(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: Any, high: Any, shape: Any) -> Any:
-    """Both corners of an edge that lie free and within reach; else, of the nearest edge, the sides where they are within reach."""
+def _reachable(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: Any, high: Any, shape: Any) -> Any:
+    """Where both corners of an edge are taken that lie free and within reach; else, of the nearest edge, the sides where they are
+    within reach [m], (2, 3), or None."""
     least, goal = np.inf, None
     for edge, far in zip(EDGES, OPPOSITE):
         order = slice(None) if x[corners[edge[0]], 0] < x[corners[edge[1]], 0] else slice(None, None, -1)
@@ -116,9 +122,15 @@ def _take(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: Any, hi
             continue
         cost = others[edge].sum() + 10 * outside + np.linalg.norm(at - tips, axis=1).sum()
         if cost < least:
-            least, goal = cost, np.clip(at, low, high)
+            least, goal = cost, at
+    return goal
+
+
+def _take(tips: Any, goal: Any, low: Any, high: Any) -> Any:
+    """Go there, and close."""
     if goal is None:
         return np.zeros((2, 3)), np.ones(2)
+    goal = np.clip(goal, low, high)
     way = goal - tips
     move = 12 * way
     # over the cloth, and then down

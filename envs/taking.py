@@ -24,6 +24,7 @@ NOT_REACHED = 1000  # particles that one counts for from which the corner is far
 # corners of each edge, and of the opposite one, side by side, as places in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
 OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
+BEYOND = 0.008  # by which a place may lie beyond the room of the tips [m]
 TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
 NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
 # what a way of one side, and a height of one side, count for in particles that are taken along
@@ -100,16 +101,21 @@ def _free_edge(x, corners, tips, places, others, side, goals, count):
 
 
 @apart
-def next_takes(x, corners, beside, holder, tips, side, goals, count):
+def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
     """Where each gripper takes hold next [m], (2, 3), and how many other particles it takes there, or -1 for none, (2,), out.
 
     Both go to the nearest edge whose corners lie free.  If there is none, one goes to the corner that lies freest.  While one holds
     a corner, the other goes to a neighbor of it.
 
     x: a sheet [m], (3, particles).  holder: which gripper holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].
+    low, high: corners of the room of the tips [m], (3,); a corner that is taken from beyond it does not lie free.
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
     take_corners(x, corners, beside, places, others)
+    for i in range(CORNERS):
+        for c in range(3):
+            if not low[c] - BEYOND <= places[i, c] <= high[c] + BEYOND:
+                others[i] += NOT_REACHED
     own = np.full(2, -1)
     holding = np.zeros(2, np.bool_)
     for p in range(len(holder)):
@@ -150,7 +156,16 @@ def observe_next(rules, sheet, seen):
     """Where each gripper takes hold next."""
     seen.next[:] = 0
     next_takes(
-        sheet.x, rules.corners, rules.beside_corners, sheet.holder, sheet.attachments, rules.side, seen.next[:, :3], seen.next[:, 3]
+        sheet.x,
+        rules.corners,
+        rules.beside_corners,
+        sheet.holder,
+        sheet.attachments,
+        rules.side,
+        rules.low,
+        rules.high,
+        seen.next[:, :3],
+        seen.next[:, 3],
     )
     for tip in range(sheet.holds.shape[0]):
         others = seen.next[tip, 3]
@@ -165,10 +180,10 @@ def observe_next(rules, sheet, seen):
 
 
 @kernel
-def _all_next_takes(x, corners, beside, holder, tips, side, goals, count):
+def _all_next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
     """``next_takes`` of many sheets, (sheets, 3, particles)."""
     for sheet in range(x.shape[0]):
-        next_takes(x[sheet], corners, beside, holder[sheet], tips[sheet], side, goals[sheet], count[sheet])
+        next_takes(x[sheet], corners, beside, holder[sheet], tips[sheet], side, low, high, goals[sheet], count[sheet])
 
 
 def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
@@ -177,7 +192,8 @@ def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
     x, tips = simulation.positions.transpose(0, 2, 1).astype(np.float64), simulation.grippers.positions.astype(np.float64)
     goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
     corners, holder = np.array(mesh.corners), np.ascontiguousarray(simulation.grippers.holder)
-    _all_next_takes(np.ascontiguousarray(x), corners, beside_corners(mesh), holder, tips, task.physics.side, goals, count)
+    room = task.arena()
+    _all_next_takes(np.ascontiguousarray(x), corners, beside_corners(mesh), holder, tips, task.physics.side, *room, goals, count)
     return goals, count
 
 

@@ -48,12 +48,23 @@ def test_where_there_is_no_free_place_the_least_is_taken():
     assert places_to_take(x[None], MESH)[1][0].tolist() == [0, 0, 3, 0]
 
 
-def taken_next(x, tips, holder=None):
+def taken_next(x, tips, holder=None, high=(9, 9, 9)):
     """Where grippers take hold next, and of how many other particles."""
     holder = np.full(MESH.num_particles, -1) if holder is None else holder
     goals, count = np.full((2, 3), np.nan), np.empty(2, np.int64)
     across = np.ascontiguousarray(x.T)
-    next_takes(across, np.array(MESH.corners), beside_corners(MESH), holder, np.array(tips, float), 0.6, goals, count)
+    next_takes(
+        across,
+        np.array(MESH.corners),
+        beside_corners(MESH),
+        holder,
+        np.array(tips, float),
+        0.6,
+        np.full(3, -9.0),
+        np.array(high, float),
+        goals,
+        count,
+    )
     return goals, count.tolist()
 
 
@@ -85,6 +96,17 @@ def test_an_edge_with_a_covered_corner_is_left_for_the_opposite_one():
     # of the two edges without corner 1 that of 3 and 2 is as near as that of 2 and 0 is far
     taken = {int(np.linalg.norm(goal - [above(x, i) for i in range(4)], axis=1).argmin()) for goal in goals}
     assert taken == {2, 3}
+
+
+def test_an_edge_beyond_reach_is_left_as_well():
+    x = lying_flat()
+    edge = x[MESH.corners[1]], x[MESH.corners[3]]
+    # the room ends a centimeter before it
+    high = (edge[0][0] - 0.01, 9, 9)
+    assert edge[0][0] == edge[1][0]
+    goals, count = taken_next(x, [edge[0] + (0.05, 0.1, 0.3), edge[1] + (0.05, -0.1, 0.3)], high=high)
+    taken = {int(np.linalg.norm(goal - [above(x, i) for i in range(4)], axis=1).argmin()) for goal in goals}
+    assert count == [0, 0] and taken == {0, 2}
 
 
 def test_of_covered_corners_one_gripper_takes_the_freest():
