@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.envs.definition import POSITION_BOUND, VELOCITY_BOUND, Observation
 from clothgym.envs.flatten_expert import flatten_actions, flatten_picks
 from clothgym.envs.flattening import (
     SpreadingTask,
@@ -33,6 +33,31 @@ from clothgym.mesh import grid
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
+SHORTEST = 1e-9  # distance of tips that hold both ends of an edge, which has no direction if they touch [m]
+
+
+@inlined
+def _observe_held_edge(rules, sheet, seen):
+    """While both grippers hold an edge: which way the sheet is laid down, where its far edge is, and how fast, in those axes."""
+    seen.out[:], seen.far[:], seen.swing = 0, 0, 0
+    for e in range(len(EDGES)):
+        for crossed in range(2):
+            first, second = rules.corners[EDGES[e, crossed]], rules.corners[EDGES[e, 1 - crossed]]
+            if sheet.holder[first] != 0 or sheet.holder[second] != 1:
+                continue
+            # along the edge, and across it, to the side on which the sheet lies with its front up
+            x, y = sheet.attachments[1, 0] - sheet.attachments[0, 0], sheet.attachments[1, 1] - sheet.attachments[0, 1]
+            long = max(np.sqrt(x * x + y * y), SHORTEST)
+            x, y, side = x / long, y / long, 1 - 2 * crossed
+            seen.out[0], seen.out[1] = -y * side, x * side
+            for tip in range(2):
+                corner = rules.corners[OPPOSITE[e, tip ^ crossed]]
+                dx, dy = sheet.x[0, corner] - sheet.attachments[tip, 0], sheet.x[1, corner] - sheet.attachments[tip, 1]
+                seen.far[tip, 0] = (dx * x + dy * y) / rules.side
+                seen.far[tip, 1] = (dy * x - dx * y) * side / rules.side
+                seen.far[tip, 2] = (sheet.x[2, corner] - sheet.attachments[tip, 2]) / rules.side
+                seen.swing += (sheet.v[1, corner] * x - sheet.v[0, corner] * y) * side / 2
+
 
 @inlined
 def _observe(own, rules, sheet, seen):
@@ -40,21 +65,11 @@ def _observe(own, rules, sheet, seen):
     observe_spread(own, rules, sheet, seen)
     observe_ways(rules, sheet, seen)
     observe_next(rules, sheet, seen)
-    seen.far[:] = 0
-    seen.facing = 0
     for tip in range(sheet.holds.shape[0]):
         seen.raised[tip] = own.raised[tip] / rules.side
         for k in range(CORNERS):
             seen.corners_held[tip, k] = sheet.holder[rules.corners[k]] == tip
-    for e in range(len(EDGES)):
-        for crossed in range(2):
-            first, second = EDGES[e, crossed], EDGES[e, 1 - crossed]
-            if sheet.holder[rules.corners[first]] == 0 and sheet.holder[rules.corners[second]] == 1:
-                seen.facing = 1 - 2 * crossed
-                for tip in range(2):
-                    corner = rules.corners[OPPOSITE[e, tip ^ crossed]]
-                    for c in range(3):
-                        seen.far[tip, c] = (sheet.x[c, corner] - sheet.attachments[tip, c]) / rules.side
+    _observe_held_edge(rules, sheet, seen)
 
 
 class FlattenTask(SpreadingTask):
@@ -81,13 +96,16 @@ class FlattenTask(SpreadingTask):
         Observation("corners_held", "for each gripper whether it holds each of the corners", (2, CORNERS)),
         NEXT,
         Observation(
+            "out", "while both hold the corners of an edge, the level direction across it in which the sheet is laid flat", (2,)
+        ),
+        Observation(
             "far",
-            "while both hold the corners of an edge, the way from each tip to the far corner of its side",
+            "and the way from each tip to the far corner of its side: along the edge, across it, and up",
             (2, 3),
             "L",
             POSITION_BOUND,
         ),
-        Observation("facing", "and 1 if these corners go around the sheet in the order of its corners, -1 if not; else 0"),
+        Observation("swing", "and how fast the far edge moves across it", (), "m/s", VELOCITY_BOUND),
         Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
     )
 

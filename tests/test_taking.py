@@ -164,23 +164,31 @@ def test_the_far_edge_is_observed_while_an_edge_is_held():
     task = env.unwrapped.task
     slices, corners, found = task.observation_slices, np.array(MESH.corners), 0
     # corners beside each other, going around
-    around = [0, 1, 3, 2]
+    around, rest = [0, 1, 3, 2], MESH.rest_positions[corners]
     for _ in range(60):
         seen, *_ = env.step(task.expert().astype(np.float32))
-        holder, tips, x = task.simulation.grippers.holder, task.simulation.grippers.positions, task.simulation.positions
+        simulation = task.simulation
+        holder, tips = simulation.grippers.holder, simulation.grippers.positions.astype(float)
+        x, v = (part[:, corners].astype(float) for part in (simulation.positions, simulation.velocities))
         for e in range(16):
             held = [next((i for i in range(4) if holder[e, corners[i]] == k), None) for k in range(2)]
-            far, facing = seen[e, slices["far"]].reshape(2, 3), seen[e, slices["facing"]].item()
+            out, far, swing = (seen[e, slices[name]] for name in ("out", "far", "swing"))
             if None in held or sum(held) == 3:
-                assert facing == 0 and not far.any()
+                assert not out.any() and not far.any() and not swing.any()
                 continue
-            step = (around.index(held[1]) - around.index(held[0])) % 4
-            assert facing == {1: 1, 3: -1}[step]
-            for k in range(2):
-                # the neighbor that the other gripper does not hold
-                i = around.index(held[k])
-                beside = next(j for j in (around[i - 1], around[(i + 1) % 4]) if j != held[1 - k])
-                assert far[k] == pytest.approx((x[e, corners[beside]] - tips[e, k]) / 0.6, abs=1e-5)
+            # the neighbor of each corner that the other gripper does not hold
+            turns = [around.index(corner) for corner in held]
+            beside = [next(j for j in (around[i - 1], around[(i + 1) % 4]) if j not in held) for i in turns]
+            along = (tips[e, 1] - tips[e, 0]) * (1, 1, 0)
+            along /= np.linalg.norm(along)
+            # with its front up the sheet lies across the edge as it does at rest
+            up = np.sign(np.cross(rest[held[1]] - rest[held[0]], rest[beside[0]] - rest[held[0]])[2])
+            across = np.cross((0, 0, up), along)
+            assert out == pytest.approx(across[:2], abs=1e-5)
+            ways = x[e, beside] - tips[e]
+            expected = np.stack([ways @ along, ways @ across, ways[:, 2]], axis=1) / 0.6
+            assert far.reshape(2, 3) == pytest.approx(expected, abs=1e-5)
+            assert swing.item() == pytest.approx(v[e, beside].mean(axis=0) @ across, abs=1e-5)
             found += 1
     assert found > 50
     env.close()
