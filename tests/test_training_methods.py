@@ -282,34 +282,3 @@ def test_the_first_weights_are_the_same_on_machines_of_any_number_of_cores(scrip
         torch.set_num_threads(threads)
         found.append(build(tmp_path, config, 0, 0).policy.state_dict())
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
-
-
-def test_turned_samples_are_what_the_expert_does_with_turned_sheets(scripts):
-    from types import SimpleNamespace
-
-    from clone import turned
-
-    from clothgym.envs.flatten_expert import flatten_picks
-
-    env = gym.make_vec("clothgym:ClothFlatten-v0", num_envs=3, action_mode="pick_place").unwrapped
-    seen, _ = env.reset(seed=0)
-    task, actions = env.task, np.clip(env.task.expert(), -1, 1)
-    more, done = turned(task, (seen, actions), 2, seed=5)
-    assert np.array_equal(more[:3], seen) and np.array_equal(done[:3], actions)
-    assert more.shape == (9, 102) and done.shape == (9, 10)
-    # by how much each sheet was turned is seen from where its first corner lies
-    where = more[:, :2].astype(float) @ [1, 1j]
-    angles = np.angle(where[3:6] / where[:3])
-    x = task.simulation.positions.astype(float)
-    for e, angle in enumerate(angles):
-        c, s = np.cos(angle), np.sin(angle)
-        x[e, :, :2] = x[e, :, :2] @ np.array([[c, s], [-s, c]])
-    other = SimpleNamespace(
-        num_envs=3, physics=task.physics, workspace=task.workspace, episode=task.episode, simulation=SimpleNamespace(positions=x)
-    )
-    assert done[3:6] == pytest.approx(flatten_picks(other), abs=1e-5)
-    # heights and all that is no direction stay
-    for name in ("coverage", "corners_held", "acting_left"):
-        part = task.observation_slices[name]
-        assert np.array_equal(more[3:6, part], seen[:, part])
-    assert np.array_equal(more[3:6, 2:54:3], seen[:, 2:54:3])

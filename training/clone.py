@@ -69,34 +69,6 @@ def fill(model: OffPolicyAlgorithm, episodes: int, noise: float, seed: int) -> N
     model._last_obs = None
 
 
-def turned(task: Any, samples: tuple[NDArray, NDArray], turns: int, seed: int) -> tuple[NDArray, NDArray]:
-    """The samples, and so many copies of them turned about the vertical by random angles: what is done turns with what is seen.
-
-    task: one that picks and places about the origin, whose experts know no other directions than those of the sheet.
-    """
-    rng, (seen, actions) = np.random.default_rng(seed), samples
-    grippers = task.num_attachments
-    # where x and y of a vector lie: three numbers each, of a gripper the first three of five; and of an action
-    at = []
-    for name, part in task.observation_slices.items():
-        size = 5 if name == "grippers" else 3 if (part.stop - part.start) % 3 == 0 else 0
-        at += [[start, start + 1] for start in range(part.start, part.stop, size)] if size else []
-    pairs, places = np.array(at), np.array([[5 * k + i, 5 * k + i + 1] for k in range(grippers) for i in (0, 2)])
-    more, done = [seen], [actions]
-    for _ in range(turns):
-        angles = rng.uniform(-np.pi, np.pi, len(actions))
-        both = seen.copy(), actions.copy()
-        for array, columns in zip(both, (pairs, places)):
-            x, y = array[:, columns[:, 0]].astype(float), array[:, columns[:, 1]].astype(float)
-            c, s = np.cos(angles)[:, None], np.sin(angles)[:, None]
-            array[:, columns[:, 0]], array[:, columns[:, 1]] = c * x - s * y, s * x + c * y
-        # what picks beside the sheet, where there is nothing left to do, lies in the corner of the area and is left there
-        idle = (actions.reshape(len(actions), grippers, 5)[:, :, :4] == 1).all(axis=(1, 2))
-        both[1][idle] = actions[idle]
-        more, done = [*more, both[0]], [*done, np.clip(both[1], -1, 1)]
-    return np.concatenate(more), np.concatenate(done)
-
-
 def joined(one: tuple[Observations, NDArray], other: tuple[Observations, NDArray]) -> tuple[Observations, NDArray]:
     """Both samples as one."""
     (seen, actions), (more, others) = one, other

@@ -12,7 +12,7 @@ import evaluate
 import numpy as np
 import policies
 import torch
-from clone import clone, demonstrations, fill, joined, turned
+from clone import clone, demonstrations, fill, joined
 from drawing import draw_learning_curve, film
 from endings import refused
 from learners import build, environments, exported, load_checkpoint, save_checkpoint
@@ -284,15 +284,13 @@ def with_logger(model: Any) -> Any:
 
 def learn_from_expert(model: Any, config: Config) -> None:
     """Clone the scripted expert into the policy."""
-    options = {name: value for name, value in config["clone"].items() if name not in ("critic_rollouts", "turns")}
+    options = {name: value for name, value in config["clone"].items() if name != "critic_rollouts"}
     env: Any = model.env
     episodes, noise, rounds = options.pop("episodes"), options.pop("noise"), options.pop("rounds", 0)
     try:
         samples = demonstrations(env, episodes, noise, config["seed"])
     except NotImplementedError as missing:
         raise ValueError(str(missing)) from missing
-    if "turns" in config["clone"]:
-        samples = turned(env.unwrapped.env.task, samples, config["clone"]["turns"], config["seed"])  # type: ignore[arg-type]
     torch.set_num_threads(config["threads"])
     for number in range(rounds + 1):
         if number:
