@@ -170,6 +170,9 @@ class ClothFlattenEnv(ClothEnv):
     ## Observation Space
     $observations
 
+    ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
+    there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
+
     ## Rewards
     $rewards
 

@@ -295,6 +295,9 @@ class ClothFlingEnv(ClothEnv):
     ## Observation Space
     $observations
 
+    ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
+    there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
+
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one

@@ -218,6 +218,6 @@ def places_to_take(x: NDArray, mesh: ClothMesh) -> tuple[NDArray, NDArray]:
 # what ``observe_next`` writes
 NEXT = Observation(
     "next",
-    "for each gripper d/(|d| + 1 cm), d the way to where it takes hold next; and 1/(1 + n) of the n other particles there",
+    "for each gripper d/(r + 1 cm), d the way to where it takes hold next, of length r; and 1/(1 + n), n other particles there",
     (2, 4),
 )
