@@ -57,6 +57,7 @@ def _observe_held_edge(rules, sheet, seen):
                 seen.far[tip, 1] = (dy * x - dx * y) * side / rules.side
                 seen.far[tip, 2] = (sheet.x[2, corner] - sheet.attachments[tip, 2]) / rules.side
                 seen.swing += (sheet.v[1, corner] * x - sheet.v[0, corner] * y) * side / 2
+            return
 
 
 @inlined
@@ -100,12 +101,12 @@ class FlattenTask(SpreadingTask):
         ),
         Observation(
             "far",
-            "and the way from each tip to the far corner of its side: along the edge, across it, and up",
+            "while both hold an edge, the way from each tip to the far corner of its side: along the edge, across it, and up",
             (2, 3),
             "L",
             POSITION_BOUND,
         ),
-        Observation("swing", "and how fast the far edge moves across it", (), "m/s", VELOCITY_BOUND),
+        Observation("swing", "while both hold an edge, how fast the far edge moves across it", (), "m/s", VELOCITY_BOUND),
         Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
     )
 
@@ -172,6 +173,7 @@ class ClothFlattenEnv(ClothEnv):
 
     ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
     there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
+    It is 0 for a gripper that has nothing to take.
 
     ## Rewards
     $rewards
@@ -234,6 +236,8 @@ class ClothFlattenHardEnv(ClothEnv):
 
     ## Observation Space
     $observations
+
+    ``next`` is chosen as in ``ClothFlatten-v0``.
 
     ## Rewards
     As in ``ClothFlatten-v0``.

@@ -122,12 +122,14 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
     move, grip = np.zeros((2, 3)), np.ones(2)
     grip[k] = -1
     goal, way = goals[1 - k], np.linalg.norm(goals[1 - k] - tips[1 - k])
-    close = way < 0.05 and others[1 - k] < 1
+    close = way < 0.05 and others[1 - k] == 0
     up = own["raised"][k] > LIFT_ONE * side - 0.03
     if not up and not close:
         move[k] = _to(np.array([0.0, 0.0, LIFT_ONE * side]), tips[k])
         move[k, :2] *= 0.5
-    if close or (up and speed < CALM_ONE):
+    if others[1 - k] < 0:
+        pass  # what is held are both neighbors
+    elif close or (up and speed < CALM_ONE):
         move[1 - k] = _to(goal, tips[1 - k])
         grip[1 - k] = -1 if way < NEAR else 1
     else:

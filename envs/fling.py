@@ -297,6 +297,7 @@ class ClothFlingEnv(ClothEnv):
 
     ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
     there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
+    It is also given for a gripper that may not close any more, and 0 for one that has nothing to take.
 
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
@@ -371,6 +372,8 @@ class ClothFlingHardEnv(ClothEnv):
 
     ## Observation Space
     $observations
+
+    ``next`` is chosen as in ``ClothFling-v0``.
 
     ## Rewards
     As in ``ClothFling-v0``.

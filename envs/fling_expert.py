@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.taking import EDGES, OPPOSITE, next_takes_of, places_to_take
+from clothgym.envs.taking import BEYOND, EDGES, OPPOSITE, next_takes_of, places_to_take
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
@@ -116,7 +116,7 @@ def _reachable(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: An
         edge, far = edge[order], far[order]
         at = takes[edge]
         outside = np.maximum(np.maximum(low - at, at - high), 0).max()
-        if outside > 0.008:
+        if outside > BEYOND:
             at, outside = _within(x, corners[edge], corners[far], low, high, shape), 1.0
         if at is None or at[1, 0] - at[0, 0] < 0.1:
             continue

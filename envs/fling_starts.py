@@ -15,7 +15,7 @@ from clothgym.envs.taking import CLEAR, EDGES, beside_corners, places_to_take
 from clothgym.mesh import grid
 
 APART = 0.15  # least distance of the tips as an episode begins, in sides
-NEARER = 0.75  # share of the distance at which the expert of ClothFlatten-v0 takes a corner: a sheet may stir as it is taken
+NEARER = 0.75  # share of the distance at which tips take a corner otherwise: a sheet may stir as it is taken
 
 
 class Start(NamedTuple):

@@ -14,13 +14,13 @@ from clothgym._jit import apart, inlined, kernel
 from clothgym.envs.definition import Observation
 from clothgym.envs.manipulation import CORNERS, REACH
 from clothgym.envs.measures import distance, length_of, squared_distance
+from clothgym.envs.pick_place import LOWEST
 from clothgym.mesh import ClothMesh
 
 AWAY = 0.85 * REACH  # distance of a tip from the corner that it is to take [m]
-CLEAR = 1.1 * REACH  # distance from it within which no other cloth may be [m]
-LOWEST_TIP = 0.012  # height of a tip [m]
+CLEAR = 1.1 * REACH  # distance from the tip within which no other cloth may be [m]
 REACHED = 0.95 * REACH  # distance at which a tip that the floor has moved still takes the corner [m]
-NOT_REACHED = 1000  # particles that one counts for from which the corner is farther
+NOT_REACHED = 1000  # particles that a place counts for from which the corner is out of reach
 # corners of each edge, and of the opposite one, side by side, as places in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
 OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
@@ -45,7 +45,7 @@ DIRECTIONS = _directions()
 
 
 def beside_corners(mesh: ClothMesh) -> NDArray:
-    """Which particles may be taken along with each corner, its neighbors, (4, particles): 0 or 1, for no record has bool arrays."""
+    """Which particles may be taken along with each corner, (4, particles): its neighbors; 0 or 1: records hold no bool arrays."""
     rest = mesh.rest_positions
     return (np.linalg.norm(rest[list(mesh.corners)][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)).astype(np.uint8)
 
@@ -63,7 +63,7 @@ def take_corners(x, corners, beside, places, others):
         for d in range(len(DIRECTIONS)):
             for c in range(3):
                 tips[d, c] = at[c] + AWAY * DIRECTIONS[d, c]
-            tips[d, 2] = max(tips[d, 2], LOWEST_TIP)
+            tips[d, 2] = max(tips[d, 2], LOWEST)
             count[d] = 0 if squared_distance(tips[d], at) < REACHED**2 else NOT_REACHED
         # particles near the corner alone can be within reach
         for p in range(x.shape[1]):
@@ -80,7 +80,7 @@ def take_corners(x, corners, beside, places, others):
 @inlined
 def _free_edge(x, corners, tips, places, others, side, goals, count):
     """Both ends of the nearest edge whose corners lie free; returns whether there is one."""
-    least, best, crossed = 1.0, -1, 0
+    least, best, crossed = np.inf, -1, 0
     for e in range(EDGES.shape[0]):
         a, b = EDGES[e, 0], EDGES[e, 1]
         if others[a] + others[b] > 0 or distance(x[:, corners[a]], x[:, corners[b]]) < TOO_CLOSE * side:
@@ -108,7 +108,8 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
     a corner, the other goes to a neighbor of it.
 
     x: a sheet [m], (3, particles).  holder: which gripper holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].
-    low, high: corners of the room of the tips [m], (3,); a corner that is taken from beyond it does not lie free.
+    low, high: corners of the room of the tips [m], (3,); a corner that is taken from beyond it counts as one with
+    1000 others.
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
     take_corners(x, corners, beside, places, others)
@@ -122,7 +123,7 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
         if holder[p] >= 0:
             holding[holder[p]] = True
     for i in range(CORNERS):
-        if holder[corners[i]] >= 0:
+        if holder[corners[i]] >= 0 and own[holder[corners[i]]] < 0:
             own[holder[corners[i]]] = i
     count[:] = -1
     # both hold something, or one of them something else
@@ -133,7 +134,7 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
         # the neighbor of a corner that lies freest and nearest
         taker = 1 if holding[0] else 0
         for i in range(CORNERS):
-            if i == own[1 - taker] or i == CORNERS - 1 - own[1 - taker]:
+            if holder[corners[i]] >= 0 or i == CORNERS - 1 - own[1 - taker]:
                 continue
             cost = others[i] + WAY_TO_NEIGHBOR * distance(places[i], tips[taker]) / side
             if cost < least:
@@ -145,7 +146,7 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
             cost = others[i] + WAY_TO_CORNER * min(ways[0], ways[1]) / side - HEIGHT_OF_CORNER * x[2, corners[i]] / side
             if cost < least:
                 least, which, taker = cost, i, int(ways[1] < ways[0])
-    if taker >= 0:
+    if which >= 0:
         count[taker] = others[which]
         for c in range(3):
             goals[taker, c] = places[which, c]
@@ -218,6 +219,6 @@ def places_to_take(x: NDArray, mesh: ClothMesh) -> tuple[NDArray, NDArray]:
 # what ``observe_next`` writes
 NEXT = Observation(
     "next",
-    "for each gripper d/(r + 1 cm), d the way to where it takes hold next, of length r; and 1/(1 + n), n other particles there",
+    "for each gripper d/(r + 1 cm), d the way to where it takes hold next, r long, and 1/(1 + n), n other particles there; or 0",
     (2, 4),
 )

@@ -131,6 +131,18 @@ def test_while_one_holds_a_corner_the_other_takes_its_nearer_neighbor():
         assert min(np.linalg.norm(goals[0] - one) for one in expected) < 1e-6
 
 
+def test_what_the_other_gripper_holds_is_not_taken():
+    x, holder = lying_flat(), np.full(MESH.num_particles, -1)
+    # two corners of an edge in one hand: there is one neighbor of the first that is not held
+    holder[[MESH.corners[0], MESH.corners[1]]] = 0
+    goals, count = taken_next(x, [x[0], x[MESH.corners[1]] + (0, 0, 0.1)], holder)
+    assert count == [-1, 0]
+    np.testing.assert_allclose(goals[1], above(x, 2), atol=1e-6)
+    # and of three there is none
+    holder[MESH.corners[2]] = 0
+    assert taken_next(x, [x[0], x[MESH.corners[1]] + (0, 0, 0.1)], holder)[1] == [-1, -1]
+
+
 def test_nothing_is_taken_beside_what_is_held_by_mistake():
     x, holder = lying_flat(), np.full(MESH.num_particles, -1)
     holder[8 * 17 + 8] = 0
@@ -145,7 +157,7 @@ def test_what_is_observed_says_where_the_expert_goes():
     approached = 0
     for _ in range(20):
         now, wanted = seen[:, at].reshape(8, 2, 4).astype(float), task.expert().reshape(8, 2, 4)
-        # the way is that of length q to 1 - q of a centimeter; the expert goes there, at most at 0.9 m/s
+        # an observed length q stands for a way of q/(1 - q) cm; the expert goes there, at most at 0.9 m/s
         length = np.linalg.norm(now[..., :3], axis=2)
         way = 0.01 * now[..., :3] / (1 - length)[..., None]
         speed = np.minimum(15 * np.linalg.norm(way, axis=2), 0.9)[..., None]

@@ -3,7 +3,8 @@
 import importlib
 
 import pytest
-from training_runs import run
+import yaml
+from training_runs import ROOT, run
 
 optuna = pytest.importorskip("optuna")
 
@@ -13,17 +14,16 @@ def tune(scripts):
     return importlib.import_module("tune")
 
 
-def test_the_first_trial_is_the_committed_configuration(tune):
-    config = tune.Args(env="ClothReach-v0", timesteps=1000).config
+@pytest.mark.parametrize("env", yaml.safe_load((ROOT / "training" / "hyperparams" / "ppo.yml").read_text()))
+def test_the_first_trial_is_the_committed_configuration(tune, env):
+    config = tune.Args(env=env, timesteps=1000).config
     again = tune.proposed(optuna.trial.FixedTrial(tune.starting_point(config)), config)
-    # what the file leaves to SB3 is said
+    # what the file leaves to SB3 is said; and trials do not begin with other arguments
     assert again["hyperparameters"].pop("clip_range") == 0.2
-    assert again == config
+    assert again == config and config["curriculum"] == {}
 
 
 def test_what_is_found_can_be_trained_with(tune):
-    import yaml
-
     config = tune.Args(env="ClothReach-v0", timesteps=1000).config
     trial = tune.starting_point(config) | {"n_envs": 16, "minibatches": 8, "n_steps": 20, "learning_rate": 0.00123456}
     found = yaml.safe_load(tune.as_yaml(tune.proposed(optuna.trial.FixedTrial(trial), config)))["ClothReach-v0"]
@@ -37,9 +37,15 @@ def test_a_study_goes_on(tmp_path):
     refused = run("tune.py", *common, "--show", cwd=tmp_path)
     # its frame breaks lines
     assert refused.returncode == 2 and "there is no such study" in " ".join(refused.stderr.replace("│", " ").split())
+    wrong = tmp_path / "other.log"
+    wrong.write_text("no journal")
+    refused = run("tune.py", "--study", wrong, cwd=tmp_path)
+    assert refused.returncode == 2 and "is no journal of a study of ClothReach-v0" in refused.stderr
     for trials in (1, 2):
         done = run("tune.py", *common, "--trials", trials, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
+    refused = run("tune.py", *common[:3], 650, *common[4:], cwd=tmp_path)
+    assert refused.returncode == 2 and "have --timesteps 640 --episodes 2 --seeds 1" in refused.stderr
     backend = optuna.storages.journal.JournalFileBackend(str(journal))
     study = optuna.load_study(study_name="ClothReach-v0", storage=optuna.storages.JournalStorage(backend))
     first, second = study.trials

@@ -48,25 +48,31 @@ class Args:
         for name in ("timesteps", "trials", "episodes", "seeds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} {getattr(self, name)}: must be at least 1")
-        # the committed configuration, which checks the id and the steps
-        self.config = train.Args(env=self.env, timesteps=self.timesteps, run=Path("runs") / "tuning").config
+        # the committed configuration, which checks the id and the steps; trials are short, and have no curriculum
+        self.config = train.Args(env=self.env, timesteps=self.timesteps, run=Path("runs") / "tuning").config | {"curriculum": {}}
         self.journal = self.study or Path("runs") / "tuning" / f"{self.config['env']}.log"
+        if self.journal.suffix == ".png":
+            raise ValueError(f"--study {self.journal}: this is where its plot goes: give another suffix, .log for instance")
         if self.show and not self.journal.is_file():
             raise ValueError(f"{self.journal}: there is no such study: call without --show first")
 
 
 def proposed(trial: Any, committed: dict[str, Any]) -> dict[str, Any]:
-    """A configuration with the numbers that a trial proposes."""
-    num_envs = trial.suggest_categorical("n_envs", [16, 32, 64, 128])
-    steps, batches = trial.suggest_categorical("n_steps", [10, 20, 40]), trial.suggest_categorical("minibatches", [1, 2, 4, 8])
+    """A configuration with the numbers that a trial proposes: the usual ones, and the committed ones."""
+    first = starting_point(committed)
+
+    def one_of(name: str, *usual: float) -> Any:
+        return trial.suggest_categorical(name, sorted({*usual, first[name]}))
+
+    num_envs, steps, batches = one_of("n_envs", 16, 32, 64, 128), one_of("n_steps", 10, 20, 40), one_of("minibatches", 1, 2, 4, 8)
     hyperparameters = committed["hyperparameters"] | {
         "n_steps": steps,
         "batch_size": num_envs * steps // batches,
         "n_epochs": trial.suggest_int("n_epochs", 3, 12),
         "learning_rate": f"lin_{trial.suggest_float('learning_rate', 3e-4, 6e-3, log=True):.3g}",
-        "gamma": trial.suggest_categorical("gamma", [0.9, 0.95, 0.97, 0.99]),
-        "gae_lambda": trial.suggest_categorical("gae_lambda", [0.8, 0.9, 0.95, 0.98]),
-        "clip_range": trial.suggest_categorical("clip_range", [0.1, 0.2, 0.3]),
+        "gamma": one_of("gamma", 0.9, 0.95, 0.97, 0.99),
+        "gae_lambda": one_of("gae_lambda", 0.8, 0.9, 0.95, 0.98),
+        "clip_range": one_of("clip_range", 0.1, 0.2, 0.3),
     }
     std = trial.suggest_float("log_std_init", -2.5, -0.5)
     hyperparameters["policy_kwargs"] = committed["hyperparameters"]["policy_kwargs"] | {"log_std_init": round(std, 2)}
@@ -76,11 +82,10 @@ def proposed(trial: Any, committed: dict[str, Any]) -> dict[str, Any]:
 def starting_point(committed: dict[str, Any]) -> dict[str, Any]:
     """The committed numbers, as ``proposed`` asks for them."""
     own, num_envs = committed["hyperparameters"], committed["num_envs"]
-    rate = own["learning_rate"]
     return {
         "n_envs": num_envs,
         "minibatches": num_envs * own["n_steps"] // own["batch_size"],
-        "learning_rate": float(rate.partition("_")[2]) if isinstance(rate, str) else rate,
+        "learning_rate": float(str(own["learning_rate"]).removeprefix("lin_")),
         "log_std_init": own["policy_kwargs"]["log_std_init"],
         "clip_range": own.get("clip_range", 0.2),
     } | {name: own[name] for name in ("n_steps", "n_epochs", "gamma", "gae_lambda")}
@@ -98,6 +103,7 @@ def score(config: dict[str, Any], seed: int, episodes: int) -> tuple[float, floa
         begun = time.process_time()
         model.learn(config["timesteps"])
         taken = time.process_time() - begun
+        model.env.close()
     seeds = list(range(VALIDATION, VALIDATION + episodes))
     found = run_episodes(config["env"], acting_of(model), seeds, progress=False, **config["env_kwargs"])
     return float(found["is_success"].mean()), taken
@@ -106,6 +112,7 @@ def score(config: dict[str, Any], seed: int, episodes: int) -> tuple[float, floa
 def as_yaml(config: dict[str, Any]) -> str:
     """A configuration as a file of hyperparameters has it."""
     first = {"n_envs": config["num_envs"], "n_timesteps": config["timesteps"], "policy": config["hyperparameters"]["policy"]}
+    first |= {"env_kwargs": config["env_kwargs"]} if config["env_kwargs"] else {}
     return yaml.safe_dump({config["env"]: first | config["hyperparameters"]}, sort_keys=False)
 
 
@@ -119,25 +126,59 @@ def draw(study: Any, path: Path) -> None:
     figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
     axes.plot(numbers, values, "o", color="0.55", label="trial")
     axes.step(numbers, best, where="post", color="C0", label="best so far")
-    axes.axhline(values[0], color="C3", linestyle=":", label="committed before")
+    for trial in done:
+        if "fixed_params" in trial.system_attrs:
+            axes.axhline(trial.value, color="C3", linestyle=":", label="committed")
     axes.set(xlabel="trial", ylabel="success", ylim=(-0.02, 1.02))
     axes.legend(frameon=False)
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
-def main(args: Args) -> None:
-    import optuna
+def opened(args: Args) -> Any:
+    """The study of a journal, new if there is none, with the committed numbers waiting as its first trial.
+
+    Raises:
+        ImportError: Optuna is not there.
+        ValueError: the file is something else, or its trials are of other steps, episodes or seeds.
+    """
+    try:
+        import optuna
+    except ImportError:
+        raise ImportError("a search needs Optuna: pip install 'clothgym[tune]'") from None
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend
     from optuna.trial import TrialState
 
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    name, settings = args.config["env"], {"timesteps": args.timesteps, "episodes": args.episodes, "seeds": args.seeds}
     args.journal.parent.mkdir(parents=True, exist_ok=True)
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    storage = JournalStorage(JournalFileBackend(str(args.journal)))
-    study = optuna.create_study(study_name=args.config["env"], storage=storage, direction="maximize", load_if_exists=True)
-    if not study.trials:
+    try:
+        storage = JournalStorage(JournalFileBackend(str(args.journal)))
+        if args.show:
+            study = optuna.load_study(study_name=name, storage=storage)
+        else:
+            study = optuna.create_study(study_name=name, storage=storage, direction="maximize", load_if_exists=True)
+    except (ValueError, KeyError, AssertionError):
+        raise ValueError(f"{args.journal} is no journal of a study of {name}: name another file with --study") from None
+    kept = study.user_attrs.get("settings")
+    if kept is None:
+        study.set_user_attr("settings", settings)
+    elif kept != settings:
+        given = " ".join(f"--{option} {value}" for option, value in kept.items())
+        raise ValueError(f"the trials of {args.journal} have {given}: give these, or another file with --study")
+    if not study.get_trials(states=(TrialState.COMPLETE, TrialState.WAITING)):
+        if args.show:
+            raise ValueError(f"{args.journal} has no finished trial")
         study.enqueue_trial(starting_point(args.config))
+    return study
+
+
+def main(args: Args) -> None:
+    with refused():
+        study = opened(args)
+    import optuna
+    from optuna.trial import TrialState
 
     def objective(trial: Any) -> float:
         config = proposed(trial, args.config)
@@ -152,13 +193,13 @@ def main(args: Args) -> None:
     study.sampler = optuna.samplers.TPESampler(seed=finished, multivariate=True)
     if not args.show and finished < args.trials:
         study.optimize(objective, n_trials=args.trials - finished)
-    best = study.best_trial
-    print(f"of {len(study.trials)} trials number {best.number} is best: success {best.value:.3f} after {args.timesteps:,} steps")
+    finished, best = len(study.get_trials(states=(TrialState.COMPLETE,))), study.best_trial
+    print(f"of {finished} trials number {best.number} is best: success {best.value:.3f} after {args.timesteps:,} steps")
     print(as_yaml(proposed(optuna.trial.FixedTrial(best.params), args.config)))
     draw(study, args.journal.with_suffix(".png"))
 
 
 if __name__ == "__main__":
     given = tyro.cli(Args)
-    with stopped(lambda: f": the study {given.journal} goes on with the same command"), refused():
+    with stopped(lambda: f": the study {given.journal} goes on with the same command"):
         main(given)
