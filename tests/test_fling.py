@@ -209,7 +209,8 @@ def test_a_clock_and_the_next_corners_are_observed():
         goals, count = next_takes_of(task)
         ways = goals - task.simulation.grippers.positions
         length = np.linalg.norm(ways, axis=2, keepdims=True)
-        expected = np.concatenate([ways / (length + 0.01), 1 / (1 + np.maximum(count, 0)[..., None])], axis=2) * (count >= 0)[..., None]
+        free = 1 / (1 + np.maximum(count, 0)[..., None])
+        expected = np.concatenate([ways / (length + 0.01), free], axis=2) * (count >= 0)[..., None]
         assert seen[:, slices["next"]].reshape(4, 2, 4) == pytest.approx(expected, abs=1e-4)
         looked += (count >= 0).sum()
     assert looked > 20
