@@ -158,6 +158,17 @@ def test_an_interrupted_suite_goes_on(scripts, tmp_path, monkeypatch):
     }
 
 
+def test_a_file_of_something_else_is_refused_before_anything_is_scored(scripts, tmp_path, capsys):
+    import suite
+
+    path = tmp_path / "list.json"
+    path.write_text("[]")
+    wanted, said = suite.rows_of([ENV], ("noop",), HELD_OUT, {}), []
+    with pytest.raises(SystemExit):
+        suite.run(wanted, 1, path, anew=True, threads=1, say=said.append)
+    assert not said and "is no file of a suite's scores" in capsys.readouterr().err
+
+
 def test_rows_of_another_machine_or_file_are_not_added_to(scripts, tmp_path):
     import suite
 

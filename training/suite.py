@@ -119,8 +119,9 @@ def run(
     """Score rows that are not in the file yet, or all of them anew; ``say`` is told of each."""
     more = {} if threads is None else {"threads": threads}
     with refused():
-        # what an environment or a checkpoint does not take is reported before anything runs
-        finished = [] if anew else load(path)
+        # what a file, an environment or a checkpoint does not take is reported before anything runs
+        finished = load(path)
+        finished = [] if anew else finished
         chosen = [policies.named(row["policy"], row["env"], row["seed"]) for row in wanted]
         for row in wanted:
             gym.make_vec(row["env"], num_envs=1, **row["env_kwargs"], **more).close()
