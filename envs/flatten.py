@@ -26,7 +26,7 @@ from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import EDGES, NEXT, OPPOSITE, beside_corners, observe_next
+from clothgym.envs.taking import EDGES, NEXT, OPPOSITE, observe_next
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
@@ -114,10 +114,6 @@ class FlattenTask(SpreadingTask):
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
-
-    def constants(self) -> dict[str, Any]:
-        mesh = self.physics.mesh
-        return super().constants() | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side

@@ -13,6 +13,7 @@ from clothgym.envs.episode import Fields
 from clothgym.envs.gripper_task import measure_grips
 from clothgym.envs.manipulation import ManipulationTask, follow, observe_grippers
 from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
+from clothgym.envs.taking import beside_corners
 
 HOLDING = 0.1  # share of the potential that is for holding the sheet
 HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
@@ -112,4 +113,4 @@ class SpreadingTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        return super().constants() | own
+        return super().constants() | own | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}

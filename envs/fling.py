@@ -30,7 +30,7 @@ from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import NEXT, beside_corners, observe_next
+from clothgym.envs.taking import NEXT, observe_next
 from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
@@ -159,9 +159,7 @@ class FlingTask(SpreadingTask):
         *SpreadingTask.observations,
         Observation("throws_left", "share of the throws that is left"),
         NEXT,
-        Observation(
-            "clock", "triangle waves over the steps, of periods 12, 36 and 108, each of them also a quarter earlier", (3, 2)
-        ),
+        Observation("clock", f"triangle waves of {PERIODS} steps, each of them also a quarter earlier", (len(PERIODS), 2)),
     )
     ranges: ClassVar = {
         **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
@@ -177,10 +175,6 @@ class FlingTask(SpreadingTask):
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
-
-    def constants(self) -> dict[str, Any]:
-        mesh = self.physics.mesh
-        return super().constants() | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
 
     def arena(self) -> tuple[NDArray, NDArray]:
         half = self.physics.side * np.array(BOX)

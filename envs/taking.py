@@ -28,7 +28,7 @@ BEYOND = 0.008  # by which a place may lie beyond the room of the tips [m]
 TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
 NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
 # what a way of one side, and a height of one side, count for in particles that are taken along
-WAY_TO_EDGE, WAY_TO_NEIGHBOR, WAY_TO_CORNER, HEIGHT_OF_CORNER = 0.1, 0.5, 0.3, 2.0
+WAY_TO_NEIGHBOR, WAY_TO_CORNER, HEIGHT_OF_CORNER = 0.5, 0.3, 2.0
 
 
 def _directions() -> NDArray:
@@ -87,9 +87,8 @@ def _free_edge(x, corners, tips, places, others, side, goals, count):
             continue
         straight = distance(tips[0], places[a]) + distance(tips[1], places[b])
         across = distance(tips[0], places[b]) + distance(tips[1], places[a])
-        way = WAY_TO_EDGE * min(straight, across) / side
-        if way < least:
-            least, best, crossed = way, e, int(across < straight)
+        if min(straight, across) < least:
+            least, best, crossed = min(straight, across), e, int(across < straight)
     if best < 0:
         return False
     for k in range(2):
@@ -113,10 +112,12 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
     take_corners(x, corners, beside, places, others)
+    # what the tips cannot reach does not lie free
     for i in range(CORNERS):
         for c in range(3):
             if not low[c] - BEYOND <= places[i, c] <= high[c] + BEYOND:
                 others[i] += NOT_REACHED
+    # whether each gripper holds something, and its first corner
     own = np.full(2, -1)
     holding = np.zeros(2, np.bool_)
     for p in range(len(holder)):
