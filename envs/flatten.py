@@ -13,6 +13,7 @@ from clothgym._jit import inlined
 from clothgym.envs.definition import POSITION_BOUND, VELOCITY_BOUND, Observation
 from clothgym.envs.flatten_expert import flatten_actions, flatten_picks
 from clothgym.envs.flattening import (
+    LIFTED,
     SpreadingTask,
     account_spread,
     evaluate_spread,
@@ -65,9 +66,11 @@ def _observe(own, rules, sheet, seen):
     """What both spreading tasks observe; what grippers take next; how high they have been since they took hold; the far edge."""
     observe_spread(own, rules, sheet, seen)
     observe_ways(rules, sheet, seen)
-    observe_next(rules, sheet, seen)
+    observe_next(own, rules, sheet, seen, False)
     for tip in range(sheet.holds.shape[0]):
         seen.raised[tip] = own.raised[tip] / rules.side
+        for i in range(len(LIFTED)):
+            seen.lifted[tip, i] = own.raised[tip] > LIFTED[i] * rules.side
         for k in range(CORNERS):
             seen.corners_held[tip, k] = sheet.holder[rules.corners[k]] == tip
     _observe_held_edge(rules, sheet, seen)
@@ -108,6 +111,7 @@ class FlattenTask(SpreadingTask):
         ),
         Observation("swing", "while both hold an edge, how fast the far edge moves across it", (), "m/s", VELOCITY_BOUND),
         Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
+        Observation("lifted", f"for each gripper whether that is above {LIFTED[0]} L, and above {LIFTED[1]} L", (2, len(LIFTED))),
     )
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
@@ -169,7 +173,7 @@ class ClothFlattenEnv(ClothEnv):
 
     ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
     there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
-    It is 0 for a gripper that has nothing to take.
+    It is 0 for a gripper that has nothing to take, and for both while a sheet that they do not hold covers 0.955 or more.
 
     ## Rewards
     $rewards

@@ -11,15 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
+from clothgym.envs.flattening import LIFTED
 from clothgym.envs.pick_place import STEPS
-from clothgym.envs.taking import EDGES, OPPOSITE, next_takes_of
+from clothgym.envs.taking import EDGES, FLAT, OPPOSITE, next_takes_of
 
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
-LIFT, LIFT_ONE = 1.22, 0.95  # how high an edge is lifted, and a corner alone, in sides
-CALM, CALM_ONE = 0.5, 0.7  # rms speed at which the sheet is laid down, and the other corner taken [m/s]
+LIFT, LIFT_ONE = 1.25, 0.95  # height that is aimed at with an edge, and with a corner alone, in sides; LIFTED is enough
+CALM, CALM_ONE = 0.5, 0.7  # rms speed of the particles at which the sheet is laid down, and the other corner taken [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sheet is laid down [m/s]
-DONE = 0.96  # coverage with which it is content
+# while it is laid down the far edge is to be farther away by AHEAD for each meter that the hands sink.  Up to NEARER [m] of what it
+# is too near is corrected: for each meter the hands move backward faster [1/s], and down more slowly, by this share [1/m]
+AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
 TEARING = 0.5  # strain at which it lets go
 AGAIN = 95  # steps that another try takes
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
@@ -43,7 +46,7 @@ def flatten_actions(task: Any) -> NDArray:
         own = task.episode[e]
         held = [np.flatnonzero(holder[e] == k) for k in range(2)]
         corner = [next((i for i in range(4) if holder[e, corners[i]] == k), -1) for k in range(2)]
-        laid = own["raised"].max() > LIFT * side - 0.03 and max(tips[e, k, 2] for k in range(2)) < 0.06
+        laid = own["raised"].max() > LIFTED[1] * side and max(tips[e, k, 2] for k in range(2)) < 0.06
         if laid and min(corner) < 0:
             pass  # what has been laid down is let go of
         elif any(len(held[k]) and corner[k] < 0 for k in range(2)):
@@ -57,7 +60,7 @@ def flatten_actions(task: Any) -> NDArray:
             grip[e] = 1 if strain > TEARING else grip[e]
         elif corner[0] >= 0 or corner[1] >= 0:
             move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
-        elif own["coverage"] >= DONE or own["step"] > task.acting_steps - AGAIN:
+        elif own["coverage"] >= task.enough + FLAT or own["step"] > task.acting_steps - AGAIN:
             move[e, :, 2] = np.where(tips[e, :, 2] < 0.3, 0.5, 0)
         else:
             move[e], grip[e] = _take_first(tips[e], goals[e], others[e], side)
@@ -91,7 +94,7 @@ def flatten_picks(task: Any) -> NDArray:
             middle, apart = middle + side * turned, PULLED * side / 2 * along
         else:
             apart = PULLED * np.sqrt(2) * side / 2 * turned
-        now = (number == k) & (task.episode["coverage"] < DONE)
+        now = (number == k) & (task.episode["coverage"] < task.enough + FLAT)
         for gripper, (pick, place) in enumerate(((p[:, a], middle - apart), (p[:, b], middle + apart))):
             actions[now, gripper, 0:2], actions[now, gripper, 2:4] = pick[now] / half, place[now] / half
             actions[now, gripper, 4] = 2 * (LIFT_EDGE if on_edge else LIFT_CORNER) - 1
@@ -123,7 +126,7 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
     grip[k] = -1
     goal, way = goals[1 - k], np.linalg.norm(goals[1 - k] - tips[1 - k])
     close = way < 0.05 and others[1 - k] == 0
-    up = own["raised"][k] > LIFT_ONE * side - 0.03
+    up = own["raised"][k] > LIFTED[0] * side
     if not up and not close:
         move[k] = _to(np.array([0.0, 0.0, LIFT_ONE * side]), tips[k])
         move[k, :2] *= 0.5
@@ -156,7 +159,7 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     apart = np.stack([-along, along]) * taut / 2
     low = x[ends, 2].min()
     far = x[corners[OPPOSITE[edge]]].mean(axis=0)
-    lifted = own["raised"].min() > LIFT * side - 0.03
+    lifted = own["raised"].min() > LIFTED[1] * side
     if not lifted:
         goal = 0.5 * side * out + (0, 0, LIFT * side)
         move = _to(goal + apart, tips)
@@ -173,13 +176,14 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     # begin as the far edge swings outward, or hangs still
     swing, reach = float(v[corners[OPPOSITE[edge]]].mean(axis=0) @ out), float((far - middle) @ out)
     sways = speed > CALM or (speed > 0.2 and (swing < 0 or reach < -0.02))
-    if middle[2] > LIFT * side - 0.04 and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
+    if middle[2] > LIFTED[1] * side - 0.01 and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
         return keep, -np.ones(2)
     height = x[ends, 2].mean()
     if low < 0.012 and (reach > 0.96 * side or -middle @ out > 1.3 * side):
         return np.zeros((2, 3)), np.ones(2)
-    # down behind the far edge, backward as it touches the floor
+    # down behind the far edge, backward as it touches the floor; and at the end so that what is off the floor does not fold
     touching = far[2] < 0.03 or height < 0.5 * side
-    back = LAYING * max(height / side, 0.4 if reach < 0.97 * side else 0.0) if touching else 0.4 * LAYING
-    down = LAYING * max(reach / side, 0.15) if touching else 0.8 * LAYING
+    slack = float(np.clip(side - 0.01 - AHEAD * height - reach, 0.0, NEARER)) if height < 0.5 * side else 0.0
+    back = LAYING * max(height / side, 0.4 if reach < 0.97 * side else 0.0) + CORRECTION * slack if touching else 0.4 * LAYING
+    down = LAYING * max(reach / side, 0.15) * (1 - CORRECTION * slack) if touching else 0.8 * LAYING
     return keep - back * out - (0, 0, down), -np.ones(2)

@@ -8,7 +8,7 @@ import numpy as np
 
 from clothgym._jit import inlined
 from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
-from clothgym.envs.definition import Observation
+from clothgym.envs.definition import VELOCITY_BOUND, Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.gripper_task import measure_grips
 from clothgym.envs.manipulation import ManipulationTask, follow, observe_grippers
@@ -20,6 +20,8 @@ HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
 ENOUGH_REST = 0.02  # [m/s]
 FLAT_ALREADY = 0.99  # coverage of which there is nothing to improve
 SANE_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
+# heights of a gripper, in sides, above which it has lifted a corner alone, and an edge, high enough
+LIFTED = (0.9, 1.17)
 
 
 @inlined
@@ -83,9 +85,9 @@ def account_spread(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def observe_spread(own, rules, sheet, seen):
-    """Grippers, time, and coverage."""
+    """Grippers, time, coverage, and how fast the sheet moves."""
     observe_grippers(own, rules, sheet, seen)
-    seen.coverage = own.coverage
+    seen.coverage, seen.speed = own.coverage, np.sqrt(sheet.summary[SPEED2])
 
 
 class SpreadingTask(ManipulationTask):
@@ -101,6 +103,7 @@ class SpreadingTask(ManipulationTask):
     observations: ClassVar[tuple[Observation, ...]] = (
         *ManipulationTask.observations,
         Observation("coverage", "share of the sheet's area that it covers"),
+        Observation("speed", "rms speed of the sheet", (), "m/s", VELOCITY_BOUND),
     )
     ranges: ClassVar = {
         **ManipulationTask.ranges, "coverage": (0.0, 1.0), "coverage_start": (0.0, 1.0), "raised": (0.0, 10.0),
@@ -113,4 +116,5 @@ class SpreadingTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        return super().constants() | own | {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh)}
+        taken = {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh), "columns": mesh.grid_shape[1]}
+        return super().constants() | own | taken

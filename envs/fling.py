@@ -122,7 +122,9 @@ def _account_fling(own, rules, sheet, info, terms, running, failure):
 def _observe_fling(own, rules, sheet, seen):
     """Grippers, time, coverage, the throws that are left, what grippers take next; and waves that tell steps of a throw apart."""
     observe_spread(own, rules, sheet, seen)
-    observe_next(rules, sheet, seen)
+    seen.next[:] = 0
+    if own.throws < THROWS:
+        observe_next(own, rules, sheet, seen, True)
     seen.throws_left = 1 - own.throws / THROWS
     for i in range(len(PERIODS)):
         period = PERIODS[i]
@@ -289,9 +291,12 @@ class ClothFlingEnv(ClothEnv):
     ## Observation Space
     $observations
 
-    ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
-    there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
-    It is also given for a gripper that may not close any more, and 0 for one that has nothing to take.
+    ``next`` is a choice that the environment makes.  Grippers that hold nothing take an edge that spans 0.1 m along x or more, the
+    first of them the end with the smaller x.  It is the nearest such edge, where each particle of other cloth that would be taken
+    along counts for a meter of way.  Only if there is no better edge within reach they take the sides of one, where these come
+    within reach; n is 1000 then.  While one gripper holds a corner, the other takes a neighbor of it; this is given for one that
+    may not close any more, too.  ``next`` is 0 for a gripper that has nothing to take; for both, once three throws have been made;
+    and while a sheet that nothing holds covers 0.905 or more.
 
     ## Rewards
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus

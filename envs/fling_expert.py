@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.taking import BEYOND, EDGES, OPPOSITE, next_takes_of, places_to_take
+from clothgym.envs.taking import FLAT, next_edges_of, next_takes_of
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 TEARING = 0.5  # strain at which it lets go
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 REST = 0.1  # rms speed at which it judges what it has thrown [m/s]
-DONE = 0.903  # coverage with which it is content
 LATE = 4  # steps by which a throw may be late
 TIMED = 0.01  # sides that a step's difference from the time counts for, beside the distance from the way
 ASTRAY = 0.2  # distance from the way at which there is no throw, in sides
@@ -52,15 +51,11 @@ def fling_actions(task: Any) -> NDArray:
     """Actions of all environments, (num_envs, 8)."""
     mesh, side, grippers, n = task.physics.mesh, task.physics.side, task.simulation.grippers, task.num_envs
     corners, rest = np.array(mesh.corners), mesh.rest_positions
-    x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)
-    v = task.simulation.velocities.astype(np.float64)
+    v, tips = task.simulation.velocities.astype(np.float64), grippers.positions.astype(np.float64)
     speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
     holder, held = grippers.holder, grippers.held
-    takes, others = np.zeros((n, 4, 3)), np.zeros((n, 4))
-    looking = (held[:, 0] == 0) | (held[:, 1] == 0)
-    takes[looking], others[looking] = places_to_take(x[looking], mesh)
-    goals, count = next_takes_of(task)
-    low, high = task.arena()
+    (edges, others), (goals, count) = next_edges_of(task), next_takes_of(task)
+    high = task.arena()[1]
     latest = task.throw.starts[-1] - AGAIN
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
     for e in range(n):
@@ -69,12 +64,8 @@ def fling_actions(task: Any) -> NDArray:
         if free.all():
             if own["throws"] == 0 and own["step"] < 6:
                 grip[e] = -1
-            elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < DONE and own["step"] < latest:
-                # an edge that lies free, or what there is
-                goal = goals[e] if count[e].min() >= 0 and goals[e, 1, 0] - goals[e, 0, 0] > 0.1 else None
-                if goal is None:
-                    goal = _reachable(x[e], tips[e], takes[e], others[e], corners, low, high, mesh.grid_shape)
-                move[e], grip[e] = _take(tips[e], goal, low, high)
+            elif own["throws"] < 3 and speed[e] < REST and own["coverage"] < task.enough + FLAT and own["step"] < latest:
+                move[e], grip[e] = _take(tips[e], edges[e], others[e])
             else:
                 move[e, :, 2] = np.where(tips[e, :, 2] < 0.25 * side, 0.4, 0)
             continue
@@ -82,15 +73,11 @@ def fling_actions(task: Any) -> NDArray:
             # the other gripper comes, if it may
             k = int(np.argmax(free))
             grip[e, 1 - k] = -1
-            mine = [i for i in range(4) if holder[e, corners[i]] == 1 - k]
-            if own["barred"][k] or not mine or own["step"] < 6:
+            if own["barred"][k] or count[e, k] < 0 or own["step"] < 6:
                 grip[e] = 1 if own["step"] >= 6 else -1
                 continue
-            beside = [i for i in range(4) if i != mine[0] and i != 3 - mine[0]]
-            ways = np.array([np.linalg.norm(takes[e, i] - tips[e, k]) for i in beside])
-            best = int(ways.argmin())
-            move[e, k] = 15 * (takes[e, beside[best]] - tips[e, k])
-            grip[e, k] = -1 if ways[best] < NEAR else 1
+            move[e, k] = 15 * (goals[e, k] - tips[e, k])
+            grip[e, k] = -1 if np.linalg.norm(goals[e, k] - tips[e, k]) < NEAR else 1
             continue
         if not (holder[e, corners] >= 0).any():
             # what was out of reach is carried there, and let go of
@@ -107,30 +94,10 @@ def fling_actions(task: Any) -> NDArray:
     return np.concatenate([move / limit, grip[..., None]], axis=2).reshape(n, -1)
 
 
-def _reachable(x: Any, tips: Any, takes: Any, others: Any, corners: Any, low: Any, high: Any, shape: Any) -> Any:
-    """Where both corners of an edge are taken that lie free and within reach; else, of the nearest edge, the sides where they are
-    within reach [m], (2, 3), or None."""
-    least, goal = np.inf, None
-    for edge, far in zip(EDGES, OPPOSITE):
-        order = slice(None) if x[corners[edge[0]], 0] < x[corners[edge[1]], 0] else slice(None, None, -1)
-        edge, far = edge[order], far[order]
-        at = takes[edge]
-        outside = np.maximum(np.maximum(low - at, at - high), 0).max()
-        if outside > BEYOND:
-            at, outside = _within(x, corners[edge], corners[far], low, high, shape), 1.0
-        if at is None or at[1, 0] - at[0, 0] < 0.1:
-            continue
-        cost = others[edge].sum() + 10 * outside + np.linalg.norm(at - tips, axis=1).sum()
-        if cost < least:
-            least, goal = cost, at
-    return goal
-
-
-def _take(tips: Any, goal: Any, low: Any, high: Any) -> Any:
-    """Go there, and close."""
-    if goal is None:
+def _take(tips: Any, goal: Any, count: Any) -> Any:
+    """Go there, if there is anything to take, and close."""
+    if count[0] < 0:
         return np.zeros((2, 3)), np.ones(2)
-    goal = np.clip(goal, low, high)
     way = goal - tips
     move = 12 * way
     # over the cloth, and then down
@@ -138,19 +105,6 @@ def _take(tips: Any, goal: Any, low: Any, high: Any) -> Any:
     move[:, 2] = np.where(aside > 0.05, 12 * (np.maximum(goal[:, 2], 0.06) - tips[:, 2]), move[:, 2])
     move /= np.maximum(length(move) / LIFTING, 1)[..., None]
     return move, -np.ones(2) if np.linalg.norm(way, axis=1).max() < NEAR else np.ones(2)
-
-
-def _within(x: Any, ends: Any, far: Any, low: Any, high: Any, shape: Any) -> Any:
-    """Where the sides that begin at both ends of an edge are first within reach [m], (2, 3), or None."""
-    places = []
-    for one, other in zip(ends, far):
-        count = shape[1] if abs(one - other) < shape[1] else shape[0]
-        line = x[np.linspace(one, other, count).astype(int)]
-        inside = np.flatnonzero(np.logical_and.reduce((line > low - (0, 0, 1)) & (line < high), axis=1))
-        if not len(inside):
-            return None
-        places.append(line[inside[0]] + (0, 0, 0.015))
-    return np.array(places)
 
 
 def _throw(throw: Throw, tips: Any, rest: Any, held: Any, side: float, step: int, high: Any, strain: float) -> Any:

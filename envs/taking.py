@@ -25,7 +25,11 @@ NOT_REACHED = 1000  # particles that a place counts for from which the corner is
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
 OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
 BEYOND = 0.008  # by which a place may lie beyond the room of the tips [m]
+SPAN = 0.1  # by which the ends of an edge that is taken whatever lies on it are apart along x at least [m]
+OUTSIDE = 10.0  # cost of a meter by which an end lies beyond the room; to take the sides costs as much as one meter
+ABOVE = 0.015  # height of a tip above the particle of a side that it takes [m]
 TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
+FLAT = 0.005  # a sheet that covers so much more than is enough is left alone
 NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
 # what a way of one side, and a height of one side, count for in particles that are taken along
 WAY_TO_NEIGHBOR, WAY_TO_CORNER, HEIGHT_OF_CORNER = 0.5, 0.3, 2.0
@@ -154,31 +158,102 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
 
 
 @inlined
-def observe_next(rules, sheet, seen):
-    """Where each gripper takes hold next."""
-    seen.next[:] = 0
-    next_takes(
-        sheet.x,
-        rules.corners,
-        rules.beside_corners,
-        sheet.holder,
-        sheet.attachments,
-        rules.side,
-        rules.low,
-        rules.high,
-        seen.next[:, :3],
-        seen.next[:, 3],
-    )
+def _first_within(x, one, other, columns, low, high, place):
+    """Where the side of a sheet that leads from one corner to another is first in the room of the tips; returns whether it is."""
+    step = (1 if abs(other - one) < columns else columns) * (1 if other > one else -1)
+    for p in range(one, other + step, step):
+        inside = low[0] < x[0, p] < high[0] and low[1] < x[1, p] < high[1] and x[2, p] < high[2]
+        if inside:
+            for c in range(3):
+                place[c] = x[c, p]
+            place[2] += ABOVE
+            return True
+    return False
+
+
+@apart
+def next_edge(x, corners, beside, columns, tips, low, high, goals, count):
+    """Where both grippers take an edge next [m], (2, 3), and how many other particles they take there, or -1 for none, (2,), out.
+
+    It is the edge that costs least: the ways of both tips in meters, plus the other particles near both corners, plus OUTSIDE for
+    each meter by which an end lies beyond the room.  The first gripper takes the end with the smaller x, and the ends are at least
+    SPAN apart along x.  If one lies farther than BEYOND outside, both take the sides that begin at the ends, where these are first
+    in the room: that costs as much as a meter outside, and counts for 1000 others.  Places are moved into the room.
+
+    x: a sheet [m], (3, particles).  columns: particles along x of the flat sheet.  tips: [m], (2, 3).  low, high: corners of the
+    room of the tips [m], (3,).
+    """
+    places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
+    take_corners(x, corners, beside, places, others)
+    ends = np.empty((2, 3))
+    least = np.inf
+    count[:] = -1
+    for e in range(EDGES.shape[0]):
+        crossed = int(x[0, corners[EDGES[e, 0]]] >= x[0, corners[EDGES[e, 1]]])
+        outside, within = 0.0, True
+        for k in range(2):
+            corner = EDGES[e, k ^ crossed]
+            for c in range(3):
+                ends[k, c] = places[corner, c]
+                outside = max(outside, low[c] - ends[k, c], ends[k, c] - high[c])
+        if outside > BEYOND:
+            outside = 1.0
+            for k in range(2):
+                one, other = corners[EDGES[e, k ^ crossed]], corners[OPPOSITE[e, k ^ crossed]]
+                within = within and _first_within(x, one, other, columns, low, high, ends[k])
+        if not within or ends[1, 0] - ends[0, 0] < SPAN:
+            continue
+        more = others[EDGES[e, 0]] + others[EDGES[e, 1]]
+        cost = more + OUTSIDE * outside + distance(tips[0], ends[0]) + distance(tips[1], ends[1])
+        if cost < least:
+            least = cost
+            for k in range(2):
+                count[k] = others[EDGES[e, k ^ crossed]] if outside <= BEYOND else NOT_REACHED
+                for c in range(3):
+                    goals[k, c] = min(max(ends[k, c], low[c]), high[c])
+
+
+@inlined
+def _show_next(sheet, seen):
+    """Turn the places and counts in ``seen.next`` into what is observed."""
     for tip in range(sheet.holds.shape[0]):
         others = seen.next[tip, 3]
-        seen.next[tip, 3] = 1 / (1 + others) if others >= 0 else 0.0
         if others >= 0:
+            seen.next[tip, 3] = 1 / (1 + others)
             for c in range(3):
                 seen.next[tip, c] -= sheet.attachments[tip, c]
             # what is near counts most: a direction, times a number that rises from 0 to 1
             far = length_of(seen.next[tip]) + NEXT_TO
             for c in range(3):
                 seen.next[tip, c] /= far
+        else:
+            seen.next[tip] = 0
+
+
+@inlined
+def observe_next(own, rules, sheet, seen, edges):
+    """Where each gripper takes hold next; nothing while a sheet that nothing holds lies flat.
+
+    edges: whether grippers that hold nothing take an edge, lying free or not.
+    """
+    seen.next[:] = 0
+    x, tips, low, high = sheet.x, sheet.attachments, rules.low, rules.high
+    places, count = seen.next[:, :3], seen.next[:, 3]
+    holding = sheet.holds.any()
+    if not holding and own.coverage >= rules.enough + FLAT:
+        return
+    if edges and not holding:
+        next_edge(x, rules.corners, rules.beside_corners, rules.columns, tips, low, high, places, count)
+    else:
+        next_takes(x, rules.corners, rules.beside_corners, sheet.holder, tips, rules.side, low, high, places, count)
+    _show_next(sheet, seen)
+
+
+def _of(task: Any) -> tuple[Any, ...]:
+    """Positions of a task's sheets [m], (num_envs, 3, particles), and tips [m]; their corners, and what lies beside these."""
+    simulation, mesh = task.simulation, task.physics.mesh
+    x = np.ascontiguousarray(simulation.positions.transpose(0, 2, 1).astype(np.float64))
+    return x, simulation.grippers.positions.astype(np.float64), np.array(mesh.corners), beside_corners(mesh)
 
 
 @kernel
@@ -190,12 +265,25 @@ def _all_next_takes(x, corners, beside, holder, tips, side, low, high, goals, co
 
 def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
     """Where each gripper of a task takes hold next [m], (num_envs, 2, 3), and ``count`` of ``next_takes``, (num_envs, 2)."""
-    simulation, mesh = task.simulation, task.physics.mesh
-    x, tips = simulation.positions.transpose(0, 2, 1).astype(np.float64), simulation.grippers.positions.astype(np.float64)
+    x, tips, corners, beside = _of(task)
     goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
-    corners, holder = np.array(mesh.corners), np.ascontiguousarray(simulation.grippers.holder)
-    room = task.arena()
-    _all_next_takes(np.ascontiguousarray(x), corners, beside_corners(mesh), holder, tips, task.physics.side, *room, goals, count)
+    holder = np.ascontiguousarray(task.simulation.grippers.holder)
+    _all_next_takes(x, corners, beside, holder, tips, task.physics.side, *task.arena(), goals, count)
+    return goals, count
+
+
+@kernel
+def _all_next_edges(x, corners, beside, columns, tips, low, high, goals, count):
+    """``next_edge`` of many sheets, (sheets, 3, particles)."""
+    for sheet in range(x.shape[0]):
+        next_edge(x[sheet], corners, beside, columns, tips[sheet], low, high, goals[sheet], count[sheet])
+
+
+def next_edges_of(task: Any) -> tuple[NDArray, NDArray]:
+    """Where the grippers of a task take an edge next [m], (num_envs, 2, 3), and ``count`` of ``next_edge``, (num_envs, 2)."""
+    x, tips, corners, beside = _of(task)
+    goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
+    _all_next_edges(x, corners, beside, task.physics.mesh.grid_shape[1], tips, *task.arena(), goals, count)
     return goals, count
 
 

@@ -115,8 +115,8 @@ def test_the_same_seed_after_other_episodes(env_id, name):
 
 @pytest.mark.parametrize("env_id", TASKS)
 def test_whole_episodes_with_resets_agree(env_id):
-    """To the end and beyond: settling, evaluation and the next episodes, in batches of 2 and 40."""
-    small, large = make(env_id, 2), make(env_id, 40)
+    """To the end and beyond: settling, evaluation and the next episodes, in batches of 2 and 18."""
+    small, large = make(env_id, 2), make(env_id, 18)
     sequence = actions(large, length(large) + 30)
     small.reset(seed=5)
     large.reset(seed=5)

@@ -163,8 +163,43 @@ def test_the_observation_says_where_grippers_are_what_they_hold_and_how_high():
     assert seen["corners_held"].reshape(2, 4).tolist() == [[0, 1, 0, 0], [0, 0, 1, 0]]
     # a tenth of a meter up, and a third of it down again
     assert seen["raised"] * SIDE == pytest.approx([low + 0.1] * 2, abs=2e-3) and tips[:, 2].max() < low + 0.05
+    # of the sheet's area: what is on its border stands for less
+    inside = np.interp(np.arange(17), [0, 1, 15, 16], [0.5, 1, 1, 0.5])
+    share = np.outer(inside, inside).ravel() / 16**2
+    v = task.simulation.velocities[0].astype(float)
+    assert seen["speed"].item() == pytest.approx(np.sqrt(share @ (v**2).sum(axis=1)), rel=1e-5)
+    assert not seen["lifted"].any() and not seen["next"].any()
     held = 0.1 + 0.9 * seen["coverage"].item()
     assert task.episode["potential"][0] == pytest.approx(held, abs=1e-6)
+
+
+def test_it_is_observed_that_a_gripper_has_lifted_what_it_holds_as_high_as_the_sheet_is_long():
+    env = start()
+    task, corners = env.task, np.array(env.task.physics.mesh.corners)
+    task.simulation.reset(positions=on_floor(task.physics.mesh))
+    tips = task.simulation.positions[:, corners[:2]].astype(float) + (0, 0, 0.01)
+    task.simulation.grippers.place(tips, np.array([0]))
+    task.episode["targets"][:] = tips
+    # one takes its corner and rises, and the other rises with nothing
+    seen = []
+    for step in range(40):
+        rise = 0.8 * (step >= 5)
+        observation, *_ = env.step([0, 0, rise, -1, 0, 0, rise, 1.0])
+        lifted = observation[env.observation_slices["lifted"]].reshape(2, 2)
+        assert not lifted[1].any()
+        seen.append((task.simulation.grippers.positions[0, 0, 2] / SIDE, *lifted[0]))
+    height, first, second = np.array(seen).T
+    assert first.astype(bool).tolist() == (height > 0.9).tolist() and second.astype(bool).tolist() == (height > 1.17).tolist()
+    assert first.sum() > second.sum() > 0
+
+
+@pytest.mark.parametrize(("at", "taken"), [(None, False), (0.46, True), (0.42, True)])
+def test_nothing_is_to_be_taken_from_a_sheet_that_covers_enough(at, taken):
+    env = start()
+    observation, *_ = put(env, on_floor(env.task.physics.mesh, at))
+    covered = observation[env.observation_slices["coverage"]].item()
+    assert (covered < 0.955) == taken
+    assert observation[env.observation_slices["next"]].any() == taken
 
 
 def test_the_best_stays_the_first_success_is_remembered_and_what_is_lost_is_lost():

@@ -6,7 +6,7 @@ import pytest
 
 from clothgym.envs.fling_starts import held_sheets
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE
-from clothgym.envs.taking import next_takes_of
+from clothgym.envs.taking import next_edges_of, next_takes_of
 
 ID, SIDE = "clothgym:ClothFling-v0", 0.6
 SEEDS = [1_000_000, 1_000_001, 1_000_002, 1_000_003, 7, 8]
@@ -199,7 +199,7 @@ def test_a_clock_and_the_next_corners_are_observed():
     env = gym.make_vec("clothgym:ClothFling-v0", num_envs=4)
     seen, _ = env.reset(seed=3)
     task, slices = env.unwrapped.task, env.unwrapped.task.observation_slices
-    looked = 0
+    looked, flat = 0, 0
     for step in range(1, 160):
         seen, *_ = env.step(task.expert().astype(np.float32))
         if step in (1, 7, 35, 100):
@@ -207,11 +207,18 @@ def test_a_clock_and_the_next_corners_are_observed():
             waves = [np.interp((step + early) % p, [0, p / 2, p], [1, -1, 1]) for p in (12, 36, 108) for early in (0, p // 4)]
             assert seen[:, slices["clock"]] == pytest.approx(np.tile(waves, (4, 1)), abs=1e-6)
         goals, count = next_takes_of(task)
+        edges, others = next_edges_of(task)
+        empty = (task.simulation.grippers.held == 0).all(axis=1)
+        goals[empty], count[empty] = edges[empty], others[empty]
         ways = goals - task.simulation.grippers.positions
         length = np.linalg.norm(ways, axis=2, keepdims=True)
         free = 1 / (1 + np.maximum(count, 0)[..., None])
         expected = np.concatenate([ways / (length + 0.01), free], axis=2) * (count >= 0)[..., None]
+        # what covers enough is left alone
+        done = (task.episode["coverage"] >= 0.905) & empty
+        expected[done | (task.episode["throws"] == 3)] = 0
+        flat += done.sum()
         assert seen[:, slices["next"]].reshape(4, 2, 4) == pytest.approx(expected, abs=1e-4)
         looked += (count >= 0).sum()
-    assert looked > 20
+    assert looked > 20 and flat > 20
     env.close()

@@ -45,10 +45,10 @@ def test_it_gives_what_the_native_batch_gives(env_id):
 
 @every_id
 def test_sb3_trains_on_it_and_logs_episodes(env_id):
-    env = VecMonitor(make_sb3_vec_env(env_id, 8, seed=0))
+    env = VecMonitor(make_sb3_vec_env(env_id, 2, seed=0))
     policy = "MultiInputPolicy" if isinstance(env.observation_space, gym.spaces.Dict) else "MlpPolicy"
     model = PPO(policy, env, n_steps=64, batch_size=128, n_epochs=1, seed=0, device="cpu")
-    model.learn(8 * 64 * math.ceil(LONGEST[env_id] / 64))
+    model.learn(2 * 64 * math.ceil(LONGEST[env_id] / 64))
     assert len(model.ep_info_buffer) > 0
     assert all(np.isfinite(episode["r"]) for episode in model.ep_info_buffer)
 

@@ -6,7 +6,7 @@ import pytest
 
 import clothgym  # noqa: F401
 from clothgym.envs.manipulation import REACH
-from clothgym.envs.taking import AWAY, CLEAR, beside_corners, next_takes, places_to_take
+from clothgym.envs.taking import AWAY, CLEAR, beside_corners, next_edge, next_takes, places_to_take
 from clothgym.mesh import grid
 
 MESH = grid(17, 17, 0.6, 0.6)
@@ -147,6 +147,47 @@ def test_nothing_is_taken_beside_what_is_held_by_mistake():
     x, holder = lying_flat(), np.full(MESH.num_particles, -1)
     holder[8 * 17 + 8] = 0
     assert taken_next(x, [x[144], (0, 0, 0.3)], holder)[1] == [-1, -1]
+
+
+def edge_next(x, tips, low=(-9, -9, 0), high=(9, 9, 9)):
+    """Where grippers take an edge next, and of how many other particles."""
+    goals, count = np.full((2, 3), np.nan), np.empty(2, np.int64)
+    room = [np.array(one, float) for one in (low, high)]
+    across = np.ascontiguousarray(x.T)
+    next_edge(across, np.array(MESH.corners), beside_corners(MESH), 17, np.array(tips, float), *room, goals, count)
+    return goals, count.tolist()
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_the_edge_that_costs_least_is_taken_by_the_left_hand_on_the_left(quarter):
+    # turned by quarters and a bit, another edge lies behind along x each time
+    angle = quarter * np.pi / 2 + 0.1
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    x = lying_flat() @ turn.T
+    order = np.argsort(x[list(MESH.corners), 1])
+    front, behind = (sorted(np.array(MESH.corners)[pair], key=lambda p: x[p, 0]) for pair in (order[:2], order[2:]))
+    up = (0, 0, AWAY)
+    # the hands are crossed above the edge behind: 1.2 m of way, and 1.7 m to the other
+    goals, count = edge_next(x, [x[behind[1]] + up, x[behind[0]] + up])
+    assert goals == pytest.approx(x[behind] + up) and count == [0, 0]
+    # straight above it, 1.2 m from the other: one particle on an end counts for a meter, two for more than the way
+    for taken, (ends, others) in enumerate([(behind, [0, 0]), (behind, [1, 0]), (front, [0, 0])]):
+        x[[100, 120][:taken]] = x[behind[0]] + (0, 0, 0.001)
+        goals, count = edge_next(x, x[behind] + up)
+        assert np.linalg.norm(goals - x[ends], axis=1) == pytest.approx([AWAY] * 2, rel=0.15) and count == others
+
+
+def test_sides_are_taken_where_they_come_within_reach():
+    # both edges along x are out of reach; the sixth row of particles is the first that is not
+    x = lying_flat()
+    goals, count = edge_next(x, [(-0.3, -0.05, 0.1), (0.3, -0.05, 0.1)], (-9, -0.1, 0), (9, 0.1, 9))
+    assert goals == pytest.approx(x.reshape(17, 17, 3)[6, [0, 16]] + (0, 0, 0.015)) and count == [1000, 1000]
+
+
+def test_an_edge_that_is_short_along_x_is_not_taken_nor_one_that_is_out_of_reach():
+    tips = [(0, 0, 0.1)] * 2
+    assert edge_next(lying_flat() * (0.01, 1, 1), tips)[1] == [-1, -1]
+    assert edge_next(lying_flat(), tips, (-9, 2, 0))[1] == [-1, -1]
 
 
 def test_what_is_observed_says_where_the_expert_goes():
