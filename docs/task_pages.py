@@ -35,7 +35,7 @@ for folder in (HERE, ROOT / "training"):
         sys.path.insert(0, str(folder))
 
 import gallery  # noqa: E402 - a script beside this one
-import report  # noqa: E402 - scripts of training/
+import results  # noqa: E402 - scripts of training/
 import suite  # noqa: E402
 
 Suite = dict[str, Any]  # what the file of scores holds
@@ -118,13 +118,13 @@ def _facts(env_id: str) -> str:
 
 def _scores(env_id: str, scores: Suite) -> str:
     """The table of an id's rows, and how they were made; what is of other code is marked."""
-    digests = report.read_digests()
+    digests = results.read_digests()
     rows = [row for row in scores["rows"] if row["env"] == env_id]
     if not rows:
         return f"None are committed yet; this makes them: `{COMMAND} --env {env_id}`, and `python docs/task_pages.py` the page."
     lines = [suite.cells(row) for row in rows]
     for line, row in zip(lines, rows):
-        line["policy"] += "" if report.is_present(row, digests) else " **(old)**"
+        line["policy"] += "" if results.is_present(row, digests) else " **(old)**"
     columns = [name for name in lines[0] if any(line[name] for line in lines)]
     table = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
     table += [f"| {' | '.join(line[name] for name in columns)} |" for line in lines]
@@ -149,7 +149,7 @@ def index(scores: Suite) -> str:
         "| id | goal | sheet | episode | actions | expert's score | its success |",
         "| --- | --- | --- | --- | --- | --- | --- |",
     ]
-    digests = report.read_digests()
+    digests = results.read_digests()
     for env_id, (_, goal) in ENVIRONMENTS.items():
         env = gym.make(env_id).unwrapped
         task: Any = env.task  # type: ignore[attr-defined]
@@ -157,7 +157,7 @@ def index(scores: Suite) -> str:
             (row for row in scores["rows"] if (row["env"], row["policy"], row["env_kwargs"]) == (env_id, "expert", {})), None
         )
         cells = suite.cells(row) if row else {"score": "", "success": ""}
-        if row and not report.is_present(row, digests):
+        if row and not results.is_present(row, digests):
             cells["score"] += " **(old)**"
         about = f"{_sheet(task)} | {_time(task)} | {_size(env.action_space)}"
         rows.append(f"| [`{env_id}`]({env_id}.md) | {goal} | {about} | {cells['score']} | {cells['success']} |")

@@ -182,9 +182,9 @@ def test_a_committed_policy_scores_what_it_says(env_id, learner):
 
 @pytest.mark.parametrize(("env_id", "learner"), COMMITTED, ids=[f"{env_id} {learner}" for env_id, learner in COMMITTED])
 def test_what_a_committed_policy_says_is_in_the_table(env_id, learner, scripts):
-    import report
+    import results
 
     about = policies.load(env_id, learner).about
-    rows = [row for row in report.learned() if (row["env"], row["learner"], row["seed"]) == (env_id, learner, about["seed"])]
+    rows = [row for row in results.learned() if (row["env"], row["learner"], row["seed"]) == (env_id, learner, about["seed"])]
     assert [(row["success_rate"], row["digest"]) for row in rows] == [(about["success_rate"], about["digest"])]
     assert rows[0].get("safe_success_rate") == about.get("safe_success_rate")

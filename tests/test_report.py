@@ -21,6 +21,20 @@ def report(scripts):
     return report
 
 
+@pytest.fixture
+def results(scripts):
+    import results
+
+    return results
+
+
+@pytest.fixture
+def curves(scripts):
+    import curves
+
+    return curves
+
+
 def result(rate, seed=0, env_id="ClothReach-v0", **more):
     row = {"env": env_id, "env_kwargs": {}, "learner": "ppo", "seed": seed, "success_rate": rate, "normalized_performance": rate}
     row |= {
@@ -45,24 +59,24 @@ def test_every_environment_has_one_and_what_moves_no_bits_is_left_out():
     assert name_of("ClothReach-v0", {"rows": 7, "physics": "fast"}) == 'ClothReach-v0 {"physics": "fast", "rows": 7}'
 
 
-def test_committed_pages_are_what_the_command_makes(report):
+def test_committed_pages_are_what_the_command_makes(report, curves, results):
     stale = [str(path) for path, text in report.pages().items() if path.read_text() != text]
     assert not stale, f"python training/report.py  makes others of {', '.join(stale)}"
-    assert not report.stale_curves(report.learned())
+    assert not curves.stale_curves(results.learned())
 
 
-def test_curves_of_other_evaluations_are_stale(report, tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "RUNS", tmp_path)
-    monkeypatch.setattr(report, "CURVES", tmp_path)
+def test_curves_of_other_evaluations_are_stale(results, curves, tmp_path, monkeypatch):
+    monkeypatch.setattr(results, "RUNS", tmp_path)
+    monkeypatch.setattr(curves, "CURVES", tmp_path)
     (tmp_path / "run_0").mkdir()
     line = {"timesteps": 100, "core_seconds": 60.0, "success_rate": 0.5, "cost": 3.0}
     (tmp_path / "run_0" / "progress.jsonl").write_text(f"{json.dumps(line)}\n{json.dumps(line | {'timesteps': 200})}\n")
     rows, path = [result(0.5)], tmp_path / "ClothReach-v0.png"
-    assert report.stale_curves(rows) == [path]
-    path.write_bytes(report.draw_curves("ClothReach-v0", rows))
-    assert report.stale_curves(rows) == []
+    assert curves.stale_curves(rows) == [path]
+    path.write_bytes(curves.draw_curves("ClothReach-v0", rows))
+    assert curves.stale_curves(rows) == []
     (tmp_path / "run_0" / "progress.jsonl").write_text(json.dumps(line | {"success_rate": 0.6}))
-    assert report.stale_curves(rows) == [path]
+    assert curves.stale_curves(rows) == [path]
 
 
 def test_rows_of_other_code_are_marked(report):
@@ -96,11 +110,11 @@ def test_a_row_says_what_its_seeds_came_to(report):
     )
 
 
-def test_learners_with_other_arguments_are_other_rows(report):
+def test_learners_with_other_arguments_are_other_rows(report, results):
     same = [result(0.9, env_kwargs={"settling": "at_once"}), result(0.8, seed=1)]
-    assert [len(rows) for rows in report.groups(same).values()] == [2]
+    assert [len(rows) for rows in results.groups(same).values()] == [2]
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
-    assert [label for _, label in report.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
+    assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
     now = {"ClothReach-v0": "now"}
     assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 2 min"
     # who always arrives, and never at no cost, is not the best
@@ -121,26 +135,26 @@ def test_sections_are_filled_and_the_rest_of_a_page_stays(report):
         report.filled(text, {})
 
 
-def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(report, tmp_path, monkeypatch):
+def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(results, tmp_path, monkeypatch):
     from clothgym import policies
 
-    monkeypatch.setattr(report, "RUNS", tmp_path / "results")
-    monkeypatch.setattr(report, "COMMITTED", tmp_path / "committed")
+    monkeypatch.setattr(results, "RUNS", tmp_path / "results")
+    monkeypatch.setattr(results, "COMMITTED", tmp_path / "committed")
     (tmp_path / "committed").mkdir()
     for seed, chosen_by in enumerate((0.7, 0.9, 0.8)):
         folder = tmp_path / f"ClothReach-v0_{seed}"
         folder.mkdir()
-        for name in report.KEPT:
+        for name in results.KEPT:
             (folder / name).write_text("{}")
         about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": seed, "chosen_by": chosen_by, "digest": "now"}
         policies.Policy([(np.ones((3, 2)), np.zeros(2))], about=about).save(folder / "policy.npz")
-    report.add(sorted(tmp_path.glob("ClothReach-v0_*")))
+    results.add(sorted(tmp_path.glob("ClothReach-v0_*")))
     assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["seed"] == 1
-    assert sorted(path.name for path in (tmp_path / "results" / "ClothReach-v0_0").iterdir()) == sorted(report.KEPT)
+    assert sorted(path.name for path in (tmp_path / "results" / "ClothReach-v0_0").iterdir()) == sorted(results.KEPT)
     # the same seed again, and worse: what is committed is what its row says
     about = {"env": "ClothReach-v0", "env_kwargs": {}, "learner": "ppo", "seed": 1, "chosen_by": 0.1, "digest": "now"}
     policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_1" / "policy.npz")
-    report.add([tmp_path / "ClothReach-v0_1"])
+    results.add([tmp_path / "ClothReach-v0_1"])
     assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["chosen_by"] == 0.1
     with pytest.raises(ValueError, match="holds no finished run, it lacks evaluation.json"):
-        report.add([tmp_path])
+        results.add([tmp_path])

@@ -56,7 +56,7 @@ def test_a_page_has_what_a_user_looks_for(env_id):
 def test_scores_are_those_of_the_file(task_pages, tmp_path, monkeypatch):
     """Rows of the id and no others, a column where a row has something; what is of other code is marked."""
     now = {"ClothReach-v0": "now", 'ClothDrape-v0 {"physics": "fast"}': "another"}
-    monkeypatch.setattr(task_pages.report, "read_digests", lambda: now)
+    monkeypatch.setattr(task_pages.results, "read_digests", lambda: now)
     rows = [
         row_of("ClothReach-v0", "expert", 0.875, best=0.9, best_ci95=[0.88, 0.92]),
         row_of("ClothReach-v0", "cem", 0.75, about="64 x 4", model_steps=123456),

@@ -11,43 +11,25 @@ benchmarks/results/digests.json.  A row whose digest is another is shown as old,
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 import re
-import shutil
 import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import suite
 import tyro
+from curves import CURVES, draw_curves, stale_curves
 from endings import refused
+from results import RESULTS, ROOT, Result, add, groups, is_present, learned, note_digests, read_digests
 
 from clothgym import files
-from clothgym.adapters.runs import POLICY
-from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
 from clothgym.registration import ENVIRONMENTS
 
-ROOT = Path(__file__).parent.parent
-RESULTS, CURVES = ROOT / "benchmarks" / "results", ROOT / "docs" / "curves"
-RUNS, DIGESTS, SUITE = RESULTS / "training", RESULTS / "digests.json", RESULTS / "suite.json"
-MAXIMIZERS = RESULTS / "maximizers.json"
-COMMITTED = ROOT / "clothgym" / "policies"
-KEPT = ("config.json", "evaluation.json", "progress.jsonl")
+SUITE, MAXIMIZERS = RESULTS / "suite.json", RESULTS / "maximizers.json"
 PAGES = ("README.md", "docs/results.md", "docs/cheats.md")
-ADVICE = "make it with  python training/report.py --digests"
-LABELS = {
-    "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
-    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
-}  # fmt: skip
-# of learners in a picture of curves, told apart by the color-blind, too (Okabe and Ito)
-COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-Result = dict[str, Any]
 
 
 @dataclass
@@ -62,32 +44,7 @@ class Args:
     """Write nothing; say which pages are stale."""
 
 
-# --- results ------------------------------------------------------------------------------------------------------------------
-
-
-def read_digests(path: Path = DIGESTS) -> dict[str, str]:
-    """What each environment does now, by ``digests.name_of``."""
-    return files.read_json(path, "list of digests", ADVICE)["digests"]
-
-
-def is_present(row: Result, digests: dict[str, str]) -> bool:
-    """Whether a result is of the code at hand."""
-    return row.get("digest") == digests.get(name_of(row["env"], row["env_kwargs"]), "unknown")
-
-
-def learned(folder: Path = RUNS) -> list[Result]:
-    """The results of all runs that are committed."""
-    return [json.loads(path.read_text()) | {"run": path.parent.name} for path in sorted(folder.glob("*/evaluation.json"))]
-
-
-def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
-    """Results that differ in their seed only, by environment and by what was learned there and how."""
-    found: dict[tuple[str, str], list[Result]] = {}
-    for one in results:
-        more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
-        label = ", ".join([LABELS[one["learner"]], *(f"`{name}={value!r}`" for name, value in more.items())])
-        found.setdefault((one["env"], label), []).append(one)
-    return found
+# --- over seeds ---------------------------------------------------------------------------------------------------------------
 
 
 def interquartile_mean(values: Iterable[float]) -> float:
@@ -103,34 +60,6 @@ def bootstrap(values: list[float], draws: int = 2000) -> tuple[float, float]:
     means = [interquartile_mean(rng.choice(values, len(values))) for _ in range(draws)]
     low, high = np.percentile(means, [2.5, 97.5])
     return float(low), float(high)
-
-
-def add(folders: Iterable[Path]) -> None:
-    """Copy what is committed of runs; of each id and learner the policy of the seed whose last evaluation on the way was best."""
-    for folder in folders:
-        if not (folder / "evaluation.json").is_file():
-            raise ValueError(f"{str(folder)!r} holds no finished run, it lacks evaluation.json: finish it with --resume {folder}")
-        target = RUNS / folder.resolve().name
-        target.mkdir(parents=True, exist_ok=True)
-        for name in KEPT:
-            shutil.copyfile(folder / name, target / name)
-        if (folder / POLICY).exists():
-            shutil.copyfile(folder / POLICY, target / POLICY)
-    choose()
-
-
-def choose() -> None:
-    """Of each id and learner the policy of the seed that was best on the episodes for choosing; the others are not kept."""
-    from clothgym import policies
-
-    for path in sorted(RUNS.glob(f"*/{POLICY}")):
-        about = policies.read(path).about
-        kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
-        other = policies.read(kept).about if kept.exists() else about
-        # one of the same seed, or of other code, is not compared with, but replaced
-        if other["chosen_by"] <= about["chosen_by"] or other["seed"] == about["seed"] or other["digest"] != about["digest"]:
-            shutil.copyfile(path, kept)
-        path.unlink()
 
 
 # --- tables -------------------------------------------------------------------------------------------------------------------
@@ -239,98 +168,6 @@ def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[s
     return markdown(found)
 
 
-# --- curves -------------------------------------------------------------------------------------------------------------------
-
-
-def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
-    """Held-out success of every seed over steps and over minutes, and its cost where there is one.
-
-    A color for each learner: a thin line for each seed, a band over all of them, their median bold.  A clone that learns no
-    further is a point for each seed.
-    """
-    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
-    if not found:
-        return None
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    curves = [(label.replace("`", ""), [progress(row["run"]) for row in rows]) for label, rows in found]
-    shown = ["success_rate"] + ["cost"] * any("cost" in line for _, seeds in curves for seed in seeds for line in seed)
-    figure, panels = plt.subplots(
-        len(shown), 2, figsize=(9, 3.2 * len(shown)), layout="constrained", sharex="col", sharey="row", squeeze=False
-    )
-    for (row, what), (column, key, unit) in product(enumerate(shown), ((0, "timesteps", 1e6), (1, "core_seconds", 60))):
-        for color, (label, seeds) in zip(COLORS, curves):
-            _draw_seeds(panels[row, column], [[(line[key] / unit, line[what]) for line in seed] for seed in seeds], color, label)
-        panels[row, column].spines[["top", "right"]].set_visible(False)
-        panels[row, column].set(xlim=(0, None))
-    figure.suptitle(env_id, fontsize=11)
-    panels[0, 0].set(ylabel="success", ylim=(0, 1.02))
-    if "cost" in shown:
-        # an untrained policy's cost of 100 and the limit of 0.3 are both to be seen
-        panels[1, 0].set_yscale("symlog", linthresh=1.0)
-        panels[1, 0].set(
-            ylabel="cost of an episode", ylim=(0, 160), yticks=(0, 0.3, 1, 10, 100), yticklabels=("0", "0.3", "1", "10", "100")
-        )
-    for panel, text in zip(panels[-1], ("environment steps [millions]", "training time [minutes of one core]")):
-        panel.set(xlabel=text)
-    figure.legend(*panels[0, 1].get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower center", ncols=3)
-    picture = io.BytesIO()
-    # without the version in it the same curves make the same file; by what is drawn a check knows it
-    figure.savefig(picture, dpi=110, metadata={"Software": None, "Comment": drawn_from(env_id, results)})
-    plt.close(figure)
-    return picture.getvalue()
-
-
-def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, label: str) -> None:
-    """What the seeds of one learner came to on the way; they are evaluated at the same steps."""
-    common = min(map(len, seeds))
-    # (seeds, evaluations, 2)
-    points = np.array([seed[:common] for seed in seeds])
-    if common == 1:
-        panel.plot(*points[:, 0].T, ls="", marker="o", ms=4, color=color, label=f"{label} ({len(seeds)})", clip_on=False, zorder=5)
-        return
-    for curve in points:
-        panel.plot(*curve.T, color=color, lw=0.7, alpha=0.5)
-    middle = np.median(points, axis=0)
-    # from the lowest to the highest of all seeds at each moment at which all of them were learning
-    moments = np.linspace(points[:, 0, 0].max(), points[:, -1, 0].min(), 100)
-    between = [np.interp(moments, *curve.T) for curve in points]
-    panel.fill_between(moments, np.min(between, axis=0), np.max(between, axis=0), color=color, alpha=0.15, lw=0)
-    panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=f"{label} ({len(seeds)})")
-
-
-def drawn_from(env_id: str, results: list[Result]) -> str:
-    """Digest of what the curves of an environment show."""
-    shown = [
-        (label, row["run"], progress(row["run"])) for (env, label), rows in groups(results).items() if env == env_id for row in rows
-    ]
-    return hashlib.sha256(json.dumps(shown, sort_keys=True).encode()).hexdigest()
-
-
-def stale_curves(results: list[Result]) -> list[Path]:
-    """Pictures of curves that are missing, or that show others."""
-    from PIL import Image
-
-    stale = []
-    for env_id in {row["env"] for row in results}:
-        path = CURVES / f"{env_id}.png"
-        if not path.exists():
-            stale.append(path)
-            continue
-        with Image.open(path) as picture:
-            if picture.info.get("Comment") != drawn_from(env_id, results):
-                stale.append(path)
-    return sorted(stale)
-
-
-def progress(run: str) -> list[dict[str, float]]:
-    """The evaluations of a committed run on its way."""
-    return [json.loads(line) for line in (RUNS / run / "progress.jsonl").read_text().splitlines()]
-
-
 # --- pages --------------------------------------------------------------------------------------------------------------------
 
 
@@ -375,17 +212,6 @@ def pages() -> dict[Path, str]:
     digests, scripted = read_digests(), suite.read(SUITE)
     made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
     return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
-
-
-def note_digests() -> None:
-    """Write what each environment does now, as it is and as committed results have it."""
-    wanted = {name_of(env_id, {}): (env_id, {}) for env_id in ENVIRONMENTS}
-    wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in learned()}
-    digests = {}
-    for name, (env_id, kwargs) in wanted.items():
-        digests[name] = digest_of(env_id, kwargs)
-        print(name, digests[name], flush=True)
-    files.write_json(DIGESTS, {"digests": digests})
 
 
 def main(args: Args) -> None:

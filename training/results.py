@@ -1,0 +1,99 @@
+"""Committed results of training: what each run scored, of which code, and the policies that are kept.
+
+A result carries the digest of what its environment did when it was made (``clothgym.lab.digests``); the present ones are in
+benchmarks/results/digests.json.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from clothgym import files
+from clothgym.adapters.runs import POLICY
+from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
+from clothgym.registration import ENVIRONMENTS
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
+RUNS, DIGESTS = RESULTS / "training", RESULTS / "digests.json"
+COMMITTED = ROOT / "clothgym" / "policies"
+KEPT = ("config.json", "evaluation.json", "progress.jsonl")
+ADVICE = "make it with  python training/report.py --digests"
+LABELS = {
+    "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
+    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
+}  # fmt: skip
+Result = dict[str, Any]
+
+
+def read_digests(path: Path = DIGESTS) -> dict[str, str]:
+    """What each environment does now, by ``digests.name_of``."""
+    return files.read_json(path, "list of digests", ADVICE)["digests"]
+
+
+def is_present(row: Result, digests: dict[str, str]) -> bool:
+    """Whether a result is of the code at hand."""
+    return row.get("digest") == digests.get(name_of(row["env"], row["env_kwargs"]), "unknown")
+
+
+def learned(folder: Path = RUNS) -> list[Result]:
+    """The results of all runs that are committed."""
+    return [json.loads(path.read_text()) | {"run": path.parent.name} for path in sorted(folder.glob("*/evaluation.json"))]
+
+
+def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
+    """Results that differ in their seed only, by environment and by what was learned there and how."""
+    found: dict[tuple[str, str], list[Result]] = {}
+    for one in results:
+        more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
+        label = ", ".join([LABELS[one["learner"]], *(f"`{name}={value!r}`" for name, value in more.items())])
+        found.setdefault((one["env"], label), []).append(one)
+    return found
+
+
+def progress(run: str) -> list[dict[str, float]]:
+    """The evaluations of a committed run on its way."""
+    return [json.loads(line) for line in (RUNS / run / "progress.jsonl").read_text().splitlines()]
+
+
+def note_digests() -> None:
+    """Write what each environment does now, as it is and as committed results have it."""
+    wanted = {name_of(env_id, {}): (env_id, {}) for env_id in ENVIRONMENTS}
+    wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in learned()}
+    digests = {}
+    for name, (env_id, kwargs) in wanted.items():
+        digests[name] = digest_of(env_id, kwargs)
+        print(name, digests[name], flush=True)
+    files.write_json(DIGESTS, {"digests": digests})
+
+
+def add(folders: Iterable[Path]) -> None:
+    """Copy what is committed of runs; of each id and learner the policy of the seed whose last evaluation on the way was best."""
+    for folder in folders:
+        if not (folder / "evaluation.json").is_file():
+            raise ValueError(f"{str(folder)!r} holds no finished run, it lacks evaluation.json: finish it with --resume {folder}")
+        target = RUNS / folder.resolve().name
+        target.mkdir(parents=True, exist_ok=True)
+        for name in KEPT:
+            shutil.copyfile(folder / name, target / name)
+        if (folder / POLICY).exists():
+            shutil.copyfile(folder / POLICY, target / POLICY)
+    choose()
+
+
+def choose() -> None:
+    """Of each id and learner the policy of the seed that was best on the episodes for choosing; the others are not kept."""
+    from clothgym import policies
+
+    for path in sorted(RUNS.glob(f"*/{POLICY}")):
+        about = policies.read(path).about
+        kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
+        other = policies.read(kept).about if kept.exists() else about
+        # one of the same seed, or of other code, is not compared with, but replaced
+        if other["chosen_by"] <= about["chosen_by"] or other["seed"] == about["seed"] or other["digest"] != about["digest"]:
+            shutil.copyfile(path, kept)
+        path.unlink()
