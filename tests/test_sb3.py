@@ -23,8 +23,11 @@ def test_it_gives_what_the_native_batch_gives(env_id):
     rng, task = np.random.default_rng(0), native.unwrapped.task
     observation, _ = native.reset(seed=4)
     assert np.array_equal(flat(adapter.reset()), flat(observation))
-    ended = False
-    for _ in range(task.acting_steps + task.settling_steps + 2):
+    ended, left = False, 20
+    # most of the time to act is over already
+    for one in (adapter.env.task, task):
+        one.episode["step"] = one.acting_steps - left
+    for _ in range(left + task.settling_steps + 2):
         actions = rng.uniform(-1, 1, native.action_space.shape).astype(np.float32)
         observation, rewards, dones, infos = adapter.step(actions)
         expected, reward, terminated, truncated, info = native.step(actions)

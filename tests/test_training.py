@@ -14,7 +14,7 @@ import clothgym
 from clothgym import files
 
 SHORT = """
-ClothDrape-v0:
+ClothReach-v0:
   n_envs: 16
   n_timesteps: !!float 800
   policy: MlpPolicy
@@ -35,12 +35,8 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("training")
     (folder / "short.yml").write_text(SHORT)
     options = ("--hyperparams", folder / "short.yml", "--evaluations", 2, "--eval-episodes", 4, "--final-episodes", 6)
-    done = run("train.py", "--run", folder / "run", *options, cwd=folder)
+    done = run("train.py", "--env", "ClothReach-v0", "--run", folder / "run", *options, cwd=folder)
     assert done.returncode == 0, done.stderr
-    # ours begins otherwise, and that is not dropped in silence
-    assert "short.yml has no curriculum for ClothDrape-v0; to begin as ours does, add  curriculum: {n_timesteps: 7" in said(
-        done.stderr
-    )
     shutil.copytree(folder / "run", folder / "fresh")
     return folder, options
 
@@ -67,7 +63,7 @@ def test_a_run_leaves_its_story(trained):
 
 def test_a_run_is_resumed_and_never_overwritten(trained):
     folder, options = trained
-    again = run("train.py", "--run", folder / "run", *options, cwd=folder)
+    again = run("train.py", "--env", "ClothReach-v0", "--run", folder / "run", *options, cwd=folder)
     assert again.returncode == 2 and "holds a run already" in said(again.stderr)
     other = run("train.py", "--resume", folder / "run", "--seed", 5, cwd=folder)
     assert other.returncode == 2 and "--seed 5: the run that --resume goes on with has 0: drop --seed" in said(other.stderr)
@@ -82,13 +78,14 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
 def test_the_learnt_policy_is_evaluated_beside_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
-    done = run("evaluate.py", "--policy", "noop", folder / "run", "--episodes", 7, "--json", out, cwd=folder)
+    reach = ("--env", "ClothReach-v0")
+    done = run("evaluate.py", *reach, "--policy", "noop", folder / "run", "--episodes", 7, "--json", out, cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "noop" in done.stdout and "performance" in done.stdout
     assert "cost" not in done.stdout and "safe" not in done.stdout  # this task has none
     scores = json.loads(out.read_text())
     assert scores["noop"]["success_rate"] == 0 and scores[str(folder / "run")]["episodes"] == 7
-    one = run("evaluate.py", "--policy", "expert", "--episodes", 7, "--json", out, cwd=folder)
+    one = run("evaluate.py", *reach, "--policy", "expert", "--episodes", 7, "--json", out, cwd=folder)
     assert one.returncode == 0 and json.loads(out.read_text())["success_rate"] > 0.5
 
 
@@ -158,6 +155,16 @@ def test_wrong_names_are_refused_as_wrong_flags_are_before_anything_slow(command
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_hyperparameters_of_one_s_own_do_not_drop_our_curriculum_in_silence(wrong, capsys):
+    import train
+
+    Path("short.yml").write_text(SHORT.replace("ClothReach", "ClothDrape"))
+    assert train.Args(hyperparams=Path("short.yml")).config["curriculum"] == {}
+    assert "short.yml has no curriculum for ClothDrape-v0; to begin as ours does, add  curriculum: {n_timesteps: 7" in (
+        capsys.readouterr().err
+    )
+
+
 def test_the_scripts_load_torch_only_when_they_begin():
     code = "import sys, train, evaluate; print([name for name in ('torch', 'stable_baselines3', 'numba') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "training", capture_output=True, text=True, timeout=60)
@@ -197,7 +204,7 @@ def test_a_checkpoint_is_never_unpickled(trained, tmp_path):
     (tmp_path / "evil").mkdir()
     (tmp_path / "evil" / "config.json").write_text((folder / "run" / "config.json").read_text())
     (tmp_path / "evil" / "checkpoint.pt").write_bytes(pickle.dumps(Path("/tmp")))
-    done = run("evaluate.py", "--policy", tmp_path / "evil", "--episodes", 2, cwd=tmp_path)
+    done = run("evaluate.py", "--env", "ClothReach-v0", "--policy", tmp_path / "evil", "--episodes", 2, cwd=tmp_path)
     assert done.returncode == 2 and "is no checkpoint" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -258,7 +265,7 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
         config["hyperparameters"]["policy_kwargs"]["net_arch"] = layers
         files.write_json(broken / "config.json", config)
         with pytest.raises(ValueError, match="config.json' is no configuration of the network in this run"):
-            runs.learned(broken, "ClothDrape-v0")
+            runs.learned(broken, "ClothReach-v0")
 
 
 def test_a_resumed_run_says_what_it_drops(broken, trained):

@@ -5,18 +5,18 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
-from training_runs import run
+from training_runs import call, run
 
 import clothgym
 from clothgym import files
 
 CONSTRAINED = """
 ClothStrain-v0:
-  n_envs: 16
-  n_timesteps: !!float 1600
+  n_envs: 4
+  n_timesteps: !!float 400
   policy: MlpPolicy
   n_steps: 50
-  batch_size: 400
+  batch_size: 100
   n_epochs: 1
   learning_rate: lin_0.0001
   policy_kwargs: {net_arch: [8], log_std_init: 0.0}
@@ -41,20 +41,18 @@ ClothReach-v0:
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
 
 
-def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(tmp_path):
+def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(scripts, tmp_path):
     (tmp_path / "short.yml").write_text(CONSTRAINED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 2, "--final-episodes", 3, "--threads", 1)
     common = ("--env", "ClothStrain-v0", "--algo", "ppo_lagrange")
-    done = run("train.py", *common, "--run", tmp_path / "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = call("train.py", *common, "--run", tmp_path / "run", *options)
     # a policy of pure noise costs far more than the excess of 10 that counts: 0.01 times that for each of two rollouts
     assert multiplier(tmp_path / "run") == pytest.approx(2 * 0.01 * 10)
     assert "cost" in done.stdout and "careless" in done.stdout
     scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert scores["references"]["careless"]["cost"] > 3 > scores["references"]["expert"]["cost"]
     assert json.loads((tmp_path / "run" / "progress.jsonl").read_text().splitlines()[-1])["cost"] >= 0
-    resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 2400, *options[2:6], cwd=tmp_path)
-    assert resumed.returncode == 0, resumed.stderr
+    call("train.py", "--resume", tmp_path / "run", "--timesteps", 600, *options[2:6])
     assert multiplier(tmp_path / "run") == pytest.approx(3 * 0.01 * 10)
 
 
@@ -157,18 +155,16 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 
 
-def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(tmp_path):
+def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(scripts, tmp_path):
     (tmp_path / "short.yml").write_text(CLONED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 40, "--final-episodes", 10, "--threads", 1)
-    done = run("train.py", "--env", "ClothReach-v0", "--algo", "bc_ppo", "--run", tmp_path / "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = call("train.py", "--env", "ClothReach-v0", "--algo", "bc_ppo", "--run", tmp_path / "run", *options)
     assert "cloned the expert from 10,240 samples" in done.stdout
     lines = [json.loads(line) for line in (tmp_path / "run" / "progress.jsonl").read_text().splitlines()]
     assert [line["timesteps"] for line in lines] == [0, 2560]
     assert lines[0]["success_rate"] > 0.5 and lines[0]["training_seconds"] > 0
     assert lines[1]["success_rate"] > 0.5  # one small step of PPO unlearns nothing
-    resumed = run("train.py", "--resume", tmp_path / "run", "--timesteps", 5120, *options[2:6], cwd=tmp_path)
-    assert resumed.returncode == 0, resumed.stderr
+    resumed = call("train.py", "--resume", tmp_path / "run", "--timesteps", 5120, *options[2:6])
     assert "cloned the expert" not in resumed.stdout
     scores = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert scores["timesteps"] == 5120 and scores["success_rate"] > 0.5 > scores["references"]["random"]["success_rate"]
@@ -219,18 +215,16 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
     assert build(learning.Path("unused"), config, 0, 64).env.unwrapped.env.task.physics_name == "true"
 
 
-def test_a_clone_alone_is_scored_again_and_not_cloned_again(tmp_path):
+def test_a_clone_alone_is_scored_again_and_not_cloned_again(scripts, tmp_path):
     """Killed before its score, and finished."""
     (tmp_path / "short.yml").write_text(CLONED.replace("!!float 2560", "0"))
     options = ("--eval-episodes", 5, "--final-episodes", 10)
     given = ("--env", "ClothReach-v0", "--algo", "bc", "--hyperparams", tmp_path / "short.yml")
-    done = run("train.py", *given, "--run", tmp_path / "run", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = call("train.py", *given, "--run", tmp_path / "run", *options)
     before = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     for name in ("model.zip", "policy.npz", "evaluation.json"):
         (tmp_path / "run" / name).unlink()
-    again = run("train.py", "--resume", tmp_path / "run", *options, cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
+    again = call("train.py", "--resume", tmp_path / "run", *options)
     assert "cloned" in done.stdout and "cloned" not in again.stdout
     after = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert after["return"] == before["return"] and after["training_seconds"] == pytest.approx(before["training_seconds"])
