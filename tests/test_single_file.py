@@ -185,6 +185,71 @@ def test_an_update_is_that_of_stable_baselines3(single):
     assert 0.1 < log["train/clip_fraction"] < 0.9
 
 
+def test_rollouts_and_updates_are_those_of_stable_baselines3_bit_for_bit(single, monkeypatch):
+    """From the same weights, with the same noise and the same minibatches: three rollouts of whole episodes, each learned from."""
+    import torch
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    torch.set_num_threads(1)
+    args = single.Args(env="ClothReach-v0", n_envs=8, n_steps=40, batch_size=80, n_epochs=3, net_arch=(16, 16))
+    agent = single.ActorCritic(58, 3, args.net_arch, args.log_std_init)
+    first = {name: part.clone() for name, part in agent.net.state_dict().items()}
+    optimizer = torch.optim.Adam(agent.net.parameters(), lr=0.001, eps=single.ADAM_EPS)
+    env, seeds = gym.make_vec("clothgym:ClothReach-v0", num_envs=8, autoreset_mode="SameStep"), []
+    reset = env.reset
+    env.reset = lambda seed: seeds.append(seed) or reset(seed=seed)
+
+    drawn = [np.random.default_rng(number).permutation(320) for number in range(9)]
+
+    class SameSamples:
+        """SB3 has the steps of an environment after one another, and this script the environments of a step."""
+
+        def __init__(self):
+            self.left = list(drawn)
+
+        def permutation(self, count):
+            places = self.left.pop(0)
+            return places % 40 * 8 + places // 40
+
+    rollouts, samples, weights = single.rollouts(env, agent, args, 0, deque()), SameSamples(), []
+    for number in range(3):
+        torch.manual_seed(number)
+        batch = next(rollouts)
+        single.update(agent, optimizer, batch, args, samples)
+        weights.append({name: part.clone() for name, part in agent.net.state_dict().items()})
+
+    class SameDraws(BaseCallback):
+        """Begins each rollout with the numbers above."""
+
+        number = 0
+
+        def _on_step(self):
+            return True
+
+        def _on_rollout_start(self):
+            torch.manual_seed(self.number)
+
+        def _on_rollout_end(self):
+            self.number += 1
+            seen.append({name: part.clone() for name, part in self.model.policy.state_dict().items()})
+
+    seen = []
+    kwargs = {"net_arch": [16, 16], "log_std_init": args.log_std_init}
+    options = {"n_steps": 40, "batch_size": 80, "n_epochs": 3, "learning_rate": 0.001, "gamma": args.gamma}
+    same = make_sb3_vec_env("ClothReach-v0", 8, seed=seeds[0])
+    model = PPO("MlpPolicy", same, policy_kwargs=kwargs, seed=seeds[0], device="cpu", **options)
+    monkeypatch.setattr(np.random, "permutation", lambda count: drawn.pop(0))
+    model.policy.load_state_dict(first)
+    model.learn(3 * 320, callback=SameDraws())
+    found = [*seen[1:], model.policy.state_dict()]
+    for one, other in zip(weights, found):
+        assert all(one[name].equal(other[name]) for name in first)
+    assert not weights[0]["log_std"].equal(weights[2]["log_std"])
+
+
 WRONG = {
     "--env ClothReech-v0": "no environment 'ClothReech-v0'; did you mean 'ClothReach-v0'?",
     "--env ClothFoldGoal-v0": "has no hyperparameters for 'ClothFoldGoal-v0' (there are: ClothDrape-v0",
