@@ -175,7 +175,11 @@ class FoldGoalTask(ManipulationTask):
         if self.reward_mode == "goal":
             achieved, desired = (self.observation[:, self.observation_slices[name]] for name in GOALS)
             self.terms[...] = np.zeros((), self.terms.dtype)
-            self.terms["progress"] = self.outcome["reward"] = np.where(running, goal_reward(achieved, desired), 0)
+            self.terms["progress"] = np.where(running, goal_reward(achieved, desired), 0)
+            # else the fastest way to few of these would be to tear the sheet
+            failed, left = running & (self.outcome["failure"] != FINE), self.most_steps() - self.steps_taken()
+            self.terms["failure"] = np.where(failed, -np.maximum(left, 0), 0)
+            self.outcome["reward"] = np.where(failed, self.terms["progress"] + self.terms["failure"], self.terms["progress"])
 
     def expert_actions(self) -> NDArray:
         """Each carried corner along an arc to its goal, and then up and away.
@@ -223,8 +227,17 @@ class GoalReward:
     """What hindsight experience replay asks of an environment."""
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
-        """0 where every corner is near its goal, else -1, (...); goals: (..., 12), for instance a batch of relabeled ones."""
-        return goal_reward(achieved_goal, desired_goal)
+        """0 where every corner is near its goal, else -1, (...), and less for a failure, whatever the goal.
+
+        achieved_goal, desired_goal: (..., 12), for instance a batch of relabeled ones.
+        info: what the step has said, whose ``reward/failure`` is added; of many steps a sequence of dictionaries, as
+            ``HerReplayBuffer`` has them with ``copy_info_dict=True``.
+        """
+        if info is None or isinstance(info, Mapping):
+            failure = (info or {}).get("reward/failure", 0.0)
+        else:
+            failure = [one.get("reward/failure", 0.0) for one in info]
+        return goal_reward(achieved_goal, desired_goal) + np.asarray(failure, np.float32)
 
 
 class ClothFoldGoalEnv(GoalReward, ClothEnv):
@@ -252,7 +265,9 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
 
     ## Rewards
     ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: what
-    ``compute_reward(achieved_goal, desired_goal, info)`` says, of one goal, (12,), or of many, (..., 12).
+    ``compute_reward(achieved_goal, desired_goal, info)`` says, of one goal, (12,), or of many, (..., 12).  A failure costs one more
+    for each step that was left, so that it is never better than to go on.  ``HerReplayBuffer`` hears of it with
+    ``copy_info_dict=True``.
     $rewards
 
     On the way the potential is ``1 - d/d0``, see below.

@@ -113,6 +113,29 @@ def test_doing_nothing_scores_nothing():
     assert not info["is_success"].any() and info["normalized_performance"].max() < 0.02 and np.all(total == -120)
 
 
+def test_whoever_tears_the_sheet_gains_nothing_by_it():
+    """With both hands holding it and going apart; all steps that are left have missed the goal, under any goal."""
+    env, _ = batch(4)
+    over, total, length, failure = np.zeros(4, bool), np.zeros(4), np.zeros(4), np.zeros(4, int)
+    while not over.all():
+        actions = env.expert_actions()
+        held = (env.task.simulation.grippers.holder[:, CORNERS] >= 0).sum(axis=1) == 2
+        tips = env.task.simulation.grippers.positions
+        apart = np.sign(tips - tips[:, ::-1])
+        actions.reshape(4, 2, 4)[held] = np.concatenate([apart, -np.ones((4, 2, 1))], axis=2)[held]
+        seen, reward, terminated, _, info = env.step(actions)
+        asked = [env.compute_reward(seen[name], seen["desired_goal"], info) for name in ("achieved_goal", "desired_goal")]
+        assert np.array_equal(reward[~over], asked[0][~over])
+        failed = ~over & terminated
+        length, failure = length + ~over, failure + info["failure"] * ~over
+        # whatever goal hindsight puts there: of one step, of a list of steps, and of the batch
+        assert np.array_equal(asked[1][failed], -(120 - length)[failed])
+        infos = [{"reward/failure": value} for value in info["reward/failure"]]
+        assert np.array_equal(env.compute_reward(seen["desired_goal"], seen["desired_goal"], infos)[failed], asked[1][failed])
+        total, over = total + reward, over | terminated
+    assert np.all(failure == 2) and length.max() < 40 and np.all(total == -120)
+
+
 def test_the_single_environment_and_the_batch_s_last_observations_are_dictionaries():
     env, one = batch(2, seed=5, autoreset_mode="SameStep")[0], gym.make(ID)
     env.action_space.seed(5)
