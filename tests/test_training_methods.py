@@ -23,6 +23,7 @@ ClothStrain-v0:
   cost_limit: 0.5
   multiplier_rate: 0.01
   excess_clip: 10.0
+  env_kwargs: {physics: fast}
 """
 CLONED = """
 ClothReach-v0:
@@ -38,10 +39,18 @@ ClothReach-v0:
 """
 
 
+@pytest.fixture
+def unfilmed(scripts, monkeypatch):
+    """The scripts without their films, which take seconds; test_training.py has one."""
+    import learning
+
+    monkeypatch.setattr(learning, "film", lambda *arguments: None)
+
+
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
 
 
-def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(scripts, tmp_path):
+def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(unfilmed, tmp_path):
     (tmp_path / "short.yml").write_text(CONSTRAINED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 2, "--final-episodes", 3, "--threads", 1)
     common = ("--env", "ClothStrain-v0", "--algo", "ppo_lagrange")
@@ -155,7 +164,7 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 
 
-def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(scripts, tmp_path):
+def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(unfilmed, tmp_path):
     (tmp_path / "short.yml").write_text(CLONED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 40, "--final-episodes", 10, "--threads", 1)
     done = call("train.py", "--env", "ClothReach-v0", "--algo", "bc_ppo", "--run", tmp_path / "run", *options)
@@ -215,7 +224,7 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
     assert build(learning.Path("unused"), config, 0, 64).env.unwrapped.env.task.physics_name == "true"
 
 
-def test_a_clone_alone_is_scored_again_and_not_cloned_again(scripts, tmp_path):
+def test_a_clone_alone_is_scored_again_and_not_cloned_again(unfilmed, tmp_path):
     """Killed before its score, and finished."""
     (tmp_path / "short.yml").write_text(CLONED.replace("!!float 2560", "0"))
     options = ("--eval-episodes", 5, "--final-episodes", 10)

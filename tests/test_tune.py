@@ -4,7 +4,7 @@ import importlib
 
 import pytest
 import yaml
-from training_runs import ROOT, run
+from training_runs import ROOT, call, run
 
 optuna = pytest.importorskip("optuna")
 
@@ -31,7 +31,7 @@ def test_what_is_found_can_be_trained_with(tune):
     assert found["learning_rate"] == "lin_0.00123" and found["policy_kwargs"]["net_arch"] == [64, 64]
 
 
-def test_a_study_goes_on(tmp_path):
+def test_a_study_goes_on(scripts, tmp_path):
     journal = tmp_path / "study.log"
     common = ("--env", "ClothReach-v0", "--timesteps", 640, "--episodes", 2, "--seeds", 1, "--study", journal)
     refused = run("tune.py", *common, "--show", cwd=tmp_path)
@@ -39,12 +39,13 @@ def test_a_study_goes_on(tmp_path):
     assert refused.returncode == 2 and "there is no such study" in " ".join(refused.stderr.replace("│", " ").split())
     wrong = tmp_path / "other.log"
     wrong.write_text("no journal")
-    refused = run("tune.py", "--study", wrong, cwd=tmp_path)
+    refused = call("tune.py", "--study", wrong)
     assert refused.returncode == 2 and "is no journal of a study of ClothReach-v0" in refused.stderr
-    for trials in (1, 2):
-        done = run("tune.py", *common, "--trials", trials, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    refused = run("tune.py", *common[:3], 650, *common[4:], cwd=tmp_path)
+    first = call("tune.py", *common, "--trials", 1)
+    # in another process
+    done = run("tune.py", *common, "--trials", 2, cwd=tmp_path)
+    assert first.returncode == done.returncode == 0, first.stderr + done.stderr
+    refused = call("tune.py", *common[:3], 650, *common[4:])
     assert refused.returncode == 2 and "have --timesteps 640 --episodes 2 --seeds 1" in refused.stderr
     backend = optuna.storages.journal.JournalFileBackend(str(journal))
     study = optuna.load_study(study_name="ClothReach-v0", storage=optuna.storages.JournalStorage(backend))

@@ -20,7 +20,10 @@ def call(script, *arguments):
     """The same without a process of its own, which would import torch anew: needs the fixture ``scripts``."""
     import tyro
 
-    module = importlib.import_module(script.removesuffix(".py"))
+    module, code = importlib.import_module(script.removesuffix(".py")), 0
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:
-        module.main(tyro.cli(module.Args, args=list(map(str, arguments))))
-    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
+        try:
+            module.main(tyro.cli(module.Args, args=list(map(str, arguments))))
+        except SystemExit as end:
+            code = end.code
+    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue(), returncode=code)
