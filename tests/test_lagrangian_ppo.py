@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -342,6 +343,25 @@ def test_a_limit_out_of_range_is_refused_while_loading_and_a_new_one_counts():
     other = LagrangianPPO.load(stored, cost_limit=2.0, multiplier_rate=0.5)
     other.update_multiplier(3.0)
     assert other.multiplier == 0.5
+
+
+def test_what_follows_a_rollout_is_of_its_own_environments_whatever_takes_their_place():
+    """As a curriculum does at the end of a rollout."""
+
+    class Others(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            self.followed = self.model.predict_cost_values(torch.as_tensor(self.model._last_obs))
+            self.model._last_obs = np.full((6, 3), 9.0, np.float32)
+
+    model, others = learner(Steps(6), n_steps=4, cost_gamma=0.9), Others()
+    learn(model, 1, callback=others)
+    rollout = model.cost_rollout
+    goes_on = 1 - rollout.dones[-1]
+    assert 0 < goes_on.mean() < 1
+    assert rollout.returns[-1] == pytest.approx(rollout.costs[-1] + 0.9 * goes_on * others.followed)
 
 
 @pytest.mark.parametrize(("cost", "told"), [(None, r"infos\[0\] has no 'cost'"), (lambda _: np.nan, r"infos\[0\]\['cost'\]=nan")])

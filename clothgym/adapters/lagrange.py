@@ -30,7 +30,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.policies import ActorCriticPolicy, BaseModel
 from stable_baselines3.common.torch_layers import create_mlp
 from stable_baselines3.common.type_aliases import GymEnv, PyTorchObs
@@ -84,8 +84,23 @@ def generalized_advantages(
     return advantages
 
 
+class _FinishCosts(BaseCallback):
+    """Takes the cost's values after the last step of a rollout, of what its environments show then."""
+
+    model: LagrangianPPO
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        model = self.model
+        assert model._last_obs is not None
+        last_values = model.predict_cost_values(obs_as_tensor(model._last_obs, model.device))
+        model.cost_rollout.finish(last_values, model.cost_gamma, model.cost_gae_lambda)
+
+
 class LagrangianPPO(PPO):
-    """``stable_baselines3.PPO`` that keeps the mean cost of an episode within a limit.
+    """``stable_baselines3.PPO`` under a constraint: the mean cost of an episode is to be at most a limit.
 
     It takes any environment whose ``infos`` have each step's ``"cost"``, and what PPO takes.  The critic of the cost is an MLP on
     the features that the policy's own critic sees.  It trains apart from the policy, and does not move the features.  As long as
@@ -196,7 +211,10 @@ class LagrangianPPO(PPO):
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int) -> bool:
         # what is left of a rollout that a callback stopped is of no use
         self.cost_rollout = CostRollout()
-        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        # the callbacks of a rollout's end may put other environments in the place of these
+        first = CallbackList([_FinishCosts(), callback])
+        first.model = first.callbacks[0].model = self
+        return super().collect_rollouts(env, first, rollout_buffer, n_rollout_steps)
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: NDArray | None = None) -> None:
         """SB3 calls this with each step's infos, while ``_last_obs`` is still what the policy acted on."""
@@ -238,9 +256,6 @@ class LagrangianPPO(PPO):
         self.logger.record("constraint/multiplier", self.multiplier)
 
         self.policy.set_training_mode(False)
-        assert self._last_obs is not None
-        last_values = self.predict_cost_values(obs_as_tensor(self._last_obs, self.device))
-        rollout.finish(last_values, self.cost_gamma, self.cost_gae_lambda)
         combined = (buffer.advantages - self.multiplier * rollout.advantages) / (1 + self.multiplier)
         buffer.advantages = combined.astype(np.float32)
         super().train()
