@@ -114,7 +114,7 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     same = [result(0.9, env_kwargs={"settling": "at_once"}), result(0.8, seed=1)]
     assert [len(rows) for rows in results.groups(same).values()] == [2]
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
-    assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", "SAC"]
+    assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", results.LABELS["sac"]]
     now = {"ClothReach-v0": "now"}
     assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 2 min"
     # who always arrives, and never at no cost, is not the best

@@ -75,7 +75,7 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
     assert lines[-1]["training_seconds"] > lines[0]["training_seconds"]
 
 
-def test_the_learnt_policy_is_evaluated_beside_the_references(trained):
+def test_the_learned_policy_is_evaluated_beside_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
     reach = ("--env", "ClothReach-v0")
@@ -97,6 +97,11 @@ WRONG = {
     "train --env ClothReach-v0 --algo ppo_lagrange": "has no hyperparameters for 'ClothReach-v0' (there are: ClothStrain-v0",
     "train --hyperparams gone.yml": "--hyperparams gone.yml: there is no such file",
     "train --hyperparams thin.yml": "thin.yml lacks n_envs, policy, n_steps for 'ClothDrape-v0'",
+    "train --hyperparams broken.yml": "--hyperparams broken.yml: it is no YAML (while parsing",
+    "train --hyperparams list.yml": "list.yml has no hyperparameters for 'ClothDrape-v0' (there are: )",
+    "train --hyperparams number.yml": "number.yml: 'ClothDrape-v0' has 3: must be a mapping, name: value",
+    'train --resume learned --env-kwargs {"rows":9}': "--resume goes on with the run's own: drop --env-kwargs",
+    "train --resume learned --hyperparams thin.yml": "--resume goes on with the run's own: drop --hyperparams",
     "train --resume gone": "'gone' is not the folder of a training run",
     "train --timesteps 0": "--timesteps 0: must be at least 1",
     "train --seed -1": "--seed -1: must be from 0",
@@ -121,7 +126,10 @@ WRONG = {
 @pytest.fixture
 def wrong(tmp_path, monkeypatch, scripts):
     """A folder with files to name, and no environment and no learner to be had in it."""
-    (tmp_path / "thin.yml").write_text("ClothDrape-v0: {n_timesteps: 100}")
+    for name, text in {
+        "thin": "ClothDrape-v0: {n_timesteps: 100}", "broken": "ClothDrape-v0: {", "list": "[1]", "number": "ClothDrape-v0: 3",
+    }.items():  # fmt: skip
+        (tmp_path / f"{name}.yml").write_text(text)
     for name, version in (("learned", clothgym.__version__), ("old", "0.0.1")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "checkpoint.pt").touch()

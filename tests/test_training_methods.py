@@ -164,7 +164,7 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 
 
-def test_a_cloned_policy_succeeds_before_it_has_learnt_and_is_not_cloned_again(unfilmed, tmp_path):
+def test_a_cloned_policy_succeeds_before_it_has_learned_and_is_not_cloned_again(unfilmed, tmp_path):
     (tmp_path / "short.yml").write_text(CLONED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 40, "--final-episodes", 10, "--threads", 1)
     done = call("train.py", "--env", "ClothReach-v0", "--algo", "bc_ppo", "--run", tmp_path / "run", *options)

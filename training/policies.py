@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 import clothgym.policies as committed
@@ -125,6 +126,37 @@ def same_as(config: Config, args: Any, *names: str) -> None:
         given = getattr(args, name)
         if given not in (config[name], type(args).__dataclass_fields__[name].default):
             raise ValueError(f"--{name} {given}: the run that --resume goes on with has {config[name]}: drop --{name}")
+
+
+def own_only(args: Any, *names: str) -> None:
+    """What ``--resume`` takes from the run alone.
+
+    Raises:
+        ValueError: one of these is given.
+    """
+    for name in names:
+        if getattr(args, name) != type(args).__dataclass_fields__[name].default:
+            raise ValueError(f"--resume goes on with the run's own: drop --{name.replace('_', '-')}")
+
+
+def hyperparameters_of(path: Path, env_id: str, advice: str = "") -> dict[str, Any]:
+    """What a file of hyperparameters, in rl_zoo3's format, says of an environment.
+
+    Raises:
+        ValueError: there is no such file, it is not YAML, or says nothing of the environment.
+    """
+    if not path.is_file():
+        raise ValueError(f"--hyperparams {path}: there is no such file")
+    try:
+        table = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"--hyperparams {path}: it is no YAML ({' '.join(str(error).split())})") from error
+    table = table if isinstance(table, dict) else {}
+    if env_id not in table:
+        raise ValueError(f"{path} has no hyperparameters for {env_id!r} (there are: {', '.join(map(str, table))}){advice}")
+    if not isinstance(table[env_id], dict):
+        raise ValueError(f"{path}: {env_id!r} has {table[env_id]!r}: must be a mapping, name: value")
+    return dict(table[env_id])
 
 
 def parsed_kwargs(text: str) -> dict[str, Any]:

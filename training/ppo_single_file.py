@@ -1,7 +1,7 @@
 """PPO in one file, to be read from top to bottom: native vector environments, torch for the nets, and no learner's library.
 
     python training/ppo_single_file.py --env ClothReach-v0          # runs/ClothReach-v0_single_file_0
-    python training/ppo_single_file.py --env ClothDrape-v0 --seed 1 --timesteps 500000 --learning-rate lin_0.002
+    python training/ppo_single_file.py --env ClothReach-v0 --seed 1 --timesteps 500000 --learning-rate lin_0.002
 
 Schulman et al., "Proximal Policy Optimization Algorithms" (2017), with the details of Stable-Baselines3 and the hyperparameters of
 train.py; a flag overrides one.  The folder holds evaluation.json (final score and settings), the TensorBoard log, and policy.npz:

@@ -25,7 +25,8 @@ KEPT = ("config.json", "evaluation.json", "progress.jsonl")
 ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
-    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC", "her": "SAC with hindsight (HER)",
+    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC, begun with the expert's episodes",
+    "her": "SAC with hindsight (HER), begun with the expert's episodes",
 }  # fmt: skip
 Result = dict[str, Any]
 

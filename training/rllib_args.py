@@ -71,14 +71,12 @@ class Args:
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
         policies.same_as(config, self, "env", "seed")
+        policies.own_only(self, "hyperparams", "env_kwargs")
         return folder, config
 
     def new_run(self) -> tuple[Path, dict[str, Any]]:
         """Folder and configuration of a new one."""
-        table = yaml.safe_load(self.hyperparams.read_text())
-        if not isinstance(table, dict) or self.env not in table:
-            raise ValueError(f"{self.hyperparams} has no hyperparameters for {self.env!r} (there are: {', '.join(table or ())})")
-        row = dict(table[self.env])
+        row = policies.hyperparameters_of(self.hyperparams, self.env)
         own = row.pop("env_kwargs", {})
         if set(row) != NEEDED or row["policy"] != "MlpPolicy" or set(row["policy_kwargs"]) != {"log_std_init", "net_arch"}:
             needed = f"{', '.join(sorted(NEEDED))}, an MlpPolicy of log_std_init and net_arch"

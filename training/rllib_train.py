@@ -41,7 +41,7 @@ from clothgym.policies import Policy
 POLICY, PROGRESS, EVALUATION = "policy.npz", "progress.jsonl", "evaluation.json"
 MODULE = "default_policy"  # RLlib's name of a network that is the only one
 # Stable-Baselines3's defaults, which train.py learns with
-CLIP_RANGE, VF_COEF, MAX_GRAD_NORM = 0.2, 0.5, 0.5
+CLIP_RANGE, VF_COEF, MAX_GRAD_NORM, ADAM_EPS = 0.2, 0.5, 0.5, 1e-5
 
 
 # --- environments and network ----------------------------------------------------------------------------------------------
@@ -119,7 +119,8 @@ def actor_critic() -> type:
 
 
 def learner() -> type:
-    """The class of the learner: RLlib's, with advantages standardized as in train.py."""
+    """The class of the learner: RLlib's, with advantages standardized, and Adam set, as in train.py."""
+    import torch
     from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 
     class Learner(PPOTorchLearner):
@@ -131,6 +132,12 @@ def learner() -> type:
             taken = batch["advantages"][batch["loss_mask"]]
             batch["advantages"] = (batch["advantages"] - taken.mean()) / (taken.std() + 1e-8)
             return super().compute_loss_for_module(batch=batch, **kwargs)
+
+        def configure_optimizers_for_module(self, module_id: str, config: Any = None) -> None:
+            """Adam with Stable-Baselines3's eps; RLlib's default is torch's."""
+            params = self.get_parameters(self.module[module_id])
+            optimizer = torch.optim.Adam(params, eps=ADAM_EPS)
+            self.register_optimizer(module_id=module_id, optimizer=optimizer, params=params, lr_or_lr_schedule=config.lr)
 
     return Learner
 
@@ -161,7 +168,9 @@ def build(args: Args, env_kwargs: dict[str, Any], done: int) -> Any:
     made = PPOConfig()
     made.environment(
         ALGO,
-        env_config={"id": f"clothgym:{config['env']}", "threads": args.cpus_per_runner} | env_kwargs,
+        # a runner on another machine imports the module that registers the id
+        env_config={"id": config["env"] if ":" in config["env"] else f"clothgym:{config['env']}"}
+        | {"threads": args.cpus_per_runner} | env_kwargs,
         # what is executed is clipped, what is learned from is the action that was drawn
         normalize_actions=False, clip_actions=True,
     )  # fmt: skip

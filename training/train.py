@@ -1,7 +1,7 @@
 """Train a policy, by PPO unless another learner is named, evaluate it on held-out seeds, and leave a folder that tells the story.
 
     python training/train.py --env ClothDrape-v0                    # runs/ClothDrape-v0_0
-    python training/train.py --env ClothDrape-v0 --seed 1 --timesteps 500000
+    python training/train.py --env ClothReach-v0 --seed 1 --timesteps 500000
     python training/train.py --env ClothStrain-v0 --algo ppo_lagrange   # runs/ClothStrain-v0_ppo_lagrange_0
     python training/train.py --env ClothDrapeGripper-v0 --algo bc_ppo   # runs/ClothDrapeGripper-v0_bc_ppo_0
     python training/train.py --resume runs/ClothDrape-v0_0          # go on after an interruption; a finished run is scored again
@@ -93,7 +93,8 @@ class Args:
             raise ValueError(f"--resume {folder}: it is of RLlib: go on with  python training/rllib_train.py --resume {folder}")
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
-        policies.same_as(config, self, "env", "seed", "algo")
+        policies.same_as(config, self, "env", "seed", "algo", "threads")
+        policies.own_only(self, "hyperparams", "env_kwargs")
         if self.timesteps is not None:
             config["timesteps"] = self.timesteps
         return folder, config
@@ -101,13 +102,7 @@ class Args:
     def new_run(self) -> tuple[Path, dict[str, Any]]:
         """Folder and configuration of a new one."""
         path = self.hyperparams or HERE / "hyperparams" / f"{self.algo}.yml"
-        if not path.is_file():
-            raise ValueError(f"--hyperparams {path}: there is no such file")
-        table = yaml.safe_load(path.read_text())
-        if not isinstance(table, dict) or self.env not in table:
-            known = ", ".join(table or ())
-            raise ValueError(f"{path} has no hyperparameters for {self.env!r} (there are: {known}): give a file with --hyperparams")
-        hyperparameters = dict(table[self.env])
+        hyperparameters = policies.hyperparameters_of(path, self.env, ": give a file with --hyperparams")
         needed = ("n_envs", "n_timesteps", "policy", "train_freq" if self.algo in policies.OFF_POLICY else "n_steps")
         missing = [key for key in needed if key not in hyperparameters]
         for part, keys in PARTS.items():
@@ -134,6 +129,9 @@ class Args:
         bare = self.env.rpartition(":")[2]
         name = bare if self.algo == "ppo" else f"{bare}_{self.algo}"
         folder = self.run or Path("runs") / f"{name}_{self.seed}"
+        first = config["curriculum"].get("n_timesteps", 0)
+        if first >= config["timesteps"] > 0:
+            print(f"all {config['timesteps']:,} steps are of the curriculum's first part, which has {first:,}", file=sys.stderr)
         if policies.has_checkpoint(folder):
             raise ValueError(f"{folder} holds a run already: go on with --resume {folder}, or choose another folder with --run")
         return folder, config

@@ -68,7 +68,7 @@ def _kill_and_resume(seconds: float | None = None, step: int | None = None) -> N
             os.kill(child, signal.SIGKILL)
 
         trained(
-            folder, "--run", str(folder / "run"), "--env", "ClothReach-v0",
+            folder, "--run", str(folder / "run"), "--env", "ClothReach-v0", "--hyperparams", "short.yml",
             prepare=None if step is None else lambda: _die_at(step), watch=None if seconds is None else watch,
         )  # fmt: skip
         if not config.exists():
@@ -146,7 +146,7 @@ def _train(arguments: tuple[str, ...]) -> None:
     import tyro
 
     learning.film = learning.draw_learning_curve = lambda *ignored: None
-    common = ("--hyperparams", "short.yml", "--evaluations", "4", "--eval-episodes", "1", "--final-episodes", "1")
+    common = ("--evaluations", "4", "--eval-episodes", "1", "--final-episodes", "1")
     with endings.stopped():
         train.main(tyro.cli(train.Args, args=(*arguments, *common)))
 

@@ -40,7 +40,7 @@ class DepthEncoder(BaseFeaturesExtractor):
 
 def _coordinates(pictures: torch.Tensor) -> torch.Tensor:
     """Columns and rows of pixels from -1 to 1, (1, 2, rows, columns)."""
-    y, x = (torch.linspace(-1, 1, size, dtype=pictures.dtype) for size in pictures.shape[-2:])
+    y, x = (torch.linspace(-1, 1, size, dtype=pictures.dtype, device=pictures.device) for size in pictures.shape[-2:])
     return torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x))])[None]
 
 
