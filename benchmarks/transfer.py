@@ -8,6 +8,7 @@ Each policy was trained in the task as its id fixes it, and has not seen any of 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+import clothgym.policies as committed
 from clothgym import files
 from clothgym.lab.bench import machine
 from clothgym.lab.digests import digest_of
@@ -30,6 +32,8 @@ EPISODES = 100
 ACTORS = (
     ("ClothDrape-v0", "expert"),
     ("ClothDrape-v0", "learned:ppo"),
+    ("ClothDrapeGripper-v0", "learned:bc_ppo"),
+    ("ClothStrain-v0", "learned:bc"),
     ("ClothReach-v0", "learned:ppo"),
 )
 # what is changed, and what it is called in the picture
@@ -59,6 +63,13 @@ def cell(env_id: str, actor: str, kwargs: dict[str, Any]) -> dict[str, Any]:
         "success_rate_ci95": wilson(successes, EPISODES),
         "normalized_performance": float(episodes["normalized_performance"].mean()),
     }
+
+
+def file_of(actor: str, env_id: str) -> str:
+    """A digest of the file of a committed policy; of a scripted one nothing, which the environment's digest covers."""
+    learner = actor.partition("learned:")[2]
+    path = committed.FOLDER / f"{env_id}_{learner}.npz"
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:12] if learner else ""
 
 
 def draw(rows: dict[str, dict[str, Any]]) -> None:
@@ -116,10 +127,11 @@ def main() -> None:
         except ValueError as error:  # a change that this task does not take
             print(f"{env_id}, {variant}: {error}")
             continue
-        # a cell of other code is measured again
-        if own.get(variant, {}).get("digest") == now:
+        # a cell of other code, or of another policy, is measured again
+        made = {"digest": now, "policy": file_of(actor, env_id)}
+        if made.items() <= own.get(variant, {}).items():
             continue
-        own[variant] = cell(env_id, actor, changed) | {"digest": now}
+        own[variant] = cell(env_id, actor, changed) | made
         files.write_json(RESULTS, {"machine": machine(), "episodes": EPISODES, "variants": VARIANTS, "rows": rows})
     print(
         json.dumps({name: {variant: one["success_rate"] for variant, one in row.items()} for name, row in rows.items()}, indent=1)
