@@ -32,8 +32,6 @@ EPISODES = 100
 ACTORS = (
     ("ClothDrape-v0", "expert"),
     ("ClothDrape-v0", "learned:ppo"),
-    ("ClothDrapeGripper-v0", "learned:bc_ppo"),
-    ("ClothStrain-v0", "learned:bc"),
     ("ClothReach-v0", "learned:ppo"),
 )
 # what is changed, and what it is called in the picture

@@ -125,6 +125,23 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}).endswith("2 min **(old)**")
 
 
+def test_a_table_of_cheats_marks_those_of_other_code(report):
+    row = {
+        "env": "ClothReach-v0",
+        "env_kwargs": {},
+        "cheat": "never",
+        "success": 0.0,
+        "performance": 0.25,
+        "return": -1.5,
+        "failed": 0.5,
+    }
+    table = report.cheats_table([row | {"digest": "now"}, row | {"digest": "before", "cost": 7.0}], {"ClothReach-v0": "now"})
+    _, _, present, old = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+    assert present == ["`ClothReach-v0`", "never", "0.00", "0.250", "-1.500", "0.50", ""]
+    assert old == ["`ClothReach-v0` **(old)**", "never", "0.00", "0.250", "-1.500", "0.50", "7.0"]
+    assert report.cheats_table([], {}) == "None yet."
+
+
 def test_sections_are_filled_and_the_rest_of_a_page_stays(report):
     text = "a\n<!-- scores of X -->\nold\n\nmore\n<!-- end -->\nb\n<!-- scores of Y -->\n<!-- end -->\n"
     made = {"scores of X": "| new |", "scores of Y": "two\nlines"}
@@ -156,5 +173,10 @@ def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(res
     policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_1" / "policy.npz")
     results.add([tmp_path / "ClothReach-v0_1"])
     assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["chosen_by"] == 0.1
+    # one that never succeeds is not kept
+    about = about | {"learner": "her", "chosen_by": 0.0}
+    policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_1" / "policy.npz")
+    results.add([tmp_path / "ClothReach-v0_1"])
+    assert [path.name for path in (tmp_path / "committed").iterdir()] == ["ClothReach-v0_ppo.npz"]
     with pytest.raises(ValueError, match="holds no finished run, it lacks evaluation.json"):
         results.add([tmp_path])

@@ -28,7 +28,7 @@ from results import RESULTS, ROOT, Result, add, groups, is_present, learned, not
 from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
-SUITE, MAXIMIZERS = RESULTS / "suite.json", RESULTS / "maximizers.json"
+SUITE, MAXIMIZERS, CHEATS = (RESULTS / f"{name}.json" for name in ("suite", "maximizers", "cheats"))
 PAGES = ("README.md", "docs/results.md", "docs/cheats.md")
 
 
@@ -125,6 +125,8 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
 
 def markdown(rows: list[dict[str, str]]) -> str:
     """A table; columns in which nothing stands are left out."""
+    if not rows:
+        return "None yet."
     columns = [name for name in rows[0] if any(row[name] for row in rows)]
     lines = [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
     return "\n".join([*lines, *(f"| {' | '.join(row[name] for name in columns)} |" for row in rows)])
@@ -136,7 +138,7 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
     own = [row for row in scripted if row["env"] == env_id and row["policy"] in order and not row["env_kwargs"]]
     rows = [scripted_row(row, digests) for row in sorted(own, key=lambda row: order[row["policy"]])]
     rows += [learned_row(label, group, digests) for (env, label), group in groups(results).items() if env == env_id]
-    return markdown(rows) if rows else "None yet."
+    return markdown(rows)
 
 
 def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
@@ -166,6 +168,18 @@ def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[s
             "its success": f"{experts[row['env']]['success_rate']:.3f}",
         })  # fmt: skip
     return markdown(found)
+
+
+def cheats_table(rows: list[Result], digests: dict[str, str]) -> str:
+    """What ways to score without doing the task have brought."""
+    return markdown([
+        {
+            "environment": f"`{row['env']}`{_old(is_present(row, digests))}", "cheat": row["cheat"],
+            "success": f"{row['success']:.2f}", "performance": f"{row['performance']:.3f}", "return": f"{row['return']:.3f}",
+            "failed": f"{row['failed']:.2f}", "cost": f"{row['cost']:.1f}" if "cost" in row else "",
+        }
+        for row in rows
+    ])  # fmt: skip
 
 
 # --- pages --------------------------------------------------------------------------------------------------------------------
@@ -211,6 +225,7 @@ def pages() -> dict[Path, str]:
     """Every page as it is to be."""
     digests, scripted = read_digests(), suite.read(SUITE)
     made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
+    made["cheats"] = cheats_table(suite.read(CHEATS), digests)
     return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
 
 

@@ -92,6 +92,10 @@ def choose() -> None:
 
     for path in sorted(RUNS.glob(f"*/{POLICY}")):
         about = policies.read(path).about
+        if not about["chosen_by"]:
+            # nobody wants one that never succeeds
+            path.unlink()
+            continue
         kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
         other = policies.read(kept).about if kept.exists() else about
         # one of the same seed, or of other code, is not compared with, but replaced
