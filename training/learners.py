@@ -53,7 +53,10 @@ def build(folder: Path, config: Config, seed: int, done: int) -> BaseAlgorithm:
 
 
 def _linear(text: str) -> Any:
-    """rl_zoo3's "lin_0.001": from there to zero over the run."""
+    """rl_zoo3's "lin_0.001": from there to zero over the run.
+
+    The last rollout may end beyond the steps that were asked for, as in rl_zoo3; its updates have a rate just below zero.
+    """
     kind, _, value = text.partition("_")
     if kind != "lin":
         raise ValueError(f"hyperparameter {text!r}: a schedule is written lin_VALUE")
