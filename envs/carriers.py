@@ -16,8 +16,9 @@ CAREFUL_SPEED, CAREFUL_ACCELERATION = 0.5, 2.0  # [m/s], [m/s^2]
 def careful(clips: NDArray, places: NDArray, velocity: NDArray, last: NDArray, edge: float, time_step: float) -> NDArray:
     """Velocities of the clips [m/s], (num_envs, 2, 3), as of a rigid pair: a bounded speed and a bounded change of it.
 
-    The turn is spread over each leg of the way, and the held edge is always as long as at rest.  velocity: of the clips now
-    [m/s]; last: whether the places are the last, (num_envs,), where the pair comes to rest; edge: its length [m].
+    The held edge is always as long as at rest, and lies along y: clips do not turn, so a pair that did would stretch the cloth
+    between its clips, and places are wide enough without.  Where it is turned, that is undone by the end of the leg.  velocity: of
+    the clips now [m/s]; last: whether the places are the last, (num_envs,), where the pair comes to rest; edge: its length [m].
     """
     center, moving = middle(clips), middle(velocity)
     away = middle(places) - center
@@ -26,10 +27,10 @@ def careful(clips: NDArray, places: NDArray, velocity: NDArray, last: NDArray, e
     speed = np.minimum(CAREFUL_SPEED, slowing)
     change = away * (speed / np.maximum(distance, 1e-9))[:, None] - moving
     change *= np.minimum(1, CAREFUL_ACCELERATION * time_step / np.maximum(length(change), 1e-9))[:, None]
-    yaw, wanted = (_yaw(pair[:, 0] - pair[:, 1]) for pair in (clips, places))
-    left = np.arctan2(np.sin(wanted - yaw), np.cos(wanted - yaw))
-    turn = yaw + left * np.minimum(1, time_step / np.maximum(distance / CAREFUL_SPEED, 4 * time_step))
-    half = edge / 2 * np.stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))], axis=1)
+    held = clips[:, 0] - clips[:, 1]
+    yaw = np.arctan2(-held[:, 0], held[:, 1])
+    yaw *= 1 - np.minimum(1, time_step / np.maximum(distance / CAREFUL_SPEED, 4 * time_step))
+    half = edge / 2 * np.stack([-np.sin(yaw), np.cos(yaw), np.zeros(len(yaw))], axis=1)
     there = center + (moving + change) * time_step
     return (np.stack([there + half, there - half], axis=1) - clips) / time_step
 
@@ -43,7 +44,3 @@ def careless(clips: NDArray, places: NDArray, speed: float, time_step: float) ->
 def middle(pairs: NDArray) -> NDArray:
     """Of what both clips have, (num_envs, 2, ...)."""
     return (pairs[:, 0] + pairs[:, 1]) / 2
-
-
-def _yaw(vectors: NDArray) -> NDArray:
-    return np.arctan2(vectors[:, 1], vectors[:, 0])
