@@ -18,7 +18,7 @@ from clothgym import limiting
 from clothgym._jit import placeholder, specialize, uncounted, used
 from clothgym.bending import Bending
 from clothgym.collisions.self.step import KERNELS as SELF_CONTACT
-from clothgym.collisions.solids.particle_contact import kernels_of as contact_kernels
+from clothgym.collisions.solids.sheet_contact import kernels_of as contact_kernels
 from clothgym.elements import Elastic
 from clothgym.forces import add_air_forces
 from clothgym.grid_forces import kernels_of
@@ -33,7 +33,7 @@ remeasure = placeholder("remeasure", "of (x, weave, limited): writes the largest
 # of ``collisions.self.step``
 press = placeholder("press", "of (x, v, w, sheet, block, step, h, carried): applies the impulses of contacts with itself")
 keep_apart = placeholder("keep_apart", "of (x, v, w, sheet, block, h, carried): corrects them, and keeps vertices in their bounds")
-# of ``collisions.solids.particle_contact``
+# of ``collisions.solids.sheet_contact``
 resolve = placeholder(
     "resolve", "of (x, v, w, triangles, shapes, colliders, h, carried, look, room): moves solids on, and the sheet out of them"
 )
@@ -145,7 +145,7 @@ def compiled(
     substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str
 ) -> tuple[Any, Any]:
     """``advance`` around an integrator's substep: with the forces of a bending model and a layout, with a limiter or none, with
-    contact of the sheet with itself or none, and with contact with solids (see ``particle_contact.needed``); and its
+    contact of the sheet with itself or none, and with contact with solids (see ``sheet_contact.needed``); and its
     ``room_for_block``."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     touching = contact_kernels(contact, by_particle)

@@ -13,7 +13,7 @@ from clothgym.attachments import Attachments, Gripper, Grippers
 from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
-from clothgym.collisions.solids.particle_contact import needed
+from clothgym.collisions.solids.sheet_contact import needed
 from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
 from clothgym.exclusive import Turn, exclusive
 from clothgym.integrators import Integrator

@@ -22,7 +22,7 @@ from clothgym.collisions.self.owner import SelfCollision, SelfContacts
 from clothgym.collisions.solids.attachment_contact import keep_out, stop_at_solids
 from clothgym.collisions.solids.mesh_collider import MeshCollider
 from clothgym.collisions.solids.owner import Solids
-from clothgym.collisions.solids.particle_contact import Contacts
+from clothgym.collisions.solids.penetration import Contacts
 from clothgym.collisions.solids.shapes import COLLIDER_ROWS, Box, Capsule, Collider, Plane, Sphere
 from clothgym.collisions.solids.signed_distance import SCRATCH_ROWS
 

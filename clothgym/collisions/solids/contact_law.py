@@ -8,7 +8,10 @@ With the outward normal n and the velocity u relative to the solid, the normal i
 The displacement loses what friction takes, too, for the time that the integrator has already moved by that velocity.  Otherwise a
 sheet at rest on a slope would creep by ``h^2 g sin`` in each substep.
 
-Both laws take and return scalars, so that lanes and single sheets share them.  zero, one, tiny: in the dtype of the others.
+At an edge of the solid the impulse acts along a direction e that is not n (see ``edges``): it takes the inward velocity, u . n, but
+pushes along e, and friction acts at right angles to e.  Depth is always corrected along n.
+
+The laws take and return scalars, so that particles and triangles share them.  zero, one, tiny: in the dtype of the others.
 """
 
 from __future__ import annotations
@@ -50,36 +53,62 @@ def contact_change(distance, nx, ny, nz, ux, uy, uz, w, friction, carried, zero,
 
 
 @inlined
-def touch_change(gap, nx, ny, nz, ux, uy, uz, jx, jy, jz, inverse_mass, friction, h, carried, zero, one, most_speed, relaxed):
+def edge_change(distance, nx, ny, nz, ex, ey, ez, ux, uy, uz, friction, carried, zero, one, tiny):
+    """``contact_change`` of a free particle inside the solid that is pushed along e.
+
+        dx = -distance n - carried s v_T,    dv = dv_E e - s v_T,    dv_E = max(-u . n, 0)/(e . n),    s = min(mu dv_E / |v_T|, 1),
+
+    where v_T is the part of u at right angles to e.
+    """
+    un = ux * nx + uy * ny + uz * nz
+    dv = max(-un, zero) / (ex * nx + ey * ny + ez * nz)
+    # what friction takes
+    ue = ux * ex + uy * ey + uz * ez
+    tx, ty, tz = ux - ue * ex, uy - ue * ey, uz - ue * ez
+    slowed = min(friction * dv / (np.sqrt(tx * tx + ty * ty + tz * tz) + tiny), one)
+    mx, my, mz = (
+        -distance * nx - carried * slowed * tx,
+        -distance * ny - carried * slowed * ty,
+        -distance * nz - carried * slowed * tz,
+    )
+    return mx, my, mz, dv * ex - slowed * tx, dv * ey - slowed * ty, dv * ez - slowed * tz
+
+
+@inlined
+def touch_change(
+    gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, friction, h, carried, zero, one, most_speed, relaxed
+):  # fmt: skip
     """The same for a point of a triangle that keeps an impulse j [N s] from substep to substep: its new impulse, its change, and a
     push [kg m], three components each.  Corner i moves by w_i b_i (carried dj + push) and its velocity changes by w_i b_i dj, with
     its barycentric weight b_i.
 
-    gap: signed distance of the point [m], after j has acted.  u: its velocity relative to the solid [m/s], likewise.  inverse_mass:
-    of the point, sum w_i b_i^2 = 1/m [1/kg].  h: the substep [s].  most_speed: see ``FASTEST``.  relaxed: see ``RELAXED``.
+    gap: signed distance of the point along n [m], after j has acted.  u: its velocity relative to the solid [m/s], likewise.
+    inverse_mass: of the point, sum w_i b_i^2 = 1/m [1/kg].  h: the substep [s].  most_speed: see ``FASTEST``.  relaxed: see
+    ``RELAXED``.
 
-        j_n <- max(j_n + m (u* - u_n), 0),    j_t <- j_t - m u_t, shortened to mu j_n,
+        j_e <- max(j_e + m (u* - u_n) / (e . n), 0),    j_t <- j_t - m u_t, shortened to mu j_e,
 
-    where u* <= 0 is the velocity that closes the gap and no more.  Depth that the substep's inward velocity explains is corrected
-    at once, the rest only by the share ``relaxed``.
+    where j_e is along e, and j_t and u_t at right angles to it, and u* <= 0 is the velocity that closes the gap and no more.  Depth
+    that the substep's inward velocity explains is corrected at once, the rest only by the share ``relaxed``.
     """
-    jn_before = jx * nx + jy * ny + jz * nz
+    je_before = jx * ex + jy * ey + jz * ez
     # a contact, if the point is inside or was borne, and can move
-    acts = ((gap < zero) | (jn_before > zero)) & (inverse_mass > zero)
+    acts = ((gap < zero) | (je_before > zero)) & (inverse_mass > zero)
     mass = one / inverse_mass if acts else zero
-    # normal impulse
-    un = ux * nx + uy * ny + uz * nz
+    # impulse along e
+    un, cosine = ux * nx + uy * ny + uz * nz, ex * nx + ey * ny + ez * nz
     target = -max(gap - carried * un, zero) / h
-    jn = min(max(jn_before + (target - un) * mass, zero), most_speed * mass)
+    je = min(max(je_before + (target - un) * mass / cosine, zero), most_speed * mass)
     # friction
-    tx, ty, tz = jx - jn_before * nx, jy - jn_before * ny, jz - jn_before * nz
-    tx, ty, tz = tx - mass * (ux - un * nx), ty - mass * (uy - un * ny), tz - mass * (uz - un * nz)
+    ue = ux * ex + uy * ey + uz * ez
+    tx, ty, tz = jx - je_before * ex, jy - je_before * ey, jz - je_before * ez
+    tx, ty, tz = tx - mass * (ux - ue * ex), ty - mass * (uy - ue * ey), tz - mass * (uz - ue * ez)
     length = np.sqrt(tx * tx + ty * ty + tz * tz)
-    share = friction * jn / length if length > friction * jn else one
-    px, py, pz = jn * nx + share * tx, jn * ny + share * ty, jn * nz + share * tz
+    share = friction * je / length if length > friction * je else one
+    px, py, pz = je * ex + share * tx, je * ey + share * ty, je * ez + share * tz
     px, py, pz = px if acts else zero, py if acts else zero, pz if acts else zero
     # depth that is left, and how much of it is corrected
-    taken = (jn - jn_before) * inverse_mass
+    taken = (je - je_before) * inverse_mass * cosine
     depth = max(-(gap + carried * taken), zero)
     moved = min(depth, max(taken, zero) * (h - carried))
     push = mass * (moved + relaxed * (depth - moved))

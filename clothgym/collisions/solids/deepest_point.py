@@ -7,8 +7,9 @@ own normal where an edge or a corner of the solid pokes into it, and perpendicul
 sphere is its center, and one round is exact; that of a capsule is its segment.
 
 The core must lie deeper than any point of the triangle: if a point turns out to lie deeper than half of ``rho``, ``rho`` is set to
-twice its depth.  But on a solid with sharp edges the point nearest to the core is not quite the deepest: the error is up to a fifth
-of ``rho``.  So ``rho`` starts at two thicknesses, which keeps the error below half a thickness.
+twice its depth.  At an edge or a corner of a box the triangle's point nearest to the core is not quite the one nearest to the edge.
+So in the end the core's point moves out to the edge, and the triangle's point closest to that is taken: the gap along the normal is
+then that of the box itself (``turn_normal``).  At a mesh, which has no such point, the error is up to a fifth of ``rho``.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ from clothgym.collisions.solids.signed_distance import (
     S_CONTACT,
     S_CORE,
     S_CORNERS,
+    S_LENGTH,
     S_RHO,
     S_SPOT,
+    S_USABLE,
     S_WEIGHTS,
     measure,
 )
@@ -38,7 +41,7 @@ from clothgym.collisions.solids.signed_distance import (
 NO_CONTACT = 1e9  # gap of a lane without contact [m]
 MESH_ROUNDS, BOX_STEPS = 3, 8  # rounds at a mesh, and steps at a box with half sides, see ``find_deepest``
 SLOW_ROUND = 0.98  # largest ratio of the moves of two rounds that the extrapolation assumes
-DEPTH = 2.0  # initial rho, in thicknesses
+DEPTH = 1.0  # initial rho, in thicknesses
 SOON = 0.25  # gap, in thicknesses, within which a triangle may touch the solid before the next search
 BALL = 5.0  # least radius of a ball that stands for the solid until the next search, in thicknesses
 CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid
@@ -213,11 +216,12 @@ def find_deepest(scratch, shapes, k):
 
 
 @kernel
-def turn_normal(scratch):
+def turn_normal(scratch, mesh):
     """Replace the solid's normal in S_CONTACT by that of contact, from core to triangle, and the distance by the gap along it.
-    S_RHO becomes how far below the triangle the core's point lies, at least ``BALL``.  Returns whether any lane has a contact.
+    At a rounded box (``mesh`` is false) S_SPOT and S_WEIGHTS become the point that is closest to the box's edge or corner.
 
-    A lane whose gap is wider than ``SOON`` thicknesses, or which surely does not touch, gets ``NO_CONTACT``.
+    S_RHO becomes how far below the triangle the core of the touch's ball is to lie, at least ``BALL``.  Returns whether any lane
+    has a contact.  A lane whose gap is wider than ``SOON`` thicknesses, or which surely does not touch, gets ``NO_CONTACT``.
     """
     zero, one, tiny, none = scratch.dtype.type(0), scratch.dtype.type(1), scratch.dtype.type(1e-18), scratch.dtype.type(NO_CONTACT)
     least_cosine, soon, deep = scratch.dtype.type(LEAST_COSINE), scratch.dtype.type(SOON), scratch.dtype.type(BALL)
@@ -235,11 +239,29 @@ def turn_normal(scratch):
         scratch[S_CONTACT + 1, l] = dx if usable else nx
         scratch[S_CONTACT + 2, l] = dy if usable else ny
         scratch[S_CONTACT + 3, l] = dz if usable else nz
-        scratch[S_RHO, l] = max(length, deep * scratch[R_THICKNESS, l])
-        # the gap along it, if it is small enough
-        gap = scratch[S_CONTACT, l] / cosine if usable else scratch[S_CONTACT, l]
-        scratch[S_CONTACT, l] = gap if (scratch[S_CLEAR, l] == zero) & (gap < soon * scratch[R_THICKNESS, l]) else none
+        scratch[S_CONTACT, l] = scratch[S_CONTACT, l] / cosine if usable else scratch[S_CONTACT, l]
+        scratch[S_USABLE, l] = one if usable else zero
+        scratch[S_LENGTH, l] = length
+    if not mesh:
+        # the core's point on an edge or a corner of the core moves out to that of the box, and the triangle's point follows
+        for c in range(3):
+            for l in range(scratch.shape[1]):
+                q, side, b = scratch[S_CORE + c, l], scratch[S_CONTACT + 1 + c, l], scratch[R_HALF + c, l]
+                half = max(b - max(scratch[S_RHO, l] - scratch[R_RADIUS, l], zero), zero)
+                outer = b if side > zero else -b
+                scratch[S_CORE + c, l] = outer if (abs(q) >= half) & (side != zero) else q
+        to_triangle(scratch)
+        for l in range(scratch.shape[1]):
+            gap = -scratch[R_RADIUS, l]
+            gap += scratch[S_CONTACT + 1, l] * (scratch[S_SPOT, l] - scratch[S_CORE, l])
+            gap += scratch[S_CONTACT + 2, l] * (scratch[S_SPOT + 1, l] - scratch[S_CORE + 1, l])
+            gap += scratch[S_CONTACT + 3, l] * (scratch[S_SPOT + 2, l] - scratch[S_CORE + 2, l])
+            scratch[S_CONTACT, l] = gap if scratch[S_USABLE, l] > zero else scratch[S_CONTACT, l]
     any_contact = False
     for l in range(scratch.shape[1]):
-        any_contact |= scratch[S_CONTACT, l] < none
+        scratch[S_RHO, l] = max(scratch[S_LENGTH, l], deep * scratch[R_THICKNESS, l])
+        gap = scratch[S_CONTACT, l]
+        near = (scratch[S_CLEAR, l] == zero) & (gap < soon * scratch[R_THICKNESS, l])
+        scratch[S_CONTACT, l] = gap if near else none
+        any_contact |= near
     return any_contact

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym.checks import vectors
 from clothgym.collisions.solids.mesh_collider import MeshCollider
-from clothgym.collisions.solids.particle_contact import Contacts, contacts
-from clothgym.collisions.solids.penetration import deepest
+from clothgym.collisions.solids.penetration import Contacts, contacts, deepest
 from clothgym.collisions.solids.shapes import (
     COLLIDER_ROWS,
     R_AFTER,

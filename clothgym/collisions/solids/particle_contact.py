@@ -1,216 +1,219 @@
-"""Contact of sheets with solids in lanes: of the particles here, of the triangles in ``triangle_contact``.
+"""Contact of one sheet's particles with solids.
 
-The contact law (``contact_law``) is applied after each substep to the positions and velocities that the integrator left.  For one
-sheet whose particles lie side by side the same is in ``grid_contact``.
+Particles are measured all at once, from the first to the last that a solid may touch.  The contact law (``contact_law``) is applied
+after each substep to the positions and velocities that the integrator left.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
-from clothgym._jit import apart, inlined, kernel, placeholder, specialize
-from clothgym.collisions.solids.contact_law import TINY, contact_change
-from clothgym.collisions.solids.grid_contact import resolve_on_sheet, resolve_particles_on_sheet, room_on_sheet
-from clothgym.collisions.solids.shapes import KIND_PLANE, KIND_ROUNDED_BOX, R_FRICTION, R_VELOCITY
-from clothgym.collisions.solids.signed_distance import (
-    S_CONTACT,
-    S_INVERSE_MASS,
-    S_MOTION,
-    S_SPOT,
-    SCRATCH_ROWS,
-    Shapes,
-    lay_out,
-    may_touch_plane,
-    may_touch_solid,
-    measure_in_world,
-    measure_mesh,
-    measure_plane,
-    measure_rounded_box,
-    normal_to_world,
-    to_axes,
+from clothgym._jit import disjoint, inlined, uncounted
+from clothgym.collisions.solids.contact_law import TINY, contact_change, edge_change
+from clothgym.collisions.solids.edges import EDGE_ROWS, LEAST_COSINE
+from clothgym.collisions.solids.shapes import (
+    KIND_PLANE,
+    KIND_ROUNDED_BOX,
+    R_AXES,
+    R_FRICTION,
+    R_HALF,
+    R_POINT,
+    R_RADIUS,
+    R_REACH2,
+    R_VELOCITY,
 )
-from clothgym.collisions.solids.touch_response import T_IMPULSE, bear_touches, follow_touches, move_solids, press_touches
-from clothgym.collisions.solids.triangle_contact import find_touches, may_touch_sheet, room_for_touches
-from clothgym.state import Layout
+from clothgym.collisions.solids.signed_distance import S_CONTACT, S_SPOT, lay_out, measure_mesh, rounded_box
 
-may_touch = placeholder("may_touch", "of (x, p, collider): whether particle p of any lane may touch the solid")
-measure_solid = placeholder(
-    "measure_solid",
-    "of (scratch, spot, shapes, k, thickness): writes the signed distance and the normal at a spot in the solid's axes to scratch",
-)
+# rows of scratch, one column a particle: position in the solid's axes, signed distance and normal, how near cells are, and those of
+# ``edges``
+P_LOCAL, P_GAP, P_NORMAL, P_NEAR, P_EDGES = 0, 3, 4, 7, 8
+PARTICLE_ROWS = P_EDGES + EDGE_ROWS
+
+
+@disjoint
+def _heights(x, y, z, px, py, pz, nx, ny, nz, radius, gap):
+    """Signed distance of particles to a plane [m]: ``gap``, (particles,).  Returns how many are below it."""
+    count, zero = 0, x.dtype.type(0)
+    for p in range(x.shape[0]):
+        gap[p] = (x[p] - px) * nx + (y[p] - py) * ny + (z[p] - pz) * nz - radius
+        count += gap[p] < zero
+    return count
+
+
+@disjoint
+def _beyond_reach(x, y, z, px, py, pz, reach2, gap):
+    """Squared distance of particles from a solid's point less its squared reach [m^2]: ``gap``.  Returns how many are within."""
+    count, zero = 0, x.dtype.type(0)
+    for p in range(x.shape[0]):
+        dx, dy, dz = x[p] - px, y[p] - py, z[p] - pz
+        gap[p] = dx * dx + dy * dy + dz * dz - reach2
+        count += gap[p] < zero
+    return count
 
 
 @inlined
-def _push_particle_out(x, v, w, p, carried, scratch):
-    """Apply the contact law to particle p, for the distance and normal in S_CONTACT."""
-    zero = x.dtype.type(0)
-    one = x.dtype.type(1)
-    tiny = x.dtype.type(TINY)
-    # its velocity and inverse mass
-    for c in range(3):
-        for l in range(x.shape[2]):
-            scratch[S_MOTION + c, l] = v[c, p, l]
-    for l in range(x.shape[2]):
-        scratch[S_INVERSE_MASS, l] = w[p, l]
-    # the changes: of position to S_SPOT, of velocity to S_MOTION
-    for l in range(x.shape[2]):
-        nx, ny, nz = scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l]
-        ux = scratch[S_MOTION, l] - scratch[R_VELOCITY, l]
-        uy = scratch[S_MOTION + 1, l] - scratch[R_VELOCITY + 1, l]
-        uz = scratch[S_MOTION + 2, l] - scratch[R_VELOCITY + 2, l]
+def _span(gap):
+    """Range from the first to one past the last value below zero."""
+    first, last = 0, gap.shape[0]
+    while first < last and gap[first] >= 0:
+        first += 1
+    while last > first and gap[last - 1] >= 0:
+        last -= 1
+    return first, last
+
+
+@disjoint
+def to_axis(x, y, z, px, py, pz, ax, ay, az, out):
+    """Coordinates of particles along one axis of a solid [m]: ``out``, (particles,)."""
+    for p in range(out.shape[0]):
+        out[p] = (x[p] - px) * ax + (y[p] - py) * ay + (z[p] - pz) * az
+
+
+@disjoint
+def measure_boxes(x, y, z, hx, hy, hz, radius, gap, nx, ny, nz):
+    """Signed distance [m] and normal of positions in the axes of a rounded box."""
+    zero, one = x.dtype.type(0), x.dtype.type(1)
+    for p in range(gap.shape[0]):
+        gap[p], nx[p], ny[p], nz[p] = rounded_box(x[p], y[p], z[p], hx, hy, hz, radius, zero, one)
+
+
+@disjoint
+def to_world(nx, ny, nz, xx, xy, xz, yx, yy, yz, zx, zy, zz):
+    """Rotate normals from a solid's axes, x, y and z, to the world's."""
+    for p in range(nx.shape[0]):
+        ax, ay, az = nx[p], ny[p], nz[p]
+        nx[p] = ax * xx + ay * yx + az * zx
+        ny[p] = ax * xy + ay * yy + az * zy
+        nz[p] = ax * xz + ay * yz + az * zz
+
+
+@disjoint
+def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+    """Apply the contact law to particles at a solid that moves with velocity s [m/s]."""
+    zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
+    for p in range(gap.shape[0]):
         mx, my, mz, cx, cy, cz = contact_change(
-            scratch[S_CONTACT, l], nx, ny, nz, ux, uy, uz, scratch[S_INVERSE_MASS, l], scratch[R_FRICTION, l], carried, zero, one,
-            tiny,
-        )  # fmt: skip
-        scratch[S_SPOT, l] = mx
-        scratch[S_SPOT + 1, l] = my
-        scratch[S_SPOT + 2, l] = mz
-        scratch[S_MOTION, l] = cx
-        scratch[S_MOTION + 1, l] = cy
-        scratch[S_MOTION + 2, l] = cz
-    # apply them
-    for c in range(3):
-        for l in range(x.shape[2]):
-            x[c, p, l] += scratch[S_SPOT + c, l]
-        for l in range(x.shape[2]):
-            v[c, p, l] += scratch[S_MOTION + c, l]
+            gap[p], nx[p], ny[p], nz[p], vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+        )
+        x[p] += mx
+        y[p] += my
+        z[p] += mz
+        vx[p] += cx
+        vy[p] += cy
+        vz[p] += cz
 
 
-def _resolve_solid(x, v, w, collider, shapes, k, carried, scratch):
-    """Resolve the contacts of one block's particles with solid k, whose rows are in the scratch."""
-    for p in range(x.shape[1]):
-        if may_touch(x, p, collider):
-            to_axes(x, p, scratch, S_SPOT)
-            measure_solid(scratch, S_SPOT, shapes, k, x.dtype.type(0))
-            normal_to_world(scratch)
-            _push_particle_out(x, v, w, p, carried, scratch)
+@disjoint
+def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+    """The same with one normal for all particles."""
+    zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
+    for p in range(gap.shape[0]):
+        mx, my, mz, cx, cy, cz = contact_change(
+            gap[p], nx, ny, nz, vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+        )
+        x[p] += mx
+        y[p] += my
+        z[p] += mz
+        vx[p] += cx
+        vy[p] += cy
+        vz[p] += cz
 
 
-# one for each kind: a branch in the loop costs a single environment as much as the contact itself
-_resolve_plane = specialize(_resolve_solid, "resolve_plane", may_touch=may_touch_plane, measure_solid=measure_plane)
-_resolve_rounded_box = specialize(
-    _resolve_solid, "resolve_rounded_box", may_touch=may_touch_solid, measure_solid=measure_rounded_box
-)
-_resolve_mesh = specialize(_resolve_solid, "resolve_mesh", may_touch=may_touch_solid, measure_solid=measure_mesh)
+@uncounted
+def measure_in_scratch(rows, first, last, collider, shapes, k, within, scratch):
+    """Distance, and normal where that is below ``within``, of particles, whose positions are in rows P_LOCAL, to a mesh.
+
+    They are measured as many at a time as the scratch has columns.
+    """
+    lay_out(collider, scratch)
+    for begin in range(first, last, scratch.shape[1]):
+        count = min(scratch.shape[1], last - begin)
+        for e in range(3):
+            for l in range(scratch.shape[1]):
+                scratch[S_SPOT + e, l] = rows[P_LOCAL + e, begin + min(l, count - 1)]
+        measure_mesh(scratch, S_SPOT, shapes, k, within)
+        for e in range(4):
+            for l in range(count):
+                rows[P_GAP + e, begin + l] = scratch[S_CONTACT + e, l]
 
 
-@apart
-def _resolve_each(x, v, w, shapes, colliders, carried, scratch):
-    """Resolve the contacts of one block's particles with each solid."""
+@uncounted
+def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz, friction, carried):
+    """Apply the contact law to those of particles ``first`` to ``last`` that are near an edge, and mark them as done.
+
+    contacts: signed distances [m] and normals, (4, particles).  edges: particles, (edges,).  pushes: directions, (edges, 3).
+    """
+    zero, one, tiny = r.dtype.type(0), r.dtype.type(1), r.dtype.type(TINY)
+    least_cosine = r.dtype.type(LEAST_COSINE)
+    for n in range(edges.shape[0]):
+        p = edges[n]
+        if p < first or p >= last or not (contacts[0, p] < zero and m[p] > zero):
+            continue
+        nx, ny, nz = contacts[1, p], contacts[2, p], contacts[3, p]
+        ex, ey, ez = pushes[n, 0], pushes[n, 1], pushes[n, 2]
+        if not ex * nx + ey * ny + ez * nz > least_cosine:
+            continue
+        mx, my, mz, cx, cy, cz = edge_change(
+            contacts[0, p], nx, ny, nz, ex, ey, ez, s[0, p] - sx, s[1, p] - sy, s[2, p] - sz, friction, carried, zero, one, tiny
+        )
+        r[0, p] += mx
+        r[1, p] += my
+        r[2, p] += mz
+        s[0, p] += cx
+        s[1, p] += cy
+        s[2, p] += cz
+        contacts[0, p] = zero
+
+
+@uncounted
+def resolve_particles(r, s, m, shapes, colliders, carried, edges, pushes, counts, rows, scratch):
+    """Resolve one sheet's particles' contacts with solids.
+
+    r: positions [m], s: velocities [m/s], (3, particles).  m: inverse masses [1/kg], (particles,).  colliders: rows, (colliders,
+    COLLIDER_ROWS, 1).  carried: time for which the velocity has already moved the positions [s].
+    edges: particles near an edge of each solid, (colliders, particles), and ``pushes``, the directions in which it pushes them,
+    (colliders, particles, 3), see ``edges``; counts: how many, (colliders,).
+    rows: scratch, (PARTICLE_ROWS, particles).  scratch: see ``signed_distance``.
+    """
     kinds = shapes.kinds
     for k in range(kinds.shape[0]):
-        collider = colliders[k]
-        lay_out(collider, scratch)
+        c = colliders[k].reshape(colliders.shape[1])
+        px, py, pz = c[R_POINT], c[R_POINT + 1], c[R_POINT + 2]
+        sx, sy, sz, friction = c[R_VELOCITY], c[R_VELOCITY + 1], c[R_VELOCITY + 2], c[R_FRICTION]
+        # a plane: heights, then the particles from the first to the last below it
         if kinds[k] == KIND_PLANE:
-            _resolve_plane(x, v, w, collider, shapes, k, carried, scratch)
-        elif kinds[k] == KIND_ROUNDED_BOX:
-            _resolve_rounded_box(x, v, w, collider, shapes, k, carried, scratch)
+            nx, ny, nz = c[R_AXES + 6], c[R_AXES + 7], c[R_AXES + 8]
+            if _heights(r[0], r[1], r[2], px, py, pz, nx, ny, nz, c[R_RADIUS], rows[P_GAP]) > 0:
+                a, b = _span(rows[P_GAP])
+                _respond_to_plane(
+                    r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[P_GAP, a:b], nx, ny, nz, sx, sy,
+                    sz, friction, carried,
+                )  # fmt: skip
+            continue
+        # any other solid: particles within its reach, from the first to the last
+        if _beyond_reach(r[0], r[1], r[2], px, py, pz, c[R_REACH2], rows[P_GAP]) == 0:
+            continue
+        a, b = _span(rows[P_GAP])
+        # positions in its axes, distances and normals there
+        for e in range(3):
+            q = R_AXES + 3 * e
+            to_axis(r[0, a:b], r[1, a:b], r[2, a:b], px, py, pz, c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e, a:b])
+        gap, nx, ny, nz = rows[P_GAP, a:b], rows[P_NORMAL, a:b], rows[P_NORMAL + 1, a:b], rows[P_NORMAL + 2, a:b]
+        if kinds[k] == KIND_ROUNDED_BOX:
+            measure_boxes(
+                rows[P_LOCAL, a:b], rows[P_LOCAL + 1, a:b], rows[P_LOCAL + 2, a:b], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2],
+                c[R_RADIUS], gap, nx, ny, nz,
+            )  # fmt: skip
         else:
-            _resolve_mesh(x, v, w, collider, shapes, k, carried, scratch)
-
-
-@apart
-def resolve_particles(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
-    """Move the solids of one block on, and resolve its particles' contacts with them after a substep.
-
-    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes); attached particles are left alone.
-    colliders: rows, (colliders, COLLIDER_ROWS, lanes).  h: the substep [s].  carried: time for which the velocity has already moved
-    the positions [s].  room: from ``room_in_lanes``.  triangles, step and look_every are for ``resolve``.
-    """
-    move_solids(colliders, h)
-    _resolve_each(x, v, w, shapes, colliders, carried, room[1])
-
-
-@apart
-def resolve(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
-    """The same, and the sheet between the particles, see ``touch_response``.
-
-    triangles: (triangles, 3).  step: of the control step, before which no touch has borne anything.  look_every: substeps after
-    which touches are searched for again.
-    """
-    touches, scratch = room
-    rows, which, count, kept, _ = touches
-    kinds = shapes.kinds
-    move_solids(colliders, h)
-    # search for touches with all solids but planes, which touch particles first; those found again keep their impulses
-    if step % look_every == 0:
-        kept[:] = 0
-        if step > 0:
-            for n in range(count[0]):
-                kept[which[n, 1], which[n, 0]] = rows[n, T_IMPULSE : T_IMPULSE + 3]
-        count[0] = 0
-        for k in range(kinds.shape[0]):
-            if kinds[k] != KIND_PLANE and may_touch_sheet(x, colliders[k], scratch):
-                lay_out(colliders[k], scratch)
-                find_touches(x, triangles, shapes, k, touches, scratch)
-    # where they are now; they bear what lies on them, and after the particles they are corrected
-    follow_touches(x, triangles, colliders, touches, scratch)
-    bear_touches(x, v, w, triangles, touches, carried)
-    _resolve_each(x, v, w, shapes, colliders, carried, scratch)
-    press_touches(x, v, w, triangles, colliders, touches, h, carried)
-
-
-@kernel
-def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
-    """``resolve`` without solids."""
-
-
-@kernel
-def room_in_lanes(x, triangles, shapes):
-    """Room for contact of one block, in lanes: for its touches, and scratch, (SCRATCH_ROWS, lanes)."""
-    return room_for_touches(x, triangles, shapes), np.empty((SCRATCH_ROWS, x.shape[2]), x.dtype)
-
-
-# contact with the sheet, with its particles alone, and with nothing: in lanes (False), and for one sheet whose particles lie side
-# by side (True)
-KERNELS = {
-    False: {"sheet": resolve, "particles": resolve_particles, "nothing": resolve_nothing},
-    True: {"sheet": resolve_on_sheet, "particles": resolve_particles_on_sheet, "nothing": resolve_nothing},
-}
-ROOM = {False: room_in_lanes, True: room_on_sheet}
-
-
-def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
-    """Kernels of contact, by the names under which the main loop calls them."""
-    return {"resolve": KERNELS[by_particle][contact], "room_for_contact": ROOM[by_particle]}
-
-
-def needed(contact: str, kinds: NDArray) -> str:
-    """The least of ``KERNELS`` that solids of these kinds need, so that less is compiled; a plane touches particles first."""
-    if not len(kinds):
-        return "nothing"
-    return contact if np.any(kinds != KIND_PLANE) else "particles"
-
-
-@kernel
-def signed_distances(first, last, x, shapes, colliders, out):
-    """Signed distance of each particle to each collider [m]: ``out``, (blocks, colliders, particles, lanes)."""
-    for b in range(first, last):
-        scratch = np.empty((SCRATCH_ROWS, x.shape[3]), x.dtype)
-        for k in range(colliders.shape[1]):
-            lay_out(colliders[b, k], scratch)
-            for p in range(x.shape[2]):
-                measure_in_world(x[b], p, scratch, shapes, k)
-                out[b, k, p] = scratch[S_CONTACT]
-
-
-class Contacts(NamedTuple):
-    """Signed distance of particles to the nearest collider [m], inf without any, and its index, or -1, (num_envs, particles)."""
-
-    distance: NDArray
-    collider: NDArray
-
-
-def contacts(layout: Layout, x: NDArray, shapes: Shapes, colliders: NDArray) -> Contacts:
-    """Signed distances of a batch; x, (blocks, 3, particles, lanes) [m], and colliders in blocks."""
-    count = colliders.shape[1]
-    if not count:
-        shape = (layout.num_envs, x.shape[2])
-        return Contacts(np.full(shape, np.inf, x.dtype), np.full(shape, -1))
-    out = np.empty((layout.blocks, count, x.shape[2], layout.lanes), x.dtype)
-    signed_distances(0, layout.blocks, x, shapes, colliders, out)
-    distances = layout.to_public(out)
-    return Contacts(distances.min(axis=1), distances.argmin(axis=1))
+            measure_in_scratch(rows, a, b, colliders[k], shapes, k, r.dtype.type(0), scratch)
+        # normals in the world
+        to_world(
+            nx, ny, nz, c[R_AXES], c[R_AXES + 1], c[R_AXES + 2], c[R_AXES + 3], c[R_AXES + 4], c[R_AXES + 5], c[R_AXES + 6],
+            c[R_AXES + 7], c[R_AXES + 8],
+        )  # fmt: skip
+        # the contact law: first of particles near an edge, then of the others
+        if counts[k] > 0:
+            _respond_at_edges(
+                r, s, m, a, b, rows[P_GAP : P_GAP + 4], edges[k, : counts[k]], pushes[k], sx, sy, sz, friction, carried
+            )
+        _respond(
+            r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried
+        )  # fmt: skip

@@ -1,8 +1,11 @@
-"""Penetration: how deep the sheet's surface lies in the solids, without the thickness that contact keeps; on request only."""
+"""On request only: how far particles are from the solids, and how deep the sheet's surface lies in them."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym._jit import kernel
 from clothgym.collisions.solids.deepest_point import find_deepest
@@ -14,10 +17,13 @@ from clothgym.collisions.solids.signed_distance import (
     S_CORNERS,
     S_SPOT,
     SCRATCH_ROWS,
+    Shapes,
     lay_out,
     measure,
+    measure_in_world,
     to_axes,
 )
+from clothgym.state import Layout
 
 FINENESS = 4  # parts of a triangle's sides: 15 points with weights in quarters
 
@@ -69,3 +75,34 @@ def _sample(scratch, i, j, shapes, k, best):
             best[0, l] = scratch[S_CONTACT, l]
             for c in range(3):
                 best[1 + c, l] = scratch[S_CORE + c, l]
+
+
+@kernel
+def signed_distances(first, last, x, shapes, colliders, out):
+    """Signed distance of each particle to each collider [m]: ``out``, (blocks, colliders, particles, lanes)."""
+    for b in range(first, last):
+        scratch = np.empty((SCRATCH_ROWS, x.shape[3]), x.dtype)
+        for k in range(colliders.shape[1]):
+            lay_out(colliders[b, k], scratch)
+            for p in range(x.shape[2]):
+                measure_in_world(x[b], p, scratch, shapes, k)
+                out[b, k, p] = scratch[S_CONTACT]
+
+
+class Contacts(NamedTuple):
+    """Signed distance of particles to the nearest collider [m], inf without any, and its index, or -1, (num_envs, particles)."""
+
+    distance: NDArray
+    collider: NDArray
+
+
+def contacts(layout: Layout, x: NDArray, shapes: Shapes, colliders: NDArray) -> Contacts:
+    """Signed distances of a batch; x, (blocks, 3, particles, lanes) [m], and colliders in blocks."""
+    count = colliders.shape[1]
+    if not count:
+        shape = (layout.num_envs, x.shape[2])
+        return Contacts(np.full(shape, np.inf, x.dtype), np.full(shape, -1))
+    out = np.empty((layout.blocks, count, x.shape[2], layout.lanes), x.dtype)
+    signed_distances(0, layout.blocks, x, shapes, colliders, out)
+    distances = layout.to_public(out)
+    return Contacts(distances.min(axis=1), distances.argmin(axis=1))

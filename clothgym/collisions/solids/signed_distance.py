@@ -24,22 +24,22 @@ from clothgym.collisions.solids.shapes import (
     R_HALF,
     R_POINT,
     R_RADIUS,
-    R_REACH2,
 )
 
 # rows of the scratch after those of the solid: a triangle's corners, a point, and a point of the solid's core, all in its axes;
-# barycentric weights; signed distance and normal of contact; depth of the core; a velocity; an inverse mass; whether the lane is
-# clear, that is surely without contact; and the point before the last two rounds of a search
+# barycentric weights; signed distance and normal of contact; depth of the core; whether the direction from the core is the normal
+# of contact, and its length; whether the lane is clear, that is surely without contact; and the point before the last two rounds
+# of a search
 S_CORNERS, S_SPOT, S_CORE, S_WEIGHTS = COLLIDER_ROWS, COLLIDER_ROWS + 9, COLLIDER_ROWS + 12, COLLIDER_ROWS + 15
-S_CONTACT, S_RHO, S_MOTION, S_INVERSE_MASS, S_CLEAR = (
+S_CONTACT, S_RHO, S_USABLE, S_LENGTH, S_CLEAR = (
     COLLIDER_ROWS + 18,
     COLLIDER_ROWS + 22,
     COLLIDER_ROWS + 23,
-    COLLIDER_ROWS + 26,
-    COLLIDER_ROWS + 27,
+    COLLIDER_ROWS + 24,
+    COLLIDER_ROWS + 25,
 )
-S_BEFORE, S_BETWEEN = COLLIDER_ROWS + 28, COLLIDER_ROWS + 31
-SCRATCH_ROWS = COLLIDER_ROWS + 34
+S_BEFORE, S_BETWEEN = COLLIDER_ROWS + 26, COLLIDER_ROWS + 29
+SCRATCH_ROWS = COLLIDER_ROWS + 32
 
 LEAST_GRADIENT = 1e-3  # length below which the grid's gradient has no reliable direction
 
@@ -59,30 +59,6 @@ class Shapes(NamedTuple):
     sizes: NDArray
     corners: NDArray
     cells: NDArray
-
-
-@inlined
-def may_touch_plane(x, p, collider):
-    """Whether particle p of any lane is below a plane; only used to skip work."""
-    near = False
-    for l in range(x.shape[2]):
-        height = x.dtype.type(0)
-        for c in range(3):
-            height += (x[c, p, l] - collider[R_POINT + c, l]) * collider[R_AXES + 6 + c, l]
-        near |= height < collider[R_RADIUS, l]
-    return near
-
-
-@inlined
-def may_touch_solid(x, p, collider):
-    """Whether particle p of any lane is within the bounding sphere of a solid that is not a plane; only used to skip work."""
-    near = False
-    for l in range(x.shape[2]):
-        dx = x[0, p, l] - collider[R_POINT, l]
-        dy = x[1, p, l] - collider[R_POINT + 1, l]
-        dz = x[2, p, l] - collider[R_POINT + 2, l]
-        near |= dx * dx + dy * dy + dz * dz < collider[R_REACH2, l]
-    return near
 
 
 @kernel

@@ -6,25 +6,27 @@ substep the triangle's point closest to the core is the touch, the direction to 
 radius the gap.  (Where these stay as they were found, a triangle that rolls on a ball swings up: its support lags behind.)  At a
 mesh, whose edges may be sharper than any ball, they stay.
 
-A touch keeps its impulse from substep to substep: that is applied again before the particles' contacts, and then corrected, one
-touch after the other (projected Gauss-Seidel with a warm start; ``contact_law.touch_change``).  So what lies on a solid comes to
-rest, although touches share corners.  The corners of the triangle share an impulse by barycentric weight times inverse mass.
+A touch keeps its impulse from substep to substep: that is applied again (a warm start), and then corrected, one touch after the
+other (projected Gauss-Seidel; ``contact_law.touch_change``).  So what lies on a solid comes to rest, although touches share
+corners.  The corners of the triangle share an impulse by barycentric weight times inverse mass.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel, uncounted
+from clothgym._jit import inlined, kernel, uncounted
 from clothgym.collisions.solids.contact_law import FASTEST, RELAXED, touch_change
 from clothgym.collisions.solids.deepest_point import to_triangle
+from clothgym.collisions.solids.edges import LEAST_COSINE
 from clothgym.collisions.solids.shapes import R_FRICTION, R_POINT, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import S_CONTACT, S_CORE, S_CORNERS, S_RHO, S_SPOT, S_WEIGHTS
 
-# rows of a touch: three weights; offset of its plane from the solid's point along the normal; normal; impulse [N s]; the ball's
-# core relative to the solid's point [m]; the ball's radius [m], not positive where weights and plane stay as they were found
-T_WEIGHTS, T_OFFSET, T_NORMAL, T_IMPULSE, T_CORE, T_RHO = 0, 3, 4, 7, 10, 13
-TOUCH_ROWS = 14
+# columns of a touch: three weights; offset of its plane from the solid's point along the normal; normal; impulse [N s]; the ball's
+# core relative to the solid's point [m]; the ball's radius [m], not positive where weights and plane stay as they were found; the
+# direction in which impulses act, see ``edges``
+T_WEIGHTS, T_OFFSET, T_NORMAL, T_IMPULSE, T_CORE, T_RHO, T_PUSH = 0, 3, 4, 7, 10, 13, 14
+TOUCH_COLUMNS = 17
 
 
 @kernel
@@ -34,15 +36,6 @@ def move_solids(colliders, h):
         for c in range(3):
             for l in range(colliders.shape[2]):
                 colliders[k, R_POINT + c, l] += h * colliders[k, R_VELOCITY + c, l]
-
-
-@inlined
-def copy_rows(rows, scratch, at):
-    """Copy rows to the scratch from row ``at`` on; they are contiguous, so one loop does it."""
-    size = rows.shape[0] * rows.shape[1]
-    source, target = rows.reshape(size), scratch[at : at + rows.shape[0]].reshape(size)
-    for e in range(size):
-        target[e] = source[e]
 
 
 @inlined
@@ -62,14 +55,11 @@ def _to_ball(scratch):
         scratch[S_CONTACT + 1, l], scratch[S_CONTACT + 2, l], scratch[S_CONTACT + 3, l] = dx, dy, dz
 
 
-# --- one sheet whose particles lie side by side -------------------------------------------------------------------------------
-
-
 @uncounted
-def follow_touches_on_sheet(r, triangles, colliders, touches, which, scratch):
+def follow_touches(r, triangles, colliders, touches, which, scratch):
     """Write weights and planes of the touches for positions r [m], (3, particles), as many at a time as the scratch has columns.
 
-    touches: rows, (touches, TOUCH_ROWS).  which: triangle and solid of each, (touches, 2).
+    touches: (touches, TOUCH_COLUMNS).  which: triangle and solid of each, (touches, 2).
     """
     number, columns = touches.shape[0], scratch.shape[1]
     for begin in range(0, number, columns):
@@ -109,7 +99,7 @@ def _move_corners(r, s, m, triangle, touch, dx, dy, dz, ux, uy, uz):
 
 
 @uncounted
-def bear_touches_on_sheet(r, s, m, triangles, touches, which, carried):
+def bear_touches(r, s, m, triangles, touches, which, carried):
     """Apply the touches' impulses j again: v_i += w_i b_i j, x_i += w_i b_i carried j.
 
     r: positions x [m], s: velocities v [m/s], (3, particles).  m: inverse masses w [1/kg], (particles,).  carried: time for which
@@ -122,10 +112,10 @@ def bear_touches_on_sheet(r, s, m, triangles, touches, which, carried):
 
 
 @uncounted
-def press_touches_on_sheet(r, s, m, triangles, colliders, touches, which, h, carried):
-    """Correct the touches' impulses, one after the other; h: the substep [s], the rest as in ``bear_touches_on_sheet``."""
+def press_touches(r, s, m, triangles, colliders, touches, which, h, carried):
+    """Correct the touches' impulses, one after the other; h: the substep [s], the rest as in ``bear_touches``."""
     zero, one = r.dtype.type(0), r.dtype.type(1)
-    most_speed, relaxed = r.dtype.type(FASTEST), r.dtype.type(RELAXED)
+    most_speed, relaxed, least_cosine = r.dtype.type(FASTEST), r.dtype.type(RELAXED), r.dtype.type(LEAST_COSINE)
     for n in range(touches.shape[0]):
         # the touch, and the signed distance of its point from its plane
         touch, triangle, c = touches[n], triangles[which[n, 0]], colliders[which[n, 1]]
@@ -143,105 +133,13 @@ def press_touches_on_sheet(r, s, m, triangles, colliders, touches, which, h, car
         uy = a * s[1, i] + b * s[1, j] + d * s[1, k] - c[R_VELOCITY + 1, 0]
         uz = a * s[2, i] + b * s[2, j] + d * s[2, k] - c[R_VELOCITY + 2, 0]
         inverse_mass = m[i] * a * a + m[j] * b * b + m[k] * d * d
-        # its new impulse, and what the change moves
+        # the direction in which it pushes, its new impulse, and what the change moves
+        ex, ey, ez = touch[T_PUSH], touch[T_PUSH + 1], touch[T_PUSH + 2]
+        if not ex * nx + ey * ny + ez * nz > least_cosine:
+            ex, ey, ez = nx, ny, nz
         px, py, pz, dx, dy, dz, qx, qy, qz = touch_change(
-            gap, nx, ny, nz, ux, uy, uz, jx, jy, jz, inverse_mass, c[R_FRICTION, 0], h, carried, zero, one, most_speed, relaxed
-        )
+            gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, c[R_FRICTION, 0], h, carried, zero, one, most_speed,
+            relaxed,
+        )  # fmt: skip
         touch[T_IMPULSE], touch[T_IMPULSE + 1], touch[T_IMPULSE + 2] = px, py, pz
         _move_corners(r, s, m, triangle, touch, carried * dx + qx, carried * dy + qy, carried * dz + qz, dx, dy, dz)
-
-
-# --- lanes ----------------------------------------------------------------------------------------------------------------------
-
-
-@apart
-def follow_touches(x, triangles, colliders, touches, scratch):
-    """Write weights and planes of one block's touches for positions x [m], (3, particles, lanes).
-
-    touches: from ``triangle_contact.room_for_touches``.
-    """
-    rows, which, count, _, _ = touches
-    for n in range(count[0]):
-        touch, collider = rows[n], colliders[which[n, 1]]
-        # corners relative to the solid's point, and the ball
-        for corner in range(3):
-            p = triangles[which[n, 0], corner]
-            for c in range(3):
-                for l in range(scratch.shape[1]):
-                    scratch[S_CORNERS + 3 * corner + c, l] = x[c, p, l] - collider[R_POINT + c, l]
-        copy_rows(touch[T_CORE : T_CORE + 3], scratch, S_CORE)
-        copy_rows(touch[T_RHO : T_RHO + 1], scratch, S_RHO)
-        _to_ball(scratch)
-        for c in range(3):
-            for l in range(scratch.shape[1]):
-                touch[T_WEIGHTS + c, l] = scratch[S_WEIGHTS + c, l] if touch[T_RHO, l] > 0 else touch[T_WEIGHTS + c, l]
-        for c in range(4):
-            for l in range(scratch.shape[1]):
-                touch[T_OFFSET + c, l] = scratch[S_CONTACT + c, l] if touch[T_RHO, l] > 0 else touch[T_OFFSET + c, l]
-
-
-@inlined
-def _move_corners_in_lanes(x, v, w, triangle, touch, moves, changes):
-    """Move a triangle's corners by w_i b_i d [m], and change their velocities by w_i b_i u [m/s]; d, u: (3, lanes)."""
-    for corner in range(3):
-        p, weight = triangle[corner], touch[T_WEIGHTS + corner]
-        for c in range(3):
-            for l in range(x.shape[2]):
-                x[c, p, l] += w[p, l] * weight[l] * moves[c, l]
-            for l in range(x.shape[2]):
-                v[c, p, l] += w[p, l] * weight[l] * changes[c, l]
-
-
-@apart
-def bear_touches(x, v, w, triangles, touches, carried):
-    """Apply the impulses of one block's touches again; see ``bear_touches_on_sheet``.
-
-    x: [m], v: [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).
-    """
-    rows, which, count, _, _ = touches
-    moves = np.empty((3, x.shape[2]), x.dtype)
-    for n in range(count[0]):
-        changes = rows[n, T_IMPULSE : T_IMPULSE + 3]
-        for c in range(3):
-            for l in range(x.shape[2]):
-                moves[c, l] = carried * changes[c, l]
-        _move_corners_in_lanes(x, v, w, triangles[which[n, 0]], rows[n], moves, changes)
-
-
-@apart
-def press_touches(x, v, w, triangles, colliders, touches, h, carried):
-    """Correct the impulses of one block's touches, one after the other; see ``press_touches_on_sheet``."""
-    rows, which, count, _, _ = touches
-    zero, one = x.dtype.type(0), x.dtype.type(1)
-    most_speed, relaxed = x.dtype.type(FASTEST), x.dtype.type(RELAXED)
-    gap, moves, changes = np.empty(x.shape[2], x.dtype), np.empty((3, x.shape[2]), x.dtype), np.empty((3, x.shape[2]), x.dtype)
-    for n in range(count[0]):
-        touch, triangle, r = rows[n], triangles[which[n, 0]], colliders[which[n, 1]]
-        i, j, m = triangle[0], triangle[1], triangle[2]
-        # the signed distances of its points from their planes; nothing to do where all are outside and bear nothing
-        touching = False
-        for l in range(x.shape[2]):
-            a, b, c = touch[T_WEIGHTS, l], touch[T_WEIGHTS + 1, l], touch[T_WEIGHTS + 2, l]
-            gap[l] = touch[T_OFFSET, l]
-            for e in range(3):
-                gap[l] += touch[T_NORMAL + e, l] * (a * x[e, i, l] + b * x[e, j, l] + c * x[e, m, l] - r[R_POINT + e, l])
-            bears = (touch[T_IMPULSE, l] != zero) | (touch[T_IMPULSE + 1, l] != zero) | (touch[T_IMPULSE + 2, l] != zero)
-            touching |= (gap[l] < zero) | bears
-        if not touching:
-            continue
-        # new impulses, and what the changes move
-        for l in range(x.shape[2]):
-            a, b, c = touch[T_WEIGHTS, l], touch[T_WEIGHTS + 1, l], touch[T_WEIGHTS + 2, l]
-            ux = a * v[0, i, l] + b * v[0, j, l] + c * v[0, m, l] - r[R_VELOCITY, l]
-            uy = a * v[1, i, l] + b * v[1, j, l] + c * v[1, m, l] - r[R_VELOCITY + 1, l]
-            uz = a * v[2, i, l] + b * v[2, j, l] + c * v[2, m, l] - r[R_VELOCITY + 2, l]
-            inverse_mass = w[i, l] * a * a + w[j, l] * b * b + w[m, l] * c * c
-            px, py, pz, dx, dy, dz, qx, qy, qz = touch_change(
-                gap[l], touch[T_NORMAL, l], touch[T_NORMAL + 1, l], touch[T_NORMAL + 2, l], ux, uy, uz, touch[T_IMPULSE, l],
-                touch[T_IMPULSE + 1, l], touch[T_IMPULSE + 2, l], inverse_mass, r[R_FRICTION, l], h, carried, zero, one,
-                most_speed, relaxed,
-            )  # fmt: skip
-            touch[T_IMPULSE, l], touch[T_IMPULSE + 1, l], touch[T_IMPULSE + 2, l] = px, py, pz
-            moves[0, l], moves[1, l], moves[2, l] = carried * dx + qx, carried * dy + qy, carried * dz + qz
-            changes[0, l], changes[1, l], changes[2, l] = dx, dy, dz
-        _move_corners_in_lanes(x, v, w, triangle, touch, moves, changes)
