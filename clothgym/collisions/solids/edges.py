@@ -26,6 +26,8 @@ LEAST_COSINE = 0.3  # between n and e; where it is less, e is n
 E_SOLID, E_SHEET, E_PUSH, E_COSINE = 0, 3, 6, 9
 EDGE_ROWS = 10
 UNBENT = 2.0
+# no point of a triangle is farther from all corners than this share of its longest side (1/sqrt(3) if equilateral)
+NEAREST = 0.58
 
 
 @inlined
@@ -36,6 +38,13 @@ def _bent(r, normals, i, j):
     behind_i = dx * normals[0, i] + dy * normals[1, i] + dz * normals[2, i]
     behind_j = dx * normals[0, j] + dy * normals[1, j] + dz * normals[2, j]
     return (cosine < r.dtype.type(WIDE)) & (behind_i <= 0) & (behind_j >= 0)
+
+
+@inlined
+def _square(r, i, j):
+    """Squared distance of particles i and j [m^2]."""
+    dx, dy, dz = r[0, j] - r[0, i], r[1, j] - r[1, i], r[2, j] - r[2, i]
+    return dx * dx + dy * dy + dz * dz
 
 
 @inlined
@@ -103,13 +112,16 @@ def find_edges(r, triangles, rows, out, within, bent):
     """Find the triangles that lie across an edge of the solid, and the directions in which it pushes their corners.
 
     r: positions [m], (3, particles).  rows: (EDGE_ROWS, particles) with the solid's normals at all particles; the rest is written.
-    out: distances of the particles from the solid [m], at most; only triangles with a corner closer than ``within`` count.
+    out: signed distances of the particles from the solid [m]; only triangles that may come closer than ``within`` count.
     bent: becomes these triangles, (triangles,).  Returns how many.
     """
-    normals, number = rows[E_SOLID : E_SOLID + 3], 0
+    normals, number, nearest2 = rows[E_SOLID : E_SOLID + 3], 0, r.dtype.type(NEAREST * NEAREST)
     for t in range(triangles.shape[0]):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-        if not (out[i] < within or out[j] < within or out[k] < within):
+        # no point of the triangle is farther from all corners than NEAREST of its longest side
+        beyond = min(out[i], min(out[j], out[k])) - within
+        longest = max(_square(r, i, j), max(_square(r, j, k), _square(r, k, i)))
+        if beyond > 0 and beyond * beyond > nearest2 * longest:
             continue
         if _bent(r, normals, i, j) or _bent(r, normals, j, k) or _bent(r, normals, k, i):
             bent[number] = t

@@ -96,8 +96,8 @@ def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, carried, step, look
 
     r: positions [m], s: velocities [m/s], (3, particles).  m: inverse masses [1/kg], (particles,); attached particles are left
     alone.  triangles: (triangles, 3).  colliders: rows, (colliders, COLLIDER_ROWS, 1), of solids that have moved on.
-    h: the substep [s].  carried: time for which the velocity has already moved the positions [s].  step: of the control step, before
-    which no touch has borne anything.  look_every: substeps after which touches are searched for again.
+    h: the substep [s].  carried: time for which the velocity has already moved the positions [s].  step: of the control step,
+    before which no touch has borne anything.  look_every: substeps after which touches are searched for again.
     """
     touches, which, count = room.touches[lane], room.which[lane], room.count[lane]
     edges, pushes, counts = room.edges[lane], room.pushes[lane], room.counts[lane]

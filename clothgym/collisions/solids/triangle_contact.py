@@ -16,7 +16,7 @@ import numpy as np
 
 from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
 from clothgym.collisions.solids.deepest_point import LYING, NO_CONTACT, find_deepest, turn_normal
-from clothgym.collisions.solids.edges import E_COSINE, E_PUSH, E_SOLID, UNBENT, find_edges, push_of_touch
+from clothgym.collisions.solids.edges import E_COSINE, E_PUSH, E_SOLID, NEAREST, UNBENT, find_edges, push_of_touch
 from clothgym.collisions.solids.particle_contact import (
     P_EDGES,
     P_GAP,
@@ -52,8 +52,6 @@ from clothgym.collisions.solids.touch_response import T_CORE, T_IMPULSE, T_NORMA
 
 COLUMNS = 32  # triangles in a scratch array
 SINK = 0.5  # depth that the sheet between its particles may sink below the surface, in thicknesses
-# no point of a triangle is farther from all corners than this share of its longest side (1/sqrt(3) if equilateral)
-NEAREST = 0.58
 
 choose_near = placeholder("choose_near", "of (rows, triangles, radius, chosen): lists triangles that may be near the solid")
 
@@ -219,14 +217,15 @@ def _keep_touching(rows, triangles, number, chosen, scratch):
 
 
 @inlined
-def _find_edges(r, triangles, shapes, k, collider, edges, pushes, rows, bent, scratch):
+def _find_edges(r, triangles, shapes, k, collider, touching, edges, pushes, rows, bent, scratch):
     """List the particles near an edge of solid k, and the directions in which it pushes them.  Returns how many they are, or -1
     where no edge is between any particles.
 
-    edges: (particles,).  pushes: (particles, 3).  rows: positions in the solid's axes and distances from its box.  bent: scratch.
+    touching: whether triangles may touch.  edges: (particles,).  pushes: (particles, 3).  rows: positions in the solid's axes and
+    distances from its box.  bent: scratch, (triangles,).
     """
     n, c = r.shape[1], collider.reshape(collider.shape[0])
-    near = False
+    near = touching
     for p in range(n):
         near |= rows[P_GAP, p] < c[R_RADIUS] + c[R_THICKNESS]
     if not near:
@@ -280,7 +279,9 @@ def find_touches(r, triangles, shapes, k, collider, touches, which, count, edges
     scratch[R_RADIUS] = c[R_RADIUS] - r.dtype.type(1 + SINK) * c[R_THICKNESS]
     number = _keep_touching(rows, triangles, choose_near(rows, triangles, scratch[R_RADIUS, 0], chosen), chosen, scratch)
     # edges; ``kept`` is not yet read, and ``chosen`` has room behind the triangles that are kept
-    at_edges = _find_edges(r, triangles, shapes, k, collider, edges[k], pushes[k], rows, chosen[triangles.shape[0] :], scratch)
+    at_edges = _find_edges(
+        r, triangles, shapes, k, collider, number > 0, edges[k], pushes[k], rows, chosen[triangles.shape[0] :], scratch
+    )
     counts[k] = max(at_edges, 0)
     if number == 0:
         return

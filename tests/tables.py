@@ -1,0 +1,96 @@
+"""A sheet on a table whose end hangs over the edge: the pull that draws it back, and the share that can hang, in closed form.
+
+The tension of what hangs, W f for a share f of the weight W, grows or falls around the edge by ``exp(mu pi/2)`` (Euler, Eytelwein),
+and what lies on the table adds ``mu W (1 - f)``.  So drawing it back takes
+
+    W (mu (1 - f) + f exp(mu pi/2)),
+
+and it stays by itself up to f = r/(1 + r), with r = mu exp(mu pi/2).
+"""
+
+import numpy as np
+
+from clothgym import Box, Capsule, Material, MeshCollider, Simulation, grid
+
+SIDE, GRAVITY = 0.6, 9.81
+
+
+def edge(radius=0.0, friction=0.3, thickness=0.001, half=0.5):
+    """Solids of a table that ends at x = 0 with its top at z = 0, and an edge of this radius [m]; half: half its length [m]."""
+    shared = {"friction": friction, "thickness": thickness}
+    if radius == 0:
+        return [Box(center=(-half, 0, -half), half_sides=(half, half, half), **shared)]
+    top = Box(center=(-half - radius / 2, 0, -half), half_sides=(half - radius / 2, half, half), **shared)
+    side = Box(center=(-half, 0, -half - radius / 2), half_sides=(half, half, half - radius / 2), **shared)
+    rail = Capsule(center=(-radius, 0, -radius), radius=radius, height=2 * half + 2 * radius, axis=(0, 1, 0), **shared)
+    return [top, side, rail]
+
+
+def mesh_edge(radius=0.0, friction=0.3, thickness=0.001, half=0.3, resolution=128, segments=8):
+    """The same as one closed mesh, a prism."""
+    turn = np.linspace(np.pi / 2, 0, segments + 1) if radius else np.array([0.0])
+    arc = np.stack([-radius + radius * np.cos(turn), -radius + radius * np.sin(turn)], axis=1)
+    outline = np.concatenate([[(-2 * half, -2 * half), (-2 * half, 0.0)], arc, [(0.0, -2 * half)]])
+    n = len(outline)
+    vertices = np.concatenate([np.insert(outline, 1, y, axis=1) for y in (-half, half)])
+    sides = [t for a in range(n) for b in [(a + 1) % n] for t in ((a, a + n, b + n), (a, b + n, b))]
+    caps = [t for a in range(1, n - 1) for t in ((0, a, a + 1), (n, n + a + 1, n + a))]
+    return [MeshCollider(vertices=vertices, triangles=sides + caps, friction=friction, thickness=thickness, resolution=resolution)]
+
+
+def over_the_edge(solids, particles, share, fabric="cotton", held=True, **options):
+    """A sheet of SIDE with this share of its length over the edge, bent there; ``held`` by the row that is farthest from it."""
+    mesh = grid(particles, particles, SIDE, SIDE)
+    thickness = solids[0].thickness
+    x = mesh.rest_positions + (share * SIDE - SIDE / 2, 0, 0)
+    hangs = x[:, 0] > 0
+    x[hangs, 2], x[hangs, 0] = -x[hangs, 0], thickness
+    row = list(range(0, particles * particles, particles))
+    simulation = Simulation(
+        mesh, Material.preset(fabric), colliders=solids, anchors=[row] if held else (), air_density=0, bending="hinge", **options
+    )
+    simulation.reset(positions=x + (0, 0, thickness))
+    return simulation
+
+
+def pull_back(solids, particles, friction, fabric="cotton", share=0.4, speed=0.1, way=0.15, **options):
+    """Drawing back a sheet that hangs over the edge: the mean pull over the closed form's, the largest strain, and depth [m]."""
+    simulation = over_the_edge(solids, particles, share, fabric, **options)
+    simulation.step(60)
+    start, weight = simulation.attachment_positions[0], Material.preset(fabric).density * SIDE**2 * GRAVITY
+    pulls, expected, strain, depth = [], [], 0.0, 0.0
+    steps = round(60 * way / speed)
+    for step in range(1, steps + 1):
+        gone = speed * step / 60
+        simulation.move_anchors(start - [gone, 0, 0])
+        simulation.step()
+        if step > steps / 6:
+            now = share - gone / SIDE
+            pulls.append(float(simulation.pulls()[0, :, 0].sum()))
+            expected.append(weight * (friction * (1 - now) + now * np.exp(friction * np.pi / 2)))
+            strain = max(strain, float(simulation.strain().max()))
+            depth = max(depth, float(simulation.penetration()[0]))
+    return {"ratio": np.mean(pulls) / np.mean(expected), "strain": strain, "depth": depth}
+
+
+def largest_share(friction):
+    """Of a sheet that stays by itself."""
+    r = friction * np.exp(friction * np.pi / 2)
+    return r / (1 + r)
+
+
+def slid(make_solids, particles, friction, share, fabric="cotton", seconds=2.0, **options):
+    """How far a sheet with this share over the edge goes by itself [m], once friction has come down to what is asked for.
+
+    It comes to rest where friction holds it, and then friction falls evenly within a second: so nothing swings.
+    """
+    simulation = over_the_edge(make_solids(friction=5 * friction), particles, share, fabric, **options)
+    simulation.step(60)
+    simulation.release()
+    for step in range(60):
+        for index, solid in enumerate(make_solids(friction=friction * (5 - 4 * (step + 1) / 60))):
+            simulation.set_collider(index, [solid])
+        simulation.step()
+    start = simulation.positions[0, :, 0].min()
+    simulation.step(round(60 * seconds))
+    return simulation.positions[0, :, 0].min() - start
