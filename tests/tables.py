@@ -1,11 +1,13 @@
-"""A sheet on a table whose end hangs over the edge: the pull that draws it back, and the share that can hang, in closed form.
+"""A sheet on a table whose end hangs over the edge: the pull that draws it back, and whether it stays by itself, in closed form.
 
-The tension of what hangs, W f for a share f of the weight W, grows or falls around the edge by ``exp(mu pi/2)`` (Euler, Eytelwein),
-and what lies on the table adds ``mu W (1 - f)``.  So drawing it back takes
+With the weight w per length, lengths a on the table and c that hang, and an edge of radius R between them, friction makes the
+tension of what hangs grow around the edge as ``dT/dt = mu T + w R (cos t + mu sin t)`` (Euler, Eytelwein; with the weight of what
+lies on the edge).  So drawing it back takes
 
-    W (mu (1 - f) + f exp(mu pi/2)),
+    w (mu a + exp(mu pi/2) c + R ((1 - mu^2) + 2 mu exp(mu pi/2))/(1 + mu^2)),
 
-and it stays by itself up to f = r/(1 + r), with r = mu exp(mu pi/2).
+and it slides down by itself where this, with -mu instead of mu, is positive.  At a sharp edge it stays up to the share f = r/(1 + r)
+of its length, with r = mu exp(mu pi/2).
 """
 
 import numpy as np
@@ -38,25 +40,39 @@ def mesh_edge(radius=0.0, friction=0.3, thickness=0.001, half=0.3, resolution=12
     return [MeshCollider(vertices=vertices, triangles=sides + caps, friction=friction, thickness=thickness, resolution=resolution)]
 
 
-def over_the_edge(solids, particles, share, fabric="cotton", held=True, **options):
-    """A sheet of SIDE with this share of its length over the edge, bent there; ``held`` by the row that is farthest from it."""
+def pull_of(friction, radius, on_table, length=SIDE):
+    """The pull over the sheet's weight; radius: of the edge [m]; on_table: length on the table [m]."""
+    growth = np.exp(friction * np.pi / 2)
+    around = radius * ((1 - friction**2) + 2 * friction * growth) / (1 + friction**2)
+    hangs = length - on_table - radius * np.pi / 2
+    return (friction * on_table + growth * hangs + around) / length
+
+
+def largest_share(friction):
+    """Of a sheet that stays by itself at a sharp edge."""
+    r = friction * np.exp(friction * np.pi / 2)
+    return r / (1 + r)
+
+
+def over_the_edge(solids, particles, share, fabric="cotton", **options):
+    """A sheet of SIDE that is held by the row farthest from the edge, and hangs over it with this share of its length, at rest."""
     mesh = grid(particles, particles, SIDE, SIDE)
-    thickness = solids[0].thickness
-    x = mesh.rest_positions + (share * SIDE - SIDE / 2, 0, 0)
-    hangs = x[:, 0] > 0
-    x[hangs, 2], x[hangs, 0] = -x[hangs, 0], thickness
     row = list(range(0, particles * particles, particles))
     simulation = Simulation(
-        mesh, Material.preset(fabric), colliders=solids, anchors=[row] if held else (), air_density=0, bending="hinge", **options
+        mesh, Material.preset(fabric), colliders=solids, anchors=[row], air_density=0, bending="hinge", **options
     )
-    simulation.reset(positions=x + (0, 0, thickness))
+    simulation.reset(positions=mesh.rest_positions + (share * SIDE - SIDE / 2, 0, solids[0].thickness))
+    # it swings down in thick air
+    simulation.set_parameters(air_drag=5.0)
+    simulation.step(120)
+    simulation.set_parameters(air_drag=0.0)
     return simulation
 
 
-def pull_back(solids, particles, friction, fabric="cotton", share=0.4, speed=0.1, way=0.15, **options):
+def pull_back(make_solids, particles, friction, radius=0.0, fabric="cotton", share=0.4, speed=0.1, way=0.15, **options):
     """Drawing back a sheet that hangs over the edge: the mean pull over the closed form's, the largest strain, and depth [m]."""
+    solids = make_solids(radius=radius, friction=friction)
     simulation = over_the_edge(solids, particles, share, fabric, **options)
-    simulation.step(60)
     start, weight = simulation.attachment_positions[0], Material.preset(fabric).density * SIDE**2 * GRAVITY
     pulls, expected, strain, depth = [], [], 0.0, 0.0
     steps = round(60 * way / speed)
@@ -65,32 +81,25 @@ def pull_back(solids, particles, friction, fabric="cotton", share=0.4, speed=0.1
         simulation.move_anchors(start - [gone, 0, 0])
         simulation.step()
         if step > steps / 6:
-            now = share - gone / SIDE
             pulls.append(float(simulation.pulls()[0, :, 0].sum()))
-            expected.append(weight * (friction * (1 - now) + now * np.exp(friction * np.pi / 2)))
+            on_table = gone - start[0, 0] - radius
+            expected.append(weight * pull_of(friction, radius + solids[0].thickness, on_table))
             strain = max(strain, float(simulation.strain().max()))
             depth = max(depth, float(simulation.penetration()[0]))
-    return {"ratio": np.mean(pulls) / np.mean(expected), "strain": strain, "depth": depth}
+    return {"ratio": float(np.mean(pulls) / np.mean(expected)), "strain": strain, "depth": depth}
 
 
-def largest_share(friction):
-    """Of a sheet that stays by itself."""
-    r = friction * np.exp(friction * np.pi / 2)
-    return r / (1 + r)
-
-
-def slid(make_solids, particles, friction, share, fabric="cotton", seconds=2.0, **options):
+def slid(make_solids, particles, friction, share, radius=0.0, fabric="cotton", seconds=2.0, **options):
     """How far a sheet with this share over the edge goes by itself [m], once friction has come down to what is asked for.
 
     It comes to rest where friction holds it, and then friction falls evenly within a second: so nothing swings.
     """
-    simulation = over_the_edge(make_solids(friction=5 * friction), particles, share, fabric, **options)
-    simulation.step(60)
+    simulation = over_the_edge(make_solids(radius=radius, friction=5 * friction), particles, share, fabric, **options)
     simulation.release()
     for step in range(60):
-        for index, solid in enumerate(make_solids(friction=friction * (5 - 4 * (step + 1) / 60))):
+        for index, solid in enumerate(make_solids(radius=radius, friction=friction * (5 - 4 * (step + 1) / 60))):
             simulation.set_collider(index, [solid])
         simulation.step()
     start = simulation.positions[0, :, 0].min()
     simulation.step(round(60 * seconds))
-    return simulation.positions[0, :, 0].min() - start
+    return float(simulation.positions[0, :, 0].min() - start)

@@ -41,7 +41,7 @@ from clothgym.collisions.solids.signed_distance import (
 NO_CONTACT = 1e9  # gap of a lane without contact [m]
 MESH_ROUNDS, BOX_STEPS = 3, 8  # rounds at a mesh, and steps at a box with half sides, see ``find_deepest``
 SLOW_ROUND = 0.98  # largest ratio of the moves of two rounds that the extrapolation assumes
-DEPTH = 1.0  # initial rho, in thicknesses
+DEPTH = 2.0  # initial rho, in thicknesses
 SOON = 0.25  # gap, in thicknesses, within which a triangle may touch the solid before the next search
 BALL = 5.0  # least radius of a ball that stands for the solid until the next search, in thicknesses
 CELLS = 0.75  # rho below a mesh's thickness, in cells of its grid

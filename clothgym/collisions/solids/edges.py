@@ -19,7 +19,7 @@ import numpy as np
 
 from clothgym._jit import inlined, uncounted
 
-WIDE = 0.94  # cosine of the angle between the solid's normals at two corners beyond which an edge is between them: 20 degrees
+WIDE = 0.71  # cosine of the angle between the solid's normals at two corners beyond which an edge is between them: 45 degrees
 LEAST_COSINE = 0.3  # between n and e; where it is less, e is n
 # rows of scratch, one column a particle: normals of the solid, and of the sheet; the best direction so far, and its cosine with the
 # sheet's normal, or UNBENT where no edge is near

@@ -70,8 +70,6 @@ def room_for_contact(x, triangles, shapes):
     solids, most = shapes.kinds.shape[0], 0
     for k in range(solids):
         most += number * (shapes.kinds[k] != KIND_PLANE)
-    # a lone sheet is worked on where it lies
-    copies = lanes if lanes > 1 else 0
     return Room(
         np.empty((lanes, most, TOUCH_COLUMNS), dtype),
         np.empty((lanes, most, 2), np.int64),
@@ -83,8 +81,8 @@ def room_for_contact(x, triangles, shapes):
         np.empty((PARTICLE_ROWS, particles), dtype),
         np.empty(2 * number, np.int64),
         np.empty((SCRATCH_ROWS, COLUMNS), dtype),
-        np.empty((copies, 6, particles), dtype),
-        np.empty((copies, particles), dtype),
+        np.empty((lanes, 6, particles), dtype),
+        np.empty((lanes, particles), dtype),
         np.empty((solids, COLLIDER_ROWS, 1), dtype),
         np.empty((6, lanes), dtype),
         np.empty(lanes, np.bool_),

@@ -51,7 +51,8 @@ from clothgym.collisions.solids.signed_distance import (
 from clothgym.collisions.solids.touch_response import T_CORE, T_IMPULSE, T_NORMAL, T_OFFSET, T_PUSH, T_RHO, T_WEIGHTS
 
 COLUMNS = 32  # triangles in a scratch array
-SINK = 0.5  # depth that the sheet between its particles may sink below the surface, in thicknesses
+SINK = 0.25  # depth that the sheet between its particles may sink below the surface, in thicknesses
+LEAST_SINK = 5e-5  # added to it, so that cloth lies flat on its particles where there is no thickness [m]
 
 choose_near = placeholder("choose_near", "of (rows, triangles, radius, chosen): lists triangles that may be near the solid")
 
@@ -276,7 +277,8 @@ def find_touches(r, triangles, shapes, k, collider, touches, which, count, edges
         to_axis(r[0], r[1], r[2], c[R_POINT], c[R_POINT + 1], c[R_POINT + 2], c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e])
     _distances(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2], rows[P_GAP])
     # triangles that may touch the solid without its thickness, and less the depth that they may sink in
-    scratch[R_RADIUS] = c[R_RADIUS] - r.dtype.type(1 + SINK) * c[R_THICKNESS]
+    inner = c[R_RADIUS] - (r.dtype.type(1 + SINK) * c[R_THICKNESS] + r.dtype.type(LEAST_SINK))
+    scratch[R_RADIUS] = inner
     number = _keep_touching(rows, triangles, choose_near(rows, triangles, scratch[R_RADIUS, 0], chosen), chosen, scratch)
     # edges; ``kept`` is not yet read, and ``chosen`` has room behind the triangles that are kept
     at_edges = _find_edges(
@@ -286,7 +288,7 @@ def find_touches(r, triangles, shapes, k, collider, touches, which, count, edges
     if number == 0:
         return
     lay_out(collider, scratch)
-    scratch[R_RADIUS] = c[R_RADIUS] - r.dtype.type(1 + SINK) * c[R_THICKNESS]
+    scratch[R_RADIUS] = inner
     # the deepest point of each, and the normal there
     for begin in range(0, number, scratch.shape[1]):
         filled = min(scratch.shape[1], number - begin)
