@@ -299,7 +299,7 @@ def _one_side_up(triangles: NDArray, numbers: _Numbers) -> tuple[NDArray, int]:
         worst, count = int(np.argmax(times > 2)), int(np.sum(times > 2))
         raise ValueError(
             f"{numbers.edge(*edges[worst])} belongs to {times[worst]} triangles ({count} such edges): on a surface it belongs to "
-            "one or two, remove the others, or separate the parts there"
+            "one or two, remove the others, separate the parts there, or join narrow triangles by merge_tolerance= of load_mesh"
         )
     # both triangles of each inner edge, and whether they have it in one direction, which two with the same side up have not
     order = np.argsort(inverse.reshape(-1), kind="stable")

@@ -14,6 +14,7 @@ from clothgym.mesh_files import read_polygons
 from clothgym.mesh_repair import Repairs, directed_edges, flat_triangles, repaired
 
 USUAL_SIZES = 0.01, 10.0  # of sheets in meters: beyond them a file is probably in another unit [m]
+SHUT = 3.0  # angle at rest from which two triangles lie on each other [rad]: the angle may jump between pi and -pi
 MILLIMETERS = 200.0  # size from which its unit is rather a millimeter than a centimeter [m]
 
 
@@ -109,6 +110,9 @@ def load_mesh(path: str | Path, scale: float = 1.0, merge_tolerance: float = 0.0
     said, size = repairs.told(), float(np.ptp(x, axis=0).max())
     if mesh.pieces > 1:
         said.append(f"the sheet has {mesh.pieces} pieces that nothing holds together")
+    if shut := int(np.sum(np.abs(mesh.hinges.rest_angle) > SHUT)):
+        edges = "1 edge is" if shut == 1 else f"{shut} edges are"
+        said.append(f"{edges} folded flat at rest, and may flip to the other side: with_rest_angles(above={SHUT:g}) opens them")
     if size > USUAL_SIZES[1]:
         unit, guess = ("millimeters", 0.001) if size >= MILLIMETERS else ("centimeters", 0.01)
         said.append(

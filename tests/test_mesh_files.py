@@ -116,6 +116,10 @@ TAKEN = {
     "centimeters": (obj(*(lambda x, f: (scaled(x, 200.0), f))(*panel())), 12, 12, 2400.0, 1, ["60 m across", "scale=0.01 if"]),
     "millimeters": (obj(*(lambda x, f: (scaled(x, 2000.0), f))(*panel())), 12, 12, 240000.0, 1, ["600 m across", "scale=0.001"]),
     "another unit": (obj(*(lambda x, f: (scaled(x, 1e-3), f))(*panel())), 12, 12, 6e-8, 1, ["0.0003 m across"]),
+    "folded flat": (
+        obj([*SQUARE[:3], (0.8, 0.1, 0)], [(0, 1, 2), (0, 2, 3)]), 4, 2, 0.85, 1,
+        ["1 edge is folded flat at rest, and may flip to the other side: with_rest_angles(above=3) opens them"],
+    ),
     "texture, normals, comments and a line that goes on": (
         "o a\nv 0 0 0 # first\nv 1 0 0\nv 1 1 0\nvt 0 0\nvn 0 0 1\nv 0 1 0\ns off\nf -4/1/1 -3//1 \\\n 3/1 4\n", 4, 2, 1.0, 1, []
     ),

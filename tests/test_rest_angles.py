@@ -141,11 +141,15 @@ def test_a_folded_file_unfolds(tmp_path, bending):
         assert angle_of(kept.positions) == pytest.approx(FOLD, abs=1e-4)
 
 
-def test_a_grid_can_rest_folded():
-    """Its hinges only; skip springs of a grid lie along its lines, and stay."""
+def test_a_grid_folds_to_its_angle_at_rest():
+    """Its hinges along the middle column, at 0.6 rad; skip springs of a grid stay, and are not used with hinges."""
     mesh = grid(5, 5, 0.08, 0.08)
-    bent = mesh.with_rest_angles(0.2)
-    assert not bent.flat and bent.shape == (5, 5) and np.all(bent.hinges.rest_angle == 0.2)
+    middle = np.arange(5) * 5 + 2
+    bent = mesh.with_rest_angles(0.6, edges=np.stack([middle[:-1], middle[1:]], axis=1))
+    assert not bent.flat and bent.shape == (5, 5) and np.sum(bent.hinges.rest_angle == 0.6) == 8
+    simulation = Simulation(bent, STIFF, bending="hinge", gravity=(0, 0, 0), air_density=0)
+    simulation.step(240)
+    assert angle_of(simulation.positions) == pytest.approx(0.6, abs=0.03)
 
 
 def test_the_names_are_public():
