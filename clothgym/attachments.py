@@ -118,7 +118,7 @@ class Attachments:
         blocks, dtype = self.layout.to_blocks, self.limits.dtype
         self.x, self.targets = blocks(state.attachment_positions, dtype), blocks(state.attachment_targets, dtype)
         self.opening, self.wanted = blocks(state.openings, dtype), blocks(state.wanted_openings, dtype)
-        self.holder = blocks(state.holder, np.dtype(np.int16))
+        self.holder = blocks(state.holder, np.dtype(np.int32))
 
     def public(self) -> dict[str, NDArray]:
         """The attachments as fields of a ``State``; fresh copies."""

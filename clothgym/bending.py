@@ -441,7 +441,7 @@ def model_of(name: str, mesh: ClothMesh) -> Bending:
         ValueError: no such name (the message lists the right ones), or a model that does not fit this mesh.
     """
     known("bending model", name, BENDING)
-    if name == "quadratic" and mesh.hinges.rest_angle.any():
+    if name == "quadratic" and not mesh.flat:
         steepest = float(np.abs(mesh.hinges.rest_angle).max())
         raise ValueError(
             f"bending='quadratic' needs a sheet that is flat at rest, and this one has angles up to {steepest:.3g} rad: use "

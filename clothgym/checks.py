@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import sys
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -16,6 +18,7 @@ SMALLEST = 1e-30  # of what must be positive: its inverse is still finite in flo
 MOST = 2**31 - 1  # of a count
 MOST_PARTICLES = 10_000_000  # of a batch; a million of them need about a gigabyte
 MOST_NUMBERS = 1_000_000_000  # of an argument
+WITHIN = ("clothgym", "gymnasium", "functools", "contextlib")  # modules that lie between a warning and the line that it is about
 
 
 def number(name: str, value: Any) -> float:
@@ -75,6 +78,14 @@ def shown(value: Any) -> str:
     except Exception:  # an integer of more digits than Python prints, or an object whose repr fails
         return f"<{type(value).__name__}>"
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 20]} ... {text[-14:]}"
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn with the line outside of this package from which it was called."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in WITHIN:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 def _as_numbers(value: Any) -> NDArray[np.float64] | None:

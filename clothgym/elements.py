@@ -159,9 +159,9 @@ def weave_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bendin
 
 
 def is_regular(mesh: ClothMesh) -> bool:
-    """Whether a mesh has exactly the springs of a grid, of one length in each kind, so that they can be taken by kinds."""
+    """Whether a mesh has exactly the springs of a flat grid, of one length in each kind, so that they can be taken by kinds."""
     # a grid with both triangles in each cell
-    if mesh.shape is None or len(mesh.triangles) != 2 * (mesh.shape[0] - 1) * (mesh.shape[1] - 1):
+    if mesh.shape is None or mesh.hinges.rest_angle.any() or len(mesh.triangles) != 2 * (mesh.shape[0] - 1) * (mesh.shape[1] - 1):
         return False
     # each spring is of a known kind, as long as the others of its kind, and there only once
     columns, springs = mesh.shape[1], mesh.springs

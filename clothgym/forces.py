@@ -230,7 +230,7 @@ class Oscillators(NamedTuple):
     inverse_mass: NDArray
 
 
-def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
+def energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
     """The elements' energy for small displacements u about rest, ``sum_rows (sum_m V_m . u_m)^2 / 2``.
 
     Returns, for each sort of element, particles (rows, m) and vectors V [(N/m)^(1/2)], (rows, m, 3).
@@ -238,7 +238,8 @@ def _energy_rows(o: Oscillators) -> list[tuple[NDArray, NDArray]]:
     # springs: k/2 (n . (u_j - u_i))^2
     springs, bends = o.elements
     i, j = springs.particles.T
-    n = (o.positions[j] - o.positions[i]) / springs.rest_length[:, None]
+    n = o.positions[j] - o.positions[i]
+    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), TINY)
     pull = np.sqrt(springs.weight * o.stiffness[springs.kind])[:, None] * n
     rows = [(springs.particles, np.stack([-pull, pull], axis=1))]
     if not len(bends.particles):
@@ -270,7 +271,7 @@ def largest_frequency(o: Oscillators) -> float:
 
     # M^-1/2 K M^-1/2 = B^T B, with the rows V M^-1/2 in B
     scale, parts = np.sqrt(o.inverse_mass), []
-    for particles, vectors in _energy_rows(o):
+    for particles, vectors in energy_rows(o):
         values = vectors * scale[particles][:, :, None]
         columns = 3 * particles[:, :, None] + np.arange(3)
         rows = np.broadcast_to(np.arange(len(particles))[:, None, None], values.shape)
@@ -290,7 +291,7 @@ def frequency_bound(o: Oscillators) -> float:
     ``(A y)/y`` (Collatz and Wielandt).  A few steps of the power method make y a good choice.
     """
     # the diagonal blocks of A, where the elements' contributions are added up before their magnitudes are taken
-    families = _energy_rows(o)
+    families = energy_rows(o)
     own = np.zeros((len(o.positions), 3, 3))
     for particles, vectors in families:
         for m in range(particles.shape[1]):

@@ -9,16 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, kernel
-from clothgym.bending import Bending
-from clothgym.elements import Elements
-from clothgym.forces import Oscillators
+from clothgym.bending import BENDING, Bending, model_of
+from clothgym.checks import known, warn
+from clothgym.elements import BendArrays, Elements, SpringArrays
+from clothgym.forces import Oscillators, energy_rows
 from clothgym.integrators import Integrator
-from clothgym.mesh import ClothMesh
+from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
 
 BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
 MOST_SUBSTEPS = 100_000  # of a control step
+ODD = 10.0  # times the substeps of the rest of the sheet: a part that needs more is named
+FAR, COARSE = 100.0, 5e-4  # from here on positions are looked at [m]; rounding beyond this share of an edge is told
 FASTEST = 1e4  # [m/s]: a corner torn away by meters in one step can whip beyond 1 km/s, and comes back
 
 
@@ -50,13 +53,88 @@ def _all_within(values, limit):
     return beyond == 0
 
 
+def bending_of(name: str, mesh: ClothMesh) -> Bending:
+    """The bending model of that name; "auto": springs for a sheet that is flat at rest, and hinges for others, with a warning.
+
+    Raises:
+        ValueError: no such name, or a model that does not fit this mesh.
+    """
+    known("bending model", name, ("auto", *BENDING))
+    if name != "auto" or mesh.flat:
+        return model_of("springs" if name == "auto" else name, mesh)
+    warn(f"{not_flat(mesh)}: bending='hinge' is chosen; name a model to choose another")
+    return BENDING["hinge"]
+
+
+def not_flat(mesh: ClothMesh) -> str:
+    """That a sheet is not flat at rest, as a clause of a sentence."""
+    return f"this sheet is not flat at rest (angles up to {np.abs(mesh.hinges.rest_angle).max():.3g} rad)"
+
+
+def warn_if_far(x: NDArray, mesh: ClothMesh, dtype: np.dtype) -> None:
+    """Warn of positions [m], (..., 3), that are so far from the origin that rounding them stretches the sheet."""
+    farthest = float(np.abs(x).max(initial=0))
+    if farthest < FAR:
+        return
+    rounding, edge = float(np.spacing(dtype.type(farthest))), float(np.median(mesh.springs.rest_length))
+    if rounding > COARSE * edge:
+        warn(
+            f"positions: {farthest:.4g} m from the origin {dtype.name} rounds them to {rounding:.2g} m, {rounding / edge:.2g} of "
+            "an edge: start nearer to the origin, or take dtype='float64'"
+        )
+
+
+def odd_part(integrator: Integrator, o: Oscillators, time_step: float) -> tuple[int, str] | None:
+    """The substeps that would do without the part of the sheet that needs the smallest ones, and a clause that names this part.
+
+    None if no part needs more than ``ODD`` times the substeps of the rest.
+    """
+    # the square of each particle's frequency were all others held: an entry of the diagonal of M^-1 K
+    local = np.zeros(len(o.positions))
+    for particles, vectors in energy_rows(o):
+        np.add.at(local, particles, np.sum(vectors**2, axis=2))
+    local *= o.inverse_mass
+    odd = local > ODD**2 * np.median(local)
+    if not odd.any():
+        return None
+    # the rest
+    springs = SpringArrays(*(array[~odd[o.elements.springs.particles].any(axis=1)] for array in o.elements.springs))
+    bends = BendArrays(*(array[~odd[o.elements.bends.particles].any(axis=1)] for array in o.elements.bends))
+    largest, _ = integrator.largest_substep(o._replace(elements=Elements(springs, bends)))
+    if largest <= 0 or not len(springs.weight):
+        return None
+    # the shortest edge of the oddest particle
+    worst, own = int(np.argmax(local)), o.elements.springs
+    edges = np.flatnonzero(own.kind <= SHEAR)
+    there = edges[(own.particles[edges] == worst).any(axis=1)]
+    shortest, median = there[np.argmin(own.rest_length[there])], float(np.median(own.rest_length[edges]))
+    (a, b), length = own.particles[shortest].tolist(), float(own.rest_length[shortest])
+    place = ", ".join(f"{c:.4g}" for c in o.positions[worst])
+    what = f"edge {a}-{b} of the mesh, {length:.3g} m long (the median is {median:.3g} m)"
+    if length > median / ODD**0.5:
+        what = f"the thin triangles at particle {worst}"
+    return integrator.automatic_substeps(
+        time_step, largest
+    ), f"{what}, near ({place}): join its ends (merge_tolerance= of load_mesh), or mesh the sheet anew"
+
+
 def oscillators(
     mesh: ClothMesh, elements: Elements, bending: Bending, fabric: Fabric, free_w: NDArray, block: int, lane: int
 ) -> Oscillators:
     """The properties that determine the substep of the environment in that block and lane.
 
     elements: in float64.  free_w: inverse masses without attachments [1/kg], (blocks, particles, lanes).
+
+    Raises:
+        ValueError: masses that are too large or too small for the type of these numbers.
     """
+    wrong = ~((free_w[block, :, lane] > 0) & (free_w[block, :, lane] < np.inf))
+    if wrong.any():
+        worst = int(np.argmax(wrong))
+        raise ValueError(
+            f"particle {worst} stands for {mesh.area[worst]:.3g} m^2: its mass, or one over it, is beyond {free_w.dtype.name}: "
+            "change the size of the sheet, or its density"
+        )
     return Oscillators(
         positions=mesh.rest_positions,
         elements=elements,
@@ -81,6 +159,13 @@ def automatic_substeps(integrator: Integrator, oscillators: Oscillators, time_st
             "or another integrator, semi_implicit_euler for instance"
         )
     substeps = integrator.automatic_substeps(time_step, largest)
+    odd = odd_part(integrator, oscillators, time_step) if substeps > ODD else None
+    if odd is not None and substeps > ODD * odd[0]:
+        needs = f"substeps='auto': {integrator.name} needs {substeps} substeps in a control step"
+        asked = f"{needs}, where {odd[0]} would do without {odd[1]}"
+        if substeps > MOST_SUBSTEPS:
+            raise ValueError(f"{asked}; the most are {MOST_SUBSTEPS}")
+        warn(asked)
     if substeps > MOST_SUBSTEPS:
         raise ValueError(
             f"substeps='auto': {integrator.name} needs {substeps:.3g} substeps in a control step, {why}; the most are "

@@ -78,6 +78,9 @@ _SECOND_TABLE = "of the second table of the Codim-IPC driver (Li et al. 2021, ar
 
 # In the sources with an E -- stretch: Young's modulus E times thickness t; shear: E t / (2 (1 + nu)); bending:
 # E t^3 / (12 (1 - nu^2)).  2HB is the width of the bending loop.
+# where hinges are named as a remedy: they swing at about 8 sqrt(B/rho)/h^2, and need no more substeps than there may be
+LIGHT, HINGES_FASTEST = 0.1, 1e7  # mass per area [kg/m^2], frequency [rad/s]
+
 PRESETS: dict[str, Material] = {
     "median": Material(
         density=0.197,
@@ -200,9 +203,20 @@ def spring_stiffness(mesh: ClothMesh, stretch: NDArray, shear: NDArray, bend: ND
         k[skip] = 64 * bend * across / along**3
         k[structural] = (c11 - 2 * k[SHEAR] * along**3 / (across * d2)) * across / along - 4 * k[skip]
     if np.any(k < 0):
+        # without rigidity, the structural springs are stiffer by four times the skip springs
+        bare = k[STRUCTURAL_X] + 4 * k[BEND_X], k[STRUCTURAL_Y] + 4 * k[BEND_Y]
+        remedy = "lower the shear stiffness, or make the cells more nearly square"
+        if min(bare[0].min(), bare[1].min()) >= 0:
+            hinges = 8 * np.sqrt(bend.max() / LIGHT) / min(a, b) ** 2 < HINGES_FASTEST
+            most = min((bare[0] * a**3 / (256 * b)).min(), (bare[1] * b**3 / (256 * a)).min())
+            remedy = (
+                "take bending='hinge' or 'quadratic', with which hinges bear the rigidity in place of springs, or "
+                if hinges
+                else ""
+            )
+            remedy += f"lower the rigidity to {most:.3g} N m, or use a coarser grid"
         raise ValueError(
             f"no springs on cells of {a:.4g} x {b:.4g} m have stretch_stiffness={stretch.min():.4g} N/m with "
-            f"shear_stiffness={shear.max():.4g} N/m and bend_rigidity={bend.max():.4g} N m: lower the shear stiffness or the "
-            "rigidity, use a coarser grid, or make the cells more nearly square"
+            f"shear_stiffness={shear.max():.4g} N/m and bend_rigidity={bend.max():.4g} N m: {remedy}"
         )
     return k

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, positive, room
+from clothgym.checks import count, indices, not_negative, number, positive, room, shown
+from clothgym.mesh_repair import Repairs
 
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
@@ -17,6 +19,7 @@ Real = NDArray[np.float64]
 # yarns, or the edges of a triangle mesh.  Those after SHEAR resist bending
 STRUCTURAL_X, STRUCTURAL_Y, EDGE, SHEAR, BEND_X, BEND_Y, OPPOSITE = range(7)
 NUM_KINDS = 7
+FLAT = 1e-3  # largest angle at rest of a sheet that counts as flat [rad]: files of six digits make some 1e-4 of a plane
 
 
 class Springs(NamedTuple):
@@ -61,6 +64,7 @@ class ClothMesh:
         area: share of the sheet's area that each particle stands for [m^2], (particles,).
         hinges: inner edges.
         shape: of a grid, particles along y and x (rows, columns); None for other meshes.
+        repairs: what reading it from a file has changed; None for other meshes.
     """
 
     size: tuple[float, float]
@@ -70,11 +74,34 @@ class ClothMesh:
     area: Real
     hinges: Hinges
     shape: tuple[int, int] | None = None
+    repairs: Repairs | None = None
+
+    def __repr__(self) -> str:
+        particles = str(self.num_particles) if self.shape is None else " x ".join(map(str, self.shape))
+        size = " x ".join(f"{side:.4g}" for side in np.ptp(self.rest_positions, axis=0)[: 2 if self.flat and self.shape else 3])
+        pieces = f", {self.pieces} pieces" if self.pieces > 1 else ""
+        return f"<ClothMesh of {particles} particles, {len(self.triangles)} triangles, {size} m{pieces}>"
 
     @property
     def num_particles(self) -> int:
         """Number of particles."""
         return len(self.rest_positions)
+
+    @cached_property
+    def pieces(self) -> int:
+        """Number of parts that no particle holds together."""
+        # each particle takes over the lowest label of its triangles until nothing changes
+        label, before = np.arange(self.num_particles), None
+        while before is None or not np.array_equal(label, before):
+            before = label.copy()
+            np.minimum.at(label, self.triangles, label[self.triangles].min(axis=1, keepdims=True))
+            label = label[label]
+        return len(np.unique(label))
+
+    @property
+    def flat(self) -> bool:
+        """Whether the sheet is flat at rest: whether no angle at rest is beyond ``FLAT``."""
+        return float(np.abs(self.hinges.rest_angle).max(initial=0)) <= FLAT
 
     @property
     def grid_shape(self) -> tuple[int, int]:
@@ -98,6 +125,73 @@ class ClothMesh:
         """A grid's particles at (-x, -y), (+x, -y), (-x, +y), (+x, +y)."""
         rows, columns = self.grid_shape
         return 0, columns - 1, (rows - 1) * columns, rows * columns - 1
+
+    def with_rest_angles(self, angle: float = 0.0, edges: ArrayLike | None = None, above: float = 0.0) -> ClothMesh:
+        """The same sheet with another angle at rest between the triangles beside some of its edges.
+
+        A garment that was modeled folded, or sewn along sharp seams, opens there when it is left alone.  Edges keep their lengths.
+        Skip springs between opposite corners get the length that they have at this angle.
+
+        Args:
+            angle: [rad], 0 for flat, positive and negative to the two sides.
+            edges: ends of the edges, (edges, 2) particles; all inner edges by default.
+            above: only edges whose angle at rest is larger than this, to either side [rad].
+
+        Raises:
+            ValueError: an angle beyond pi, or an edge that does not join two triangles.
+        """
+        angle, above = number("angle", angle), not_negative("above", above)
+        if abs(angle) > np.pi:
+            raise ValueError(f"angle={shown(angle)}: must be from -pi to pi")
+        hinges = self.hinges
+        chosen = np.abs(hinges.rest_angle) > above if above else np.ones(len(hinges.weight), bool)
+        if edges is not None:
+            chosen &= _named_hinges(hinges, indices("edges", np.ravel(edges), self.num_particles, "particles of this mesh"))
+        rest_angle = np.where(chosen, angle, hinges.rest_angle)
+        springs = self.springs if self.shape is not None else _refolded(self, chosen, angle)
+        return replace(self, hinges=hinges._replace(rest_angle=frozen(rest_angle)), springs=springs)
+
+
+def _named_hinges(hinges: Hinges, ends: NDArray) -> NDArray[np.bool_]:
+    """Which hinges lie on the edges with these ends, two by two, (2 edges,).
+
+    Raises:
+        ValueError: an edge that is none of theirs, or an end without the other.
+    """
+    if len(ends) % 2:
+        raise ValueError(f"edges={shown(ends.tolist())}: must be pairs of particles, (edges, 2)")
+    wanted = {tuple(sorted(pair)) for pair in ends.reshape(-1, 2).tolist()}
+    own = [tuple(sorted(pair)) for pair in hinges.particles[:, :2].tolist()]
+    if missing := wanted.difference(own):
+        a, b = min(missing)
+        raise ValueError(f"edges: {a}-{b} is no edge between two triangles: name particles of inner edges")
+    return np.array([pair in wanted for pair in own], bool)
+
+
+def _refolded(mesh: ClothMesh, chosen: NDArray, angle: float) -> Springs:
+    """The springs, with skip springs across the chosen hinges as long as their span at this angle; see ``triangle_mesh``."""
+    particles, (ends, rest_length, kind, weight) = mesh.hinges.particles[chosen], mesh.springs
+    # the hinges and the skip springs by their ends; both are in the order in which they were made where these are the same
+    skip = np.flatnonzero(kind == OPPOSITE)
+    size = mesh.num_particles
+    keys = [np.sort(pairs, axis=1).astype(np.int64) @ [size, 1] for pairs in (mesh.hinges.particles[:, 2:], ends[skip])]
+    hinge, spring = (np.argsort(key, kind="stable") for key in keys)
+    spring_of = np.empty(len(skip), np.int64)
+    spring_of[hinge] = skip[spring]
+    own = spring_of[chosen]
+    # heights of the opposite corners over the edge, and their distance along it
+    xi, xj, xk, xl = (mesh.rest_positions[particles[:, c]] for c in range(4))
+    along = (xj - xi) / np.linalg.norm(xj - xi, axis=1, keepdims=True)
+    feet = [np.sum((corner - xi) * along, axis=1) for corner in (xk, xl)]
+    heights = [np.linalg.norm(corner - xi - foot[:, None] * along, axis=1) for corner, foot in zip((xk, xl), feet)]
+    span = np.sqrt(
+        (feet[1] - feet[0]) ** 2 + heights[0] ** 2 + heights[1] ** 2 + 2 * heights[0] * heights[1] * np.cos(angle)
+    )  # fmt: skip
+    # what they store at a curvature depends on their length
+    weight, rest_length = weight.copy(), rest_length.copy()
+    weight[own] *= (rest_length[own] / span) ** 4
+    rest_length[own] = span
+    return mesh.springs._replace(rest_length=frozen(rest_length), weight=frozen(weight))
 
 
 def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, checks, guards, integrators
 from clothgym.attachments import Attachments, Gripper, Grippers
-from clothgym.bending import model_of
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
 from clothgym.collisions.solids.sheet_contact import needed
@@ -49,7 +48,7 @@ class Simulation(Observed):
         anchor_speed: largest speed of an anchor [m/s].
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.  One fabric
-            has a drape coefficient of about 60 % with the first and of 25 % with the others (docs/materials.md).
+            drapes to about 60 % with the first, 25 % with the others.  "auto": springs, or hinges if it is not flat at rest.
         contact: "sheet": solids touch the whole sheet, and stop attachments; or "particles": they touch particles only, and
             attachments go through them.
         self_collision: False, "fast" or "strict", or a dict with mode, thickness [m] and friction, see ``collisions``.
@@ -77,7 +76,7 @@ class Simulation(Observed):
         anchors: Sequence[int | Sequence[int]] = (),
         anchor_speed: float = 10.0,
         grippers: Sequence[Gripper] = (),
-        bending: str = "springs",
+        bending: str = "auto",
         contact: str = "sheet",
         self_collision: bool | str | Mapping[str, Any] = False,
         strain_limit: float | None = None,
@@ -102,7 +101,7 @@ class Simulation(Observed):
         self.threads = count("threads", threads) if threads is not None else _jit.default_threads()
         self.strain_limit = checked_limit(strain_limit)
         self.on_divergence = on_divergence
-        self.bending = model_of(bending, mesh)
+        self.bending = guards.bending_of(bending, mesh)
         self.mesh = mesh
         self.material = material if material is not None else Material.preset("penava_cotton")
         self.integrator = integrators.get(integrator)
@@ -307,6 +306,7 @@ class Simulation(Observed):
         shape = (len(env), self.mesh.num_particles, 3)
         x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
+        guards.warn_if_far(x, self.mesh, self.dtype)
         if positions is not None:
             self._contact.check(x, env)
         return env, np.broadcast_to(x, shape), np.broadcast_to(v, shape)

@@ -326,7 +326,7 @@ def at_rest(
         velocities=np.zeros((num_envs, mesh.num_particles, 3)),
         free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
         anchors=each(anchors),
-        holder=np.full((num_envs, mesh.num_particles), -1, np.int16),
+        holder=np.full((num_envs, mesh.num_particles), -1, np.int32),
         attachment_positions=np.zeros((num_envs, attachments, 3)),
         attachment_targets=np.zeros((num_envs, attachments, 3)),
         openings=np.zeros((num_envs, attachments)),

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import os
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import as_array, count, finite, positive, room, shown
+from clothgym.checks import as_array, count, finite, not_negative, positive, room, shown, warn
 from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
+from clothgym.mesh_files import read_polygons
+from clothgym.mesh_repair import Repairs, directed_edges, flat_triangles, repaired
 
-FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
+USUAL_SIZES = 0.01, 10.0  # of sheets in meters: beyond them a file is probably in another unit [m]
+SHUT = 3.0  # angle at rest from which two triangles lie on each other [rad]: the angle may jump between pi and -pi
+MILLIMETERS = 200.0  # size from which its unit is rather a millimeter than a centimeter [m]
 
 
 def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
@@ -79,70 +82,66 @@ def disc(radius: float, rings: int) -> ClothMesh:
     return triangle_mesh(np.concatenate(points), triangles)
 
 
-def load_mesh(path: str | Path) -> ClothMesh:
-    """A sheet from a mesh file (obj, ply, stl, off, glb, ...) in meters; its shape in the file is its shape at rest.
+def load_mesh(path: str | Path, scale: float = 1.0, merge_tolerance: float = 0.0) -> ClothMesh:
+    """A sheet from a mesh file (obj, ply, off, stl, glb, ...); its shape in the file is its shape at rest.
 
-    Vertices at exactly the same position become one particle.  Some readers, such as that of obj, omit vertices that no triangle
-    uses.
+    Vertices at exactly the same position become one particle.  Faces of any number of corners are cut into triangles, faces and
+    vertices that mean nothing are dropped, and triangles that disagree on which side is up are turned round.  One warning says what
+    was changed, and ``repairs`` of the mesh says it in numbers, with the particle that each vertex of the file has become.  The
+    angles between the triangles of the file are those at rest, until ``ClothMesh.with_rest_angles``.
+
+    Args:
+        path: the file.  obj, ply and off are read as they are; other formats need trimesh.
+        scale: meters in the file's unit; 0.01 for centimeters.
+        merge_tolerance: vertices that are no farther apart are joined as well, on edges that are as short, and where both lie on a
+            border, as those of a seam [m].
 
     Raises:
-        ImportError: trimesh is missing: ``pip install clothgym[mesh]``.
-        ValueError: there is no such file, it cannot be read or holds no triangles, or they form no sheet (see ``triangle_mesh``).
+        ImportError: trimesh is missing, and the format needs it: ``pip install clothgym[mesh]``.
+        ValueError: there is no such file, it cannot be read or holds no triangles, or they form no sheet.  The message names the
+            file's own vertices and their positions.
     """
-    vertices, triangles = read_triangles(path, "load_mesh", "sheet")
+    x, triangles, _, repairs = read_triangles(path, "load_mesh", "sheet", positive("scale", scale), merge_tolerance)
     try:
-        return triangle_mesh(vertices, triangles)
+        mesh = replace(triangle_mesh(x, triangles), repairs=repairs)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} is not a sheet: {error}") from error
+    # what was changed, and what is probably not meant
+    said, size = repairs.told(), float(np.ptp(x, axis=0).max())
+    if mesh.pieces > 1:
+        said.append(f"the sheet has {mesh.pieces} pieces that nothing holds together")
+    if shut := int(np.sum(np.abs(mesh.hinges.rest_angle) > SHUT)):
+        edges = "1 edge is" if shut == 1 else f"{shut} edges are"
+        said.append(f"{edges} folded flat at rest, and may flip to the other side: with_rest_angles(above={SHUT:g}) opens them")
+    if size > USUAL_SIZES[1]:
+        unit, guess = ("millimeters", 0.001) if size >= MILLIMETERS else ("centimeters", 0.01)
+        said.append(
+            f"the sheet is {size:.4g} m across, as files are in meters: give scale={scale * guess:g} if this one is in {unit}"
+        )
+    elif size < USUAL_SIZES[0]:
+        said.append(f"the sheet is {size:.4g} m across, as files are in meters: give scale= if this one is in a larger unit")
+    if said:
+        warn(f"{str(path)!r}: {'; '.join(said)}")
+    return mesh
 
 
-def read_triangles(path: str | Path, who: str, what: str) -> tuple[NDArray, NDArray]:
-    """Vertices [m], (vertices, 3), and triangles, (triangles, 3), of a mesh file; vertices at the same position are merged.
+def read_triangles(
+    path: str | Path, who: str, what: str, scale: float = 1.0, merge_tolerance: float = 0.0
+) -> tuple[NDArray, NDArray, NDArray, Repairs]:
+    """Vertices [m], (vertices, 3), triangles, (triangles, 3), the file's numbers of the vertices, (vertices,), and the repairs.
 
-    who, what: the caller and the kind of object that it reads, for error messages.
+    who, what: the caller and the kind of object that it reads, for error messages.  Others: see ``load_mesh``.
 
     Raises:
         ImportError: trimesh is missing.
-        ValueError: there is no such file, it cannot be read or holds no triangles, or a vertex is not finite or in no triangle.
+        ValueError: there is no such file, it cannot be read or holds no triangles, or they form no surface, see ``repaired``.
     """
+    tolerance = not_negative("merge_tolerance", merge_tolerance)
+    polygons = read_polygons(path, who, what)
     try:
-        import trimesh
-    except ImportError:
-        raise ImportError(f"{who} reads files with trimesh: pip install 'clothgym[mesh]'") from None
-    if not isinstance(path, (str, os.PathLike)):
-        raise ValueError(f"path={shown(path)}: must be the name of a file")
-    if not os.path.isfile(path):
-        problem = "it is a folder: name a file in it" if os.path.isdir(path) else "there is no such file: check the path"
-        raise ValueError(f"{shown(str(path))}: {problem}")
-    # trimesh reads the file
-    advice = f"export the {what} as a triangle mesh, for instance obj or ply"
-    try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:  # trimesh's readers raise whatever their parsers do
-        raise ValueError(f"{str(path)!r} cannot be read as a mesh ({error or type(error).__name__}): {advice}") from error
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise ValueError(f"{str(path)!r} holds no triangles: {advice}")
-    # vertices without a finite position, and those in no triangle, are refused
-    try:
-        x = np.array(loaded.vertices, np.float64)
-        nowhere = np.flatnonzero(~np.isfinite(x).all(axis=1))
-        if len(nowhere):
-            raise ValueError(f"vertex {nowhere[0]} is at {x[nowhere[0]].tolist()}: give it a finite position")
-        return _merged(x, corners_of(x, np.array(loaded.faces)))
+        return repaired(polygons, scale, tolerance)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} is not a {what}: {error}") from error
-
-
-def _merged(x: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray]:
-    """Distinct vertices, in the order of their first appearance, and the triangles between them.
-
-    Some formats repeat a vertex in each of its triangles, or where texture or normals differ.  It is still the same particle.
-    """
-    _, first, which = np.unique(x, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    return x[first[order]], place[which.reshape(-1)][triangles]
 
 
 def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
@@ -168,11 +167,6 @@ def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
     square = 3 / 8 * (a * a + b * b) + a * b / 4 + c * c / 2
     area = (length * (np.abs(py[:, 2]) + np.abs(py[:, 3])) / 2).sum() / 3
     return hinges._replace(weight=frozen(hinges.weight * (area / max((hinges.weight * square).sum(), 1e-300))))
-
-
-def directed_edges(triangles: NDArray) -> NDArray:
-    """The edges of each triangle with their directions, (3 triangles, 2)."""
-    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def _area_beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
@@ -218,12 +212,9 @@ def refuse_degenerate(x: NDArray, corners: NDArray) -> None:
     """Refuse triangles without area.
 
     Raises:
-        ValueError: a triangle whose area is at most FLATTEST/2 times its longest side squared; the message names it.
+        ValueError: a triangle without area, see ``flat_triangles``; the message names it.
     """
-    sides = [x[corners[:, b]] - x[corners[:, a]] for a, b in ((0, 1), (1, 2), (2, 0))]
-    twice = np.linalg.norm(np.cross(sides[0], sides[2]), axis=1)
-    longest = np.max([np.sum(side**2, axis=1) for side in sides], axis=0)
-    flat = twice <= FLATTEST * longest
+    flat = flat_triangles(x, corners)
     if np.any(flat):
         worst = int(np.flatnonzero(flat)[0])
         raise ValueError(f"triangle {worst}, {corners[worst].tolist()}, is degenerate (no area): remove it, or merge its corners")

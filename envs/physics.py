@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.attachments import Gripper
-from clothgym.checks import count, finite, number, one_of, positive, shown
-from clothgym.guards import refusal
+from clothgym.checks import count, finite, number, one_of, positive, shown, warn
+from clothgym.guards import not_flat, refusal
 from clothgym.integrators import Integrator
 from clothgym.material import PRESETS, Material, spring_stiffness
 from clothgym.mesh import ClothMesh, grid
@@ -42,7 +42,8 @@ class Physics:
         anchors, grippers: see ``Simulation``; anchors may be a function of the mesh, so that its resolution can be chosen.
         air_density: [kg/m^3].
         wind: what the air does, unless the environment's keyword says otherwise.
-        contact, self_collision, bending: as ``Simulation`` takes them.
+        contact, self_collision, bending: as ``Simulation`` takes them.  Of a sheet that is not flat at rest hinges resist the
+            bending, and a warning says so, unless an environment's keyword names another model.
         solid_hands: whether solids stop what holds the sheet, in tasks whose kernels see to it.
         fast: what physics="fast" changes beside ``SHORT_CUTS``.
     """
@@ -62,6 +63,11 @@ class Physics:
     bending: str = "quadratic"
     solid_hands: bool = True
     fast: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.mesh, ClothMesh) and not self.mesh.flat and self.bending != "hinge":
+            warn(f"{not_flat(self.mesh)}: bending='hinge' is chosen in place of {self.bending!r}, which is for flat ones")
+            object.__setattr__(self, "bending", "hinge")
 
     def chosen(self, name: str) -> Physics:
         """This, "true"; or "fast", with the short cuts that most benchmarks take.

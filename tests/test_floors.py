@@ -13,6 +13,8 @@ FLOORS = {
     "clothgym.files": 0,
     "clothgym.progress": 0,
     "clothgym.mesh": 1,
+    "clothgym.mesh_files": 1,
+    "clothgym.mesh_repair": 1,
     "clothgym.triangles": 1,
     "clothgym.material": 1,
     "clothgym.geometry": 1,

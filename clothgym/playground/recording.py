@@ -213,7 +213,7 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
         springs=Springs(**{name: frozen(value) for name, value in fields_of("springs").items()}),
         hinges=Hinges(**{name: frozen(value) for name, value in fields_of("hinges").items()}),
         shape=tuple(about["grid"]) if about["grid"] else None,
-        **sheet,
+        **sheet,  # type: ignore[arg-type]
     )
     if mesh.shape is not None and (len(mesh.shape) != 2 or min(mesh.shape) < 2 or np.prod(mesh.shape) != mesh.num_particles):
         raise ValueError(f"a grid of {mesh.shape} has not {mesh.num_particles} particles")

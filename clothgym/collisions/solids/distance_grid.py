@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import kernel
+from clothgym.collisions.solids.thin_walls import lost_wall
 from clothgym.geometry.closest_points import closest_on_triangle
 
 BAND = 2  # cells around a triangle's bounds in which distances to it are computed exactly
@@ -36,13 +37,12 @@ def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> Dis
     vertices: [m], (vertices, 3).  triangles: (triangles, 3).
 
     Raises:
-        ValueError: a grid that is too large, or a part of the surface that is inside out.
+        ValueError: a grid that is too large, a part of the surface that is inside out, or walls that the grid would lose.
     """
     # the grid: the bounds and some padding
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    cell = float((high - low).max()) / resolution
+    low = vertices.min(axis=0)
+    cell, nodes = _size_of(vertices, resolution)
     corner = low - PADDING * cell
-    nodes = np.ceil((high - low) / cell) + 1 + 2 * PADDING
     if nodes.prod() > MOST_NODES:
         raise ValueError(
             f"resolution={resolution}: a grid of {nodes.prod():.2g} nodes, more than {MOST_NODES:.0g}: give a lower resolution"
@@ -61,10 +61,38 @@ def distance_grid(vertices: NDArray, triangles: NDArray, resolution: int) -> Dis
     if winding.min() < 0:
         where = corner + cell * np.array(np.unravel_index(np.argmin(winding), winding.shape))
         raise ValueError(f"a part of the mesh near {np.round(where, 4).tolist()} is inside out: turn its triangles round")
-    # distances and gradients in meters
+    # walls thinner than the cells
     signed = np.where(winding > 0, -distance, distance)
+    lost = lost_wall((vertices - corner) / cell, triangles, signed, resolution)
+    if lost is not None:
+        enough, thickness, place = lost
+        _refuse_lost(vertices, resolution, enough, cell * thickness, corner + cell * place)
+    # distances and gradients in meters
     nodes = np.stack([cell * signed, *np.gradient(signed)], axis=-1).astype(np.float32)
     return DistanceGrid(np.ascontiguousarray(nodes), corner, cell)
+
+
+def _size_of(vertices: NDArray, resolution: int) -> tuple[float, NDArray]:
+    """The side of a cell [m], and how many nodes there are along each axis, (3,)."""
+    size = np.ptp(vertices, axis=0)
+    cell = float(size.max()) / resolution
+    return cell, np.ceil(size / cell) + 1 + 2 * PADDING
+
+
+def _refuse_lost(vertices: NDArray, resolution: int, enough: int, thickness: float, place: NDArray) -> None:
+    """Refuse a grid that loses walls of this thickness [m] at this place [m]; enough: the resolution that would hold them."""
+    cell = _size_of(vertices, resolution)[0]
+    nodes = _size_of(vertices, enough)[1].prod()
+    remedy = f"give resolution={enough}"
+    if nodes > MOST_NODES:
+        remedy = (
+            f"resolution={enough} would do, but takes {nodes:.2g} nodes, more than {MOST_NODES:.0g}: make the walls thicker, or "
+            "make the solid of several colliders"
+        )
+    raise ValueError(
+        f"resolution={resolution}: its cells of {cell:.3g} m lose walls that are {thickness:.3g} m thick, for instance at "
+        f"{np.round(place, 4).tolist()}: {remedy}"
+    )
 
 
 @kernel

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import as_array, count, finite, not_negative, positive, shown, vector
+from clothgym.checks import as_array, count, finite, not_negative, positive, shown, vector, warn
 from clothgym.collisions.solids.distance_grid import DistanceGrid, distance_grid
 from clothgym.collisions.solids.shapes import KIND_MESH, R_AXES, R_HALF, R_POINT, UNTURNED, Collider, Quaternion, Vector, turned
 from clothgym.geometry.closed_mesh import checked_solid
@@ -24,10 +24,11 @@ class MeshCollider(Collider):
     """A solid whose surface is a closed triangle mesh, from a file or from arrays.
 
     Kernels read a grid of signed distances that is built once.  Edges are rounded, and details are lost, at the size of its cells,
-    which is the mesh's longest side divided by ``resolution``.  Walls should be at least two cells thick.
+    which is the mesh's longest side divided by ``resolution``.  Walls that are lost are refused, with the resolution that would do:
+    those of two cells and more never are.
 
     Attributes:
-        path: a mesh file in meters, which trimesh reads.
+        path: a mesh file in meters, read as by ``load_mesh``: what has no area is dropped, and a warning says what was changed.
         vertices: [m], (vertices, 3); triangles: between them, (triangles, 3), counter-clockwise seen from outside.
         center: position of the mesh's origin [m].
         rotation: a quaternion (w, x, y, z) of any length.
@@ -36,7 +37,8 @@ class MeshCollider(Collider):
 
     Raises:
         ImportError: a path without trimesh: ``pip install clothgym[mesh]``.
-        ValueError: as for ``Collider``; neither or both of path and arrays; a surface that is not closed (``checked_solid``).
+        ValueError: as for ``Collider``; neither or both of path and arrays; a surface that is not closed (``checked_solid``), or
+            has walls that the grid would lose.
     """
 
     kind: ClassVar[int] = KIND_MESH
@@ -76,9 +78,11 @@ class MeshCollider(Collider):
     def surface(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Vertices in the solid's own axes, scaled [m], and triangles."""
         if self.path is not None:
-            x, triangles = read_triangles(self.path, "MeshCollider", "solid")
+            x, triangles, numbers, repairs = read_triangles(self.path, "MeshCollider", "solid", self.scale)
+            if said := repairs.told():
+                warn(f"{str(self.path)!r}: {'; '.join(said)}")
             with self._named():
-                return _solid(*_frozen(x * self.scale, triangles))
+                return _solid(*_frozen(x, triangles, numbers))
         assert self.vertices is not None and self.triangles is not None
         corners = as_array(self.triangles)
         if corners is None:
@@ -141,8 +145,8 @@ def _frozen(*arrays: NDArray) -> tuple[_Bytes, ...]:
 
 
 @lru_cache(maxsize=16)
-def _solid(vertices: _Bytes, triangles: _Bytes) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    return checked_solid(vertices.array, triangles.array)
+def _solid(vertices: _Bytes, triangles: _Bytes, numbers: _Bytes | None = None) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    return checked_solid(vertices.array, triangles.array, None if numbers is None else numbers.array)
 
 
 @lru_cache(maxsize=16)
