@@ -8,6 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from clothgym import folders
 from clothgym.registration import register
 
 if TYPE_CHECKING:
@@ -49,11 +50,15 @@ _HOMES = {
     "load_mesh": "clothgym.triangles",
     "triangle_mesh": "clothgym.triangles",
 }
+# packages that are loaded when first used, too
+_PACKAGES = ("adapters", "collisions", "envs", "integrators", "policies", "render", "starts")
+
+__all__ = [*_HOMES, "policies"]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "policies":
-        return import_module("clothgym.policies")
+    if name in _PACKAGES:
+        return import_module(f"clothgym.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'clothgym' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)
@@ -61,7 +66,8 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*_HOMES, "policies", "__version__"])
+    return sorted([*_HOMES, *_PACKAGES, "__version__"])
 
 
+folders.keep()
 register()

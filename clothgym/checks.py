@@ -99,10 +99,15 @@ def _as_numbers(value: Any) -> NDArray[np.float64] | None:
             return array.astype(np.float64)
         except OverflowError:
             return None
-    if array.dtype.kind not in "iuf" and array.size:
+    if array.dtype.kind not in "iuf" and array.size and not _is_short_float(array.dtype):
         return None
     with np.errstate(over="ignore"):  # what is beyond float64 is infinite, and refused as such
-        return array.astype(np.float64, copy=False) if array.dtype.kind in "iuf" else np.zeros(array.shape)
+        return array.astype(np.float64, copy=False) if array.size else np.zeros(array.shape)
+
+
+def _is_short_float(kind: np.dtype) -> bool:
+    """Whether numbers are of a type that a library has added to NumPy's, as bfloat16 of JAX: NumPy has no letter for its kind."""
+    return kind.kind == "V" and kind.names is None and "float" in kind.name and np.can_cast(kind, np.float64)
 
 
 def as_array(value: Any) -> NDArray | None:
@@ -112,18 +117,32 @@ def as_array(value: Any) -> NDArray | None:
     if isinstance(value, range) and len(value) > MOST_NUMBERS:
         return None
     try:
-        # tensors that require gradients give their numbers only when they are detached
-        array = np.asarray(value.detach() if hasattr(value, "detach") else value)
+        array = np.asarray(_plain(value) if hasattr(value, "detach") else value)
     except Exception:  # ragged, or an object or tensor whose own conversion fails
         return None
     return None if np.ma.is_masked(value) else array
+
+
+def _plain(tensor: Any) -> Any:
+    """A tensor whose numbers NumPy can take: detached from its gradients, on the processor, and of a type that NumPy has."""
+    tensor = tensor.detach().cpu()
+    try:
+        return np.asarray(tensor)
+    except TypeError:  # bfloat16 and shorter ones
+        return tensor.float() if tensor.is_floating_point() else tensor
+
+
+def _dtype_of(value: Any) -> str:
+    """What a message says of the type of an array's or a tensor's elements, where it may be why that is refused."""
+    kind = getattr(value, "dtype", None)
+    return "" if kind is None or str(kind).endswith(("float32", "float64")) else f", not of {shown(kind)}: convert it to float32"
 
 
 def numbers(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     """``value`` as a float64 array, if it holds real numbers, finite or not, and has that shape."""
     array = _as_numbers(value)
     if array is None:
-        raise ValueError(f"{name}={shown(value)}: must be an array of numbers, {shape}")
+        raise ValueError(f"{name}={shown(value)}: must be an array of numbers, {shape}{_dtype_of(value)}")
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}: must be {shape}")
     return array
@@ -169,7 +188,7 @@ def finite(name: str, value: ArrayLike) -> NDArray:
     """``value`` as a float64 array, if it holds finite numbers of a magnitude up to LARGEST."""
     array = _as_numbers(value)
     if array is None:
-        raise ValueError(f"{name}={shown(value)}: must be numbers")
+        raise ValueError(f"{name}={shown(value)}: must be numbers{_dtype_of(value)}")
     # within range; NaN is not
     within = np.abs(array) <= LARGEST
     if within.all():

@@ -155,7 +155,7 @@ def _setting(text: str) -> tuple[str, Any]:
 
 
 def _readable(text: str) -> Path:
-    path = Path(text)
+    path = Path(text).expanduser()
     if not path.is_file() or not os.access(path, os.R_OK):
         raise argparse.ArgumentTypeError(f"{text!r}: there is no such file that can be read")
     return path
@@ -163,7 +163,7 @@ def _readable(text: str) -> Path:
 
 def _writable(text: str) -> Path:
     """A path that can be created or written to."""
-    path = Path(text)
+    path = Path(text).expanduser()
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text!r}: there is no folder {str(path.parent)!r}; make it, or name another")
     place = path if path.exists() else path.parent

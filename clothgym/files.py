@@ -60,7 +60,7 @@ def replacing(path: str | Path, before: Path | None = None) -> Iterator[Path]:
         ValueError: ``path`` is a device, a pipe or a folder.
         Unwritten: the disk is full, or the folder cannot be written.
     """
-    path = Path(path).resolve()
+    path = Path(path).expanduser().resolve()
     if path.exists() and not path.is_file():
         raise ValueError(f"{str(path)!r} is no regular file: name one that can be replaced")
     part = path.with_name(f".{path.stem}.{os.urandom(4).hex()}.part{path.suffix}")
@@ -105,6 +105,7 @@ def read(path: str | Path, most: int = LARGEST) -> bytes:
         OSError: there is none, or it cannot be read.
         ValueError: it is a device, a pipe or a folder, or too large.
     """
+    path = Path(path).expanduser()
     about = os.stat(path)
     if not stat.S_ISREG(about.st_mode):
         raise ValueError("it is no regular file")

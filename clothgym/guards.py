@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 
 import numpy as np
@@ -17,6 +16,7 @@ from clothgym.integrators import Integrator
 from clothgym.mesh import SHEAR, ClothMesh
 from clothgym.parameters import PROPERTIES
 from clothgym.state import Fabric
+from clothgym.warning import warn_caller
 
 BURST = 10.0  # strain above which a sheet has blown up, even if it is not flagged as diverged
 MOST_SUBSTEPS = 100_000  # of a control step
@@ -186,10 +186,9 @@ def warn_if_beyond(integrator: Integrator, each: Iterable[Oscillators], time_ste
             remedy = "Use another integrator, or a fabric with damping_time."
             if largest > 0:
                 remedy = f"Use substeps={integrator.automatic_substeps(time_step, largest)} or substeps='auto'."
-            warnings.warn(
+            warn_caller(
                 f"{substeps} substeps of {h:.3g} s are too few for {integrator.name}: its bound here is {largest:.3g} s, {why}. "
                 f"{remedy}",
-                stacklevel=4,
             )
             return
 
@@ -245,4 +244,4 @@ def report_divergence(new: NDArray, steps: NDArray, integrator: Integrator, subs
     )
     if stop:
         raise FloatingPointError(message)
-    warnings.warn(message, RuntimeWarning, stacklevel=3)
+    warn_caller(message, RuntimeWarning)

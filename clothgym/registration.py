@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import sys
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium as gym
@@ -104,6 +106,13 @@ def register() -> None:
             )
 
 
+def _look_here(module: str) -> None:
+    """Let a module be found in the current folder, where ``python -m clothgym`` finds it, and the command ``clothgym`` does not."""
+    top, here = module.partition(".")[0], str(Path.cwd())
+    if not sys.flags.safe_path and not {"", here} & set(sys.path) and top.isidentifier() and find_spec(top) is None:
+        sys.path.append(here)
+
+
 def checked_id(env_id: str) -> str:
     """A registered id whose environment is ours or built on ours, as ``gym.make`` takes it, without our own namespace.
 
@@ -115,6 +124,7 @@ def checked_id(env_id: str) -> str:
     bare = env_id.removeprefix("clothgym:")
     module, _, name = bare.rpartition(":")
     if module:
+        _look_here(module)
         try:
             import_module(module)
         except ImportError as error:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.checks import shown
 from clothgym.collisions import Collider, Plane
 from clothgym.envs.episode import Fields
 from clothgym.envs.measures import centers_of_area, key_particles
@@ -55,7 +56,9 @@ class TaskDefinition:
 
     Attributes:
         physics: the sheet, its fabric, what holds it, and how time is stepped.
-        acting_steps: steps after which the agent's time is up; settling_steps: those that follow, in which actions are ignored.
+        control_steps: control steps of a step, one unless an action says otherwise.
+        acting_steps: control steps after which the agent's time is up.
+        settling_steps: those that follow, in which actions are ignored.
         actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
         observations: what is observed beside the points of the sheet, in that order.
         goals: names of the last of these, which are given apart, in a dictionary, as goal environments have it.
@@ -75,6 +78,7 @@ class TaskDefinition:
     physics: ClassVar[Physics]
     acting_steps: ClassVar[int]
     settling_steps: ClassVar[int] = 0
+    control_steps: int = 1
     actions_per_attachment: ClassVar[int] = 3
     kernels: ClassVar[Kernels] = IN_NUMPY
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles", "heightmap", "pointcloud", "rgb", "depth", "rgbd")
@@ -98,6 +102,11 @@ class TaskDefinition:
     simulation: Simulation
     episode: NDArray
     info: NDArray
+
+    @property
+    def step_seconds(self) -> float:
+        """How long a step lasts in the simulation [s]."""
+        return self.control_steps * self.physics.time_step
 
     # --- start ----------------------------------------------------------------------------------------------------------
 
@@ -233,7 +242,10 @@ def points_observed(task: TaskDefinition | type[TaskDefinition], obs_mode: str, 
 
 
 def check_definition(task: TaskDefinition, in_numpy: bool) -> None:
-    """Refuse a task that cannot be evaluated or has nothing to observe."""
+    """Refuse a task that lacks what every task must say, cannot be evaluated or has nothing to observe."""
+    for name, kind, what in (("physics", Physics, "a Physics"), ("acting_steps", int, "a number of control steps")):
+        if not isinstance(value := getattr(task, name, None), kind) or value == 0:
+            raise TypeError(f"{type(task).__name__}.{name} is {shown(value)}: must be {what}")
     missing = [name for name in ("performance", "success") if getattr(type(task), name) is getattr(TaskDefinition, name)]
     if in_numpy and missing:
         raise TypeError(f"{type(task).__name__} does not define {' and '.join(missing)}(): a task without kernels needs both")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import checks, files
+from clothgym._jit import WITHOUT_JIT
 from clothgym.checks import LARGEST, fits, shown
 from clothgym.parameters import check_properties
 from clothgym.state import State
@@ -31,7 +32,8 @@ LARGEST_SEED = 2**128 - 1  # as large as what NumPy draws where none is given
 Fields = Sequence[tuple[Any, ...]]  # (name, type) or (name, type, shape)
 
 
-VERSION = 1  # of the format of files
+VERSION = 2  # of the format of files
+LAST = "last "  # begins the names of what a state remembers of the last step's info
 
 
 @dataclass
@@ -150,7 +152,9 @@ def records(count: int, fields: Fields) -> NDArray:
     """Records with these fields, all zero, (count,): kernels read ``record.name``, Python ``records["name"]``."""
     # a shape of 1 is a row: older versions of numpy take it for a number
     whole = [(name, kind, *((size,) if isinstance(size, int) else size for size in shape)) for name, kind, *shape in fields]
-    return np.zeros(count, np.dtype(whole, align=True))
+    made = np.zeros(count, np.dtype(whole, align=True))
+    # kernels that are not compiled read fields as attributes, too
+    return made.view(np.recarray) if WITHOUT_JIT else made
 
 
 def names_of(records: NDArray) -> tuple[str, ...]:
@@ -198,9 +202,14 @@ def check_state(task: Any, state: TaskState) -> None:
     # of episodes that there cannot be
     for name in ("over", "step", *memory):
         low, high = task._ranges.get(name, (-LARGEST, LARGEST))
-        fits(name, state.episode[name], memory[name], low, high, advice=advice)
+        # info may hold any number: nothing follows from it
+        excused = np.ones(task.num_envs, bool) if name.startswith(LAST) else None
+        fits(name, state.episode[name], memory[name], low, high, excused, advice)
         if name == "step" and np.any(state.episode["over"] & (state.episode["step"] == 0)):
             raise ValueError("the state is from before the first reset: there is no episode to continue")
+    ended = state.episode["terminated"] | state.episode["truncated"]
+    if np.any(ended != state.episode["over"]):
+        raise ValueError(f"the state's over differs from its terminated and truncated: {advice}")
     check_properties(task.physics.material, state.episode["material"])
     episodes = task.episode.copy()
     for name in names_of(episodes):

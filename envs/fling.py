@@ -302,7 +302,8 @@ class ClothFlingEnv(ClothEnv):
     ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
     0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
     that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
-    is the normalized performance, at a failure 0.
+    is the normalized performance, at a failure 0.  So a return is that performance, less the potential at the start and these
+    terms: doing nothing may return less than 0.
     ``reward_mode="sparse"``: the normalized performance, at the evaluation.
 
     ## Evaluation

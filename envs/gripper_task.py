@@ -83,6 +83,7 @@ class GripperTask(Task):
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
         if action_mode == "pick_place":
+            self.control_steps = pick_place.STEPS
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
         if action_mode == "pick_place":

@@ -24,7 +24,6 @@ from clothgym.mesh import SHEAR, ClothMesh
 if TYPE_CHECKING:
     from clothgym.envs.task import Task
     from clothgym.render import Camera
-    from clothgym.simulation import Simulation
 
 PICTURES = ("heightmap", "pointcloud", "rgb", "depth", "rgbd")
 CAMERA = ("rgb", "depth", "rgbd", "pointcloud")  # of these the modes that a camera takes
@@ -273,13 +272,3 @@ def checked_camera(task: TaskDefinition, camera: Any) -> Camera:
     if not chosen.eye[2] > 0:
         raise ValueError(f"camera={shown(camera)}: its eye must be above the floor z = 0")
     return chosen
-
-
-def info_of_physics(simulation: Simulation) -> dict[str, NDArray]:
-    """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
-    held lags behind [m]."""
-    limiting, contacts = simulation.limiting, simulation.self_contacts
-    info = {} if limiting is None else {"strain_before_limiting": limiting.before}
-    if contacts is not None:
-        info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "attachment_lag": contacts.lag}
-    return info

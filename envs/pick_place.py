@@ -92,7 +92,7 @@ def perform(task: Any, actions: NDArray) -> None:
     outcome, terms, info = task.outcome.copy(), task.terms.copy(), task.info.copy()
     begun = ~task.episode["over"]
     for name in ("reward", "terminated", "failure"):
-        outcome[name] = 0
+        outcome[name][begun] = 0
     terms[...] = np.zeros((), terms.dtype)
     velocities = np.zeros((task.num_envs, grippers, 4))
     for step in range(STEPS):
@@ -108,7 +108,8 @@ def perform(task: Any, actions: NDArray) -> None:
         info[running] = task.info[running]
         if task.episode["over"].all():
             break
-    # environments that were over before it show what a step of theirs shows
+    # environments that were over before it give their last answer
+    outcome["reward"][~begun] = 0
     info[~begun] = task.info[~begun]
     for name in ("reward", "terminated", "failure"):
         task.outcome[name] = outcome[name]

@@ -20,6 +20,12 @@ RENDER_COLORS = ("fabric", "strain", "depth")
 LARGEST_FRAME = 8192  # pixels of a side
 
 
+def frames_a_second(seconds: float) -> float:
+    """The rate of a film with a frame after each step of so long [s], as an int where it is whole: ``metadata["render_fps"]``."""
+    rate = 1 / seconds
+    return round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
+
+
 def check_render_mode(render_mode: str | None, render_color: str) -> None:
     """Refuse what ``draw`` cannot do."""
     if render_mode is not None and not (isinstance(render_mode, str) and render_mode in RENDER_MODES):

@@ -154,7 +154,8 @@ def rewards_of(task_class: type[Task]) -> list[str]:
         *_prose(
             f'``reward_mode="delta"``: the change of a potential in [0, 1], less ``{EFFORT_PRICE:g} |a|^2`` for the motion and '
             f"{FAILURE_PENALTY:g} for a failure, plus {SUCCESS_BONUS:g} for a success.  At the end the potential is the normalized "
-            "performance, at a failure 0."
+            "performance, at a failure 0.  So a return is that performance, less the potential at the start and these terms: doing "
+            "nothing may return less than 0."
         ),
         '``reward_mode="sparse"``: the normalized performance, at the evaluation.',
     ]

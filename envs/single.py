@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from clothgym.checks import numbers
 from clothgym.envs.episode import FAILURES, TaskState
+from clothgym.envs.hooks import expert
 from clothgym.envs.keyboard import actions_of_keys
 from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords, completed
-from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, renderer_of
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
 from clothgym.envs.task import Task
 from clothgym.exclusive import Turn, exclusive
+from clothgym.warning import warn_caller
 
 IMAGE_SIZE = 480
 
@@ -32,7 +34,10 @@ class ClothEnv(gym.Env[Any, NDArray]):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        cls.__doc__ = completed(cls.__doc__, getattr(cls, "task_class", None))
+        task_class = getattr(cls, "task_class", None)
+        cls.__doc__ = completed(cls.__doc__, task_class)
+        if task_class is not None:
+            cls.metadata = cls.metadata | {"render_fps": frames_a_second(task_class.physics.time_step)}
 
     def __init__(
         self,
@@ -48,17 +53,13 @@ class ClothEnv(gym.Env[Any, NDArray]):
         self.frame_size = checked_frame_size(width, height)
         kwargs.setdefault("threads", 1)
         self.task = self.task_class(1, **kwargs)
-        self.metadata = self.metadata | {"render_fps": round(1 / self.task.physics.time_step)}
+        self.metadata = self.metadata | {"render_fps": frames_a_second(self.task.step_seconds)}
         self.observation_space = self.task.observed.space
         self.action_space = self.task.single_action_space
         self._renderer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.task.reset(np.array([0]), [seed], options)
-        generator = self.task.generators[0]
-        if self._np_random is not generator:  # it has been seeded anew
-            sequence: Any = generator.bit_generator.seed_seq
-            self._np_random, self._np_random_seed = generator, sequence.entropy
         return self.task.observed.one(0), self.task.info_of(0)
 
     @exclusive
@@ -77,6 +78,24 @@ class ClothEnv(gym.Env[Any, NDArray]):
         """Of the task: one thread at a time is in the environment."""
         return self.task.turn
 
+    # what Gymnasium's own np_random and np_random_seed read and write: the generator from which the environment draws its episodes
+
+    @property
+    def _np_random(self) -> np.random.Generator | None:  # type: ignore[override]
+        return None if self._np_random_seed is None else self.task.generators[0]
+
+    @_np_random.setter
+    def _np_random(self, value: Any) -> None:
+        self.task.generators.put([value])
+
+    @property
+    def _np_random_seed(self) -> int | None:  # type: ignore[override]
+        return self.task.generators.seeds[0]
+
+    @_np_random_seed.setter
+    def _np_random_seed(self, value: Any) -> None:
+        self.task.generators.seeds[0] = value
+
     @property
     def observation_slices(self) -> dict[str, slice]:
         """Where each observation lies in the state vector, by its name on the page."""
@@ -91,17 +110,21 @@ class ClothEnv(gym.Env[Any, NDArray]):
         """For ``gymnasium.utils.play``: what each set of keys does, see ``keyboard``."""
         return actions_of_keys(self.task.num_attachments, self.task.actions_per_attachment)
 
+    def __getattr__(self, name: str) -> Any:
+        where = ": it is env.unwrapped.task.simulation" if name == "simulation" else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{where}")
+
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
         return vars(self) | {"_renderer": None}
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
-        return self.task.expert()[0].astype(np.float32)
+        return expert(self.task)[0]
 
     def render(self) -> NDArray | None:  # type: ignore[override]
         if self.render_mode is None:
-            gym.logger.warn("render() without a render_mode does nothing; use gym.make(..., render_mode='rgb_array')")
+            warn_caller("render() without a render_mode does nothing; use gym.make(..., render_mode='rgb_array')")
             return None
         if self._renderer is None:
             self._renderer = renderer_of(self.task, *self.frame_size)
@@ -114,4 +137,3 @@ class ClothEnv(gym.Env[Any, NDArray]):
     def set_state(self, state: TaskState) -> None:
         """Continue from what ``get_state`` returned, here or in another environment of the same kind."""
         self.task.set_state(state)
-        self._np_random, self._np_random_seed = self.task.generators[0], -1  # as Gymnasium has it for one of unknown seed

@@ -382,17 +382,3 @@ def write_observation(points, particles, origin, per_side, more, bound, observat
     # all within the bounds of the space
     for i in range(bound.shape[0]):
         observation[i] = min(max(observation[i], -bound[i]), bound[i])
-
-
-# --- in NumPy -----------------------------------------------------------------------------------------------------------------
-
-
-def evaluate_in_numpy(task: Any) -> None:
-    """Write what the methods of a task without kernels return, for the kernels of all tasks to read."""
-    # a sheet that has diverged makes numbers that are not finite: its failure is what counts
-    with np.errstate(all="ignore"):
-        task.episode["performance"] = np.clip(np.nan_to_num(task.performance()), 0, 1)
-        task.episode["success"], task.episode["done"] = task.success(), task.done()
-        for one in task.observations:
-            values = task.episode[one.name] if one.function is None else one.function(task)
-            task.seen[one.name] = np.reshape(values, (task.num_envs, *one.shape))

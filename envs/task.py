@@ -15,18 +15,19 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.utils import seeding
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
 from clothgym.checks import not_negative, numbers, one_of, shown
+from clothgym.envs import answers, hooks
 from clothgym.envs.definition import TaskDefinition, check_definition
 from clothgym.envs.episode import TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
-from clothgym.envs.observing import Observer, StateVector, info_of_physics
+from clothgym.envs.generators import Generators
+from clothgym.envs.observing import Observer, StateVector
 from clothgym.envs.physics import check_ranges, checked_material_option, checked_ranges, checked_wind, chosen_fabric, most_demanding
 from clothgym.envs.settling import check as check_settling
 from clothgym.envs.settling import only, settle
-from clothgym.envs.stepping import IN_NUMPY, compiled, evaluate_in_numpy, mesh_arrays
+from clothgym.envs.stepping import IN_NUMPY, compiled, mesh_arrays
 from clothgym.exclusive import Turn, exclusive
 from clothgym.material import Material
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
@@ -63,7 +64,7 @@ class Task(TaskDefinition):
         observation_slices: where each observation lies in ``observation[env]``, the state vector, by its name.
         observed: what ``reset`` and ``step`` return of it.
         rules: one record of numbers that all environments share.
-        outcome, info, terms: records of what the last step has brought, or the reset since then, (num_envs,).
+        outcome, info, physical, terms: records of what the last step or reset has brought, (num_envs,), see ``answers``.
         turn: one thread at a time is in the task; ``turn.unfinished`` are the environments that need a reset.
 
     Raises:
@@ -122,7 +123,7 @@ class Task(TaskDefinition):
             integrator=method,
             time_step=fixed.time_step,
             substeps=substeps,  # type: ignore[arg-type]
-            colliders=self.colliders(),
+            colliders=hooks.colliders(self),
             contact=fixed.contact if contact is None else contact,
             air_density=not_negative("air_density", air_density),
             anchors=fixed.held,
@@ -135,13 +136,12 @@ class Task(TaskDefinition):
             on_divergence="ignore",  # a step's outcome says so
         )
         check_settling(self)
-        self.num_envs = num_envs
-        self.threads = self.simulation.threads
+        self.num_envs, self.threads = num_envs, self.simulation.threads
         self.num_attachments = len(fixed.held) + len(fixed.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)
         self._prepare_records()
-        self.generators: list[np.random.Generator] = [np.random.default_rng(0)] * num_envs
-        self._seeded = np.zeros(num_envs, bool)
+        self.generators = Generators(num_envs)
+        self._begun = np.zeros(num_envs, bool)
         self.turn = Turn("environment", error=gym.error.ResetNeeded)
         self.state_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
         self.observed = Observer(self, obs_mode, image_size, camera, num_points, privileged)
@@ -155,13 +155,14 @@ class Task(TaskDefinition):
         self.observation = np.zeros((count, len(vector.bound)), np.float32)
         # what the task declares, as records for its kernels and as the numbers in them
         self.seen = records(count, [(one.name, np.float32, one.shape) for one in self.observations])
-        attachment, (low, high) = (self.num_attachments, 3), self.arena()
+        attachment, (low, high) = (self.num_attachments, 3), hooks.arena(self)
         # what an episode remembers
         memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool)]
         memory += [("targets", float, attachment), ("potential", float)]
-        memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES)), *self.remembers()]
+        memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES))]
         if self._in_numpy:
             memory += [("performance", float), ("success", bool), ("done", bool)]
+        memory += hooks.fields(self, "remembers()", self.remembers(), [name for name, *_ in memory])
         self.episode = records(count, memory)
         self.episode["over"] = True
         steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
@@ -182,13 +183,15 @@ class Task(TaskDefinition):
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]
         self._belongs = {"task": type(self).__name__, "observation mode": points, "digest of the arguments": digest}
         # what a step brings
-        brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("failure", np.int64)]
+        brought: list[tuple[Any, ...]] = [("reward", float), ("terminated", bool), ("truncated", bool), ("failure", np.int64)]
         brought += [("moves", float, (self.num_attachments, self.actions_per_attachment)), ("free", np.uint8, self.num_attachments)]
         self.outcome = records(count, brought)
-        always = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
-        self.info = records(
-            count, [*always, ("normalized_performance", float), ("is_success", bool), *self.evaluation, *self.accounts]
-        )
+        told: list[tuple[Any, ...]] = [("strain_max", np.float32), ("strain_before_limiting", np.float32), ("settling", bool)]
+        told += [("normalized_performance", float), ("is_success", bool)]
+        for hook in ("evaluation", "accounts"):
+            told += hooks.fields(self, hook, getattr(self, hook), [name for name, *_ in told])
+        self.info = records(count, told)
+        self.physical = records(count, answers.PHYSICAL)
         self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
         # what the kernels need beside these
         self._mesh = mesh_arrays(physics.mesh, self.particles)
@@ -226,14 +229,13 @@ class Task(TaskDefinition):
         # draw what is new; what has been drawn is put back if it is refused
         drawn = self._drawn()
         before = [array[envs] for array in drawn]
-        generators = [(self.generators[env], self.generators[env].bit_generator.state) for env in envs.tolist()]
+        generators = self.generators.kept(envs)
         try:
             start = self.simulation.checked_start(envs, self._draw(envs, seeds, options))
         except BaseException:
             for array, value in zip(drawn, before):
                 array[envs] = value
-            for env, (generator, state) in zip(envs.tolist(), generators):
-                self.generators[env], generator.bit_generator.state = generator, state
+            self.generators.put_back(generators)
             raise
         # then change
         self.turn.begin(envs.tolist())
@@ -243,19 +245,18 @@ class Task(TaskDefinition):
 
     def _drawn(self) -> list[NDArray]:
         """All that drawing an episode writes, beside the generators, live, (num_envs, ...)."""
-        return [self.episode, self.air, self._seeded]
+        return [self.episode, self.air, self._begun]
 
     def _draw(self, envs: NDArray, seeds: Sequence[int | None], options: Mapping[str, Any]) -> NDArray:
         """Draw each episode from its own generator; returns the sheets [m], (len(envs), particles, 3)."""
         starts = np.empty((len(envs), self.physics.mesh.num_particles, 3))
         for k, (env, seed) in enumerate(zip(envs.tolist(), seeds)):
-            if seed is not None or not self._seeded[env]:
-                self.generators[env] = seeding.np_random(seed)[0]
-                self._seeded[env] = True
+            generator = self.generators.of(env, seed)
+            self._begun[env] = True
             self._draw_material(env, options.get("material", {}))
             if self.wind is not None:
-                self.air[env] = self.wind.series(self.generators[env], self.air.shape[1], self.physics.time_step)
-            starts[k] = self.begin(env, self.generators[env], options)
+                self.air[env] = self.wind.series(generator, self.air.shape[1], self.physics.time_step)
+            starts[k] = hooks.start(self, env, generator, options)
         return starts
 
     def _begin(self, envs: NDArray, warn: bool) -> None:
@@ -271,9 +272,10 @@ class Task(TaskDefinition):
         self.place_attachments(envs)
         for name, value in (("step", 0), ("settling_since", -1), ("over", False)):
             self.episode[name][envs] = value
-        for brought in (self.outcome, self.info, self.terms):
+        for brought in (self.outcome, self.info, self.physical, self.terms):
             brought[envs] = np.zeros((), brought.dtype)
         self._score_and_observe(envs, begins=True)
+        answers.note_physics(self, envs)
         self.observed.begun(envs)
 
     def _checked_options(self, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -306,7 +308,7 @@ class Task(TaskDefinition):
 
     @exclusive
     def step(self, actions: Any) -> None:
-        """One control step of all environments that are not over; the others keep still and get no reward.
+        """One control step of all environments that are not over; the others give their last answer again, and no reward.
 
         Raises:
             ValueError: actions, (num_envs, numbers), of a wrong shape or not finite; nothing has moved then.
@@ -325,8 +327,8 @@ class Task(TaskDefinition):
 
     def check_ready(self) -> None:
         """Refuse a step of a batch that has not been reset, or was interrupted."""
-        if not self._seeded.all():
-            raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._seeded))} has not been reset yet: call reset() first")
+        if not self._begun.all():
+            raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._begun))} has not been reset yet: call reset() first")
         self.turn.check_whole()
         self.simulation.turn.check_whole()
 
@@ -344,17 +346,18 @@ class Task(TaskDefinition):
             self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
-        with only(self, envs):
-            self.before_step(actions)
-            simulation.step(envs=envs)
-            self.info[chosen] = np.zeros((), self.info.dtype)
-            self.after_step()
-        self._score_and_observe(chosen, begins=False)
-        # anchors that an action has opened let go after the step in which it did
-        if self.outcome["free"].any():
-            simulation.release(*np.nonzero(self.outcome["free"]))
-            self.outcome["free"] = 0
-        self.observed.stepped(chosen)
+        with answers.standing(self):
+            with only(self, envs):
+                self.before_step(actions)
+                simulation.step(envs=envs)
+                self.info[chosen] = np.zeros((), self.info.dtype)
+                self.after_step()
+            self._score_and_observe(chosen, begins=False)
+            # anchors that an action has opened let go after the step in which it did
+            if self.outcome["free"].any():
+                simulation.release(*np.nonzero(self.outcome["free"]))
+                self.outcome["free"] = 0
+            self.observed.stepped(chosen)
 
     def steps_taken(self) -> NDArray:
         """Calls of ``step`` since each episode's start, (num_envs,)."""
@@ -380,7 +383,7 @@ class Task(TaskDefinition):
         block, lane = self._place if everyone else self.simulation.layout.at(envs)
         pulls = self.simulation.pulls(None if everyone else envs) if self.feels_pulls else self._no_pulls
         if self._in_numpy:
-            evaluate_in_numpy(self)
+            hooks.evaluate_in_numpy(self)
 
         def work(first: int, last: int) -> None:
             self._finish_step(
@@ -398,16 +401,11 @@ class Task(TaskDefinition):
 
         ``failure`` is a place in ``FAILURES``; the reward's terms are ``reward/NAME``.
         """
-        info: dict[str, Any] = {name: self.info[name].copy() for name in names_of(self.info)} | info_of_physics(self.simulation)
-        info["failure"] = self.outcome["failure"].copy()
-        return info | {f"reward/{name}": self.terms[name].copy() for name in names_of(self.terms)}
+        return answers.of_batch(self)
 
     def info_of(self, env: int) -> dict[str, Any]:
         """The same of one environment, as plain Python values."""
-        info = dict(zip(names_of(self.info), self.info[env].item()))
-        info |= {name: value[env].item() for name, value in info_of_physics(self.simulation).items()}
-        info["failure"] = self.outcome["failure"][env].item()
-        return info | {f"reward/{name}": value for name, value in zip(names_of(self.terms), self.terms[env].item())}
+        return answers.of_one(self, env)
 
     # --- state ----------------------------------------------------------------------------------------------------------
 
@@ -428,7 +426,8 @@ class Task(TaskDefinition):
 
     def _memory(self) -> dict[str, NDArray]:
         """All that is remembered of the episodes, live."""
-        return {name: self.episode[name] for name in names_of(self.episode)} | {"observation": self.observation, "wind": self.air}
+        own = {name: self.episode[name] for name in names_of(self.episode)} | {"observation": self.observation, "wind": self.air}
+        return own | answers.remembered(self)
 
     @exclusive
     def set_state(self, state: TaskState) -> None:
@@ -443,7 +442,9 @@ class Task(TaskDefinition):
         self.turn.begin(range(self.num_envs))
         for name, value in self._memory().items():
             value[...] = state.episode[name]
-        self.generators[:] = generators
-        self._seeded[:] = True
+        self.generators.put(generators)
+        self._begun[:] = True
+        # a reward is of a step, and belongs to no state
+        self.outcome["reward"], self.terms[...] = 0, np.zeros((), self.terms.dtype)
         self.observed.begun(self._everyone)
         self.turn.unfinished = ()

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from clothgym.checks import count, mask, shown
 from clothgym.envs.episode import FAILURES, TaskState, batch_seeds
+from clothgym.envs.hooks import expert
 from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords
-from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, renderer_of
+from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
 from clothgym.envs.task import Task
 from clothgym.exclusive import Turn, exclusive
 
@@ -26,7 +27,9 @@ class ClothVectorEnv(VectorEnv):
 
     Args:
         num_envs: environments in the batch; environment ``i`` of a batch seeded ``s`` equals a single one seeded ``s + i``.
-        autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.
+        autoreset_mode: "NextStep" (Gymnasium's default), "SameStep" or "Disabled", or an ``AutoresetMode``.  With "Disabled" an
+            environment that is over gives its last answer, with a reward of zero, until ``reset`` begins it again; a wrapper that
+            counts ends, as ``RecordEpisodeStatistics``, is to be reset before it counts one twice.
         render_mode: None, "rgb_array" or "depth_array"; ``render`` returns one frame an environment.
         render_color: "fabric", or "strain" or "depth" for their colors.
         width, height: of a frame [pixels].
@@ -58,13 +61,13 @@ class ClothVectorEnv(VectorEnv):
         check_render_mode(render_mode, render_color)
         self.render_mode, self.render_color = render_mode, render_color
         self.frame_size = checked_frame_size(width, height)
+        self.task = self.task_class(self.num_envs, **kwargs)
         self.metadata = {
             "render_modes": RENDER_MODES,
-            "render_fps": round(1 / self.task_class.physics.time_step),
+            "render_fps": frames_a_second(self.task.step_seconds),
             "autoreset_mode": self.autoreset_mode,
             "failures": FAILURES,
         }
-        self.task = self.task_class(self.num_envs, **kwargs)
         self.single_observation_space = self.task.observed.space
         self.single_action_space = self.task.single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -87,18 +90,16 @@ class ClothVectorEnv(VectorEnv):
     def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """One control step of the batch; what happens to environments that are over depends on the autoreset mode."""
         task, everyone = self.task, np.ones(self.num_envs, bool)
-        over = task.episode["over"].copy()
+        over, final = task.episode["over"].copy(), {}
         task.advance(actions)
-        reward, terminated, truncated = task.outcome["reward"].copy(), task.outcome["terminated"].copy(), self._truncated(over)
+        self._truncate(over)
         if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             # those that ended in the last step begin again in this one: their actions were ignored
             task.reset(np.flatnonzero(over))
-            info = _with_masks(task.infos(), everyone)
-        elif self.autoreset_mode == AutoresetMode.SAME_STEP:
+        reward, terminated, truncated = (task.outcome[name].copy() for name in ("reward", "terminated", "truncated"))
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             final = self._reset_ended(terminated | truncated)
-            info = _with_masks(task.infos(), everyone) | final
-        else:
-            info = _with_masks(_only(task.infos(), ~over), ~over)
+        info = _with_masks(task.infos(), everyone) | final
         brought = self.task.observed.batch(), reward, terminated, truncated, info
         self.turn.unfinished = ()
         return brought
@@ -108,16 +109,16 @@ class ClothVectorEnv(VectorEnv):
         """Of the task: one thread at a time is in the environment."""
         return self.task.turn
 
-    def _truncated(self, over: NDArray) -> NDArray:
-        """Whether each environment has reached ``max_episode_steps`` in this step; over: those that were before it.
+    def _truncate(self, over: NDArray) -> None:
+        """End the episodes that have reached ``max_episode_steps`` in this step; over: those that had ended before it.
 
         Without that nothing is truncated: the time limit is part of the tasks.
         """
         if self.max_episode_steps is None:
-            return np.zeros(self.num_envs, bool)
+            return
         truncated = ~over & (self.task.steps_taken() >= self.max_episode_steps)
+        self.task.outcome["truncated"] |= truncated
         self.task.episode["over"] |= truncated
-        return truncated
 
     def _reset_ended(self, ended: NDArray) -> dict[str, Any]:
         """Same-step mode: begin again; what was last, as ``final_info`` and ``final_obs``."""
@@ -143,7 +144,7 @@ class ClothVectorEnv(VectorEnv):
         """Call a method, or read an attribute, of the batch on behalf of each environment."""
         value = getattr(self, name)
         result = value(*args, **kwargs) if callable(value) else value
-        each = name in ("render", "expert_actions") and result is not None
+        each = name in ("render", "expert_actions", "np_random", "np_random_seed") and result is not None
         return tuple(result) if each else (result,) * self.num_envs
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -157,6 +158,20 @@ class ClothVectorEnv(VectorEnv):
             values = values[0]
         setattr(self, name, values)
 
+    @property  # type: ignore[override]
+    def np_random(self) -> tuple[np.random.Generator, ...]:
+        """The generators from which the environments draw their episodes, one each, as Gymnasium's own batches have them."""
+        return tuple(self.task.generators.of(env) for env in range(self.num_envs))
+
+    @np_random.setter
+    def np_random(self, value: Any) -> None:
+        self.task.generators.put(value)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """Their seeds; -1 where a generator's is not known, as after ``set_state``."""
+        return tuple(self.task.generators.seeds[env] for env, _ in enumerate(self.np_random))
+
     @property
     def observation_slices(self) -> dict[str, slice]:
         """Where each observation lies in an environment's row of the state vectors, by its name on the page."""
@@ -167,13 +182,17 @@ class ClothVectorEnv(VectorEnv):
         """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
         return mesh_edges(self.task.physics.mesh)
 
+    def __getattr__(self, name: str) -> Any:
+        where = ": it is env.unwrapped.task.simulation" if name == "simulation" else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{where}")
+
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
         return vars(self) | {"_renderer": None}
 
     def expert_actions(self) -> NDArray:
         """What the task's scripted expert does now, (num_envs, actions)."""
-        return self.task.expert().astype(np.float32)
+        return expert(self.task)
 
     def get_state(self) -> TaskState:
         """All that is needed to continue the batch bit for bit."""

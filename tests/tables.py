@@ -6,8 +6,8 @@ lies on the edge).  So drawing it back takes
 
     w (mu a + exp(mu pi/2) c + R ((1 - mu^2) + 2 mu exp(mu pi/2))/(1 + mu^2)),
 
-and it slides down by itself where this, with -mu instead of mu, is positive.  At a sharp edge it stays up to the share f = r/(1 + r)
-of its length, with r = mu exp(mu pi/2).
+and it slides down by itself where this, with -mu instead of mu, is positive.  At a sharp edge it stays up to the share
+f = r/(1 + r) of its length, with r = mu exp(mu pi/2).
 """
 
 import numpy as np

@@ -13,6 +13,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 
 import clothgym
@@ -28,10 +29,13 @@ PAGES = {
 API = sorted((ROOT / "docs" / "api").glob("*.rst"))
 BLOCKS = {name: re.findall(r"^```(\w*)\n(.*?)^```", page, re.DOTALL | re.MULTILINE) for name, page in PAGES.items()}
 PYTHON = {name: [text for language, text in blocks if language == "python"] for name, blocks in BLOCKS.items()}
-ELSEWHERE = {"README.md": "test_docs.py", "docs/clients.md": "clients"}
-SAMPLES = [name for name, blocks in PYTHON.items() if blocks and name not in ELSEWHERE]
+ELSEWHERE = {"docs/clients.md": "clients"}
+# pages whose blocks run each by itself; those of others continue one another
+ALONE = [name for name, blocks in PYTHON.items() if blocks and (name == "README.md" or name.startswith("docs/howto/"))]
+SAMPLES = [name for name, blocks in PYTHON.items() if blocks and name not in ELSEWHERE and name not in ALONE]
 
-# the same in fewer steps, of fewer environments, and of smaller batches; and a committed policy in the place of a run's
+# what a sample is run with in place of what it says: the same in fewer steps, of fewer environments, and of smaller batches; and a
+# committed policy in the place of a run's
 SHORTER = (
     (r"\.learn\([\d_]+\)", ".learn(1)"),
     (r'(make_sb3_vec_env\("[\w-]+", num_envs=)\d+', r"\g<1>2"),
@@ -63,11 +67,34 @@ def run(page, blocks):
 @pytest.mark.parametrize("page", SAMPLES)
 def test_a_page_s_samples_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    names = run(page, PYTHON[page])
+    run(page, PYTHON[page])
+
+
+@pytest.mark.parametrize(("page", "number"), [(page, number) for page in ALONE for number in range(len(PYTHON[page]))])
+def test_a_block_runs_by_itself(page, number, tmp_path, monkeypatch, capsys):
+    """In an empty folder, without the names of another block, and without ids that only another one has registered."""
+    monkeypatch.chdir(tmp_path)
+    block, known = PYTHON[page][number], dict(gym.registry)
+    for env_id in known:
+        if env_id.startswith("Cloth") and not re.search(r"^(import|from) clothgym|clothgym:", block, re.MULTILINE):
+            monkeypatch.delitem(gym.registry, env_id)
+    try:
+        names = run(page, [block])
+    finally:
+        for env_id in set(gym.registry) - set(known):
+            del gym.registry[env_id]
     if page == "docs/howto/task.md":  # it is the whole of a task: its expert gets there
         task = names["envs"].unwrapped.task
         middle = task.simulation.positions[:, 40, :2]  # of 9 x 9 particles
         assert names["terminated"].all() and abs(middle - task.episode["goal"]).max() < 0.05
+    if page == "README.md":
+        assert {0: "policy", 1: "held_out", 2: "film", 3: "post"}[number] in names
+        if number == 0:
+            assert names["terminated"] and names["info"]["normalized_performance"] > 0.5  # the expert's
+        if number == 1:
+            assert (tmp_path / "reach.zip").exists() and "return, mean and deviation" in capsys.readouterr().out
+        if number == 2:
+            assert names["images"].shape[1:] == (48, 48, 1) and names["state"].shape[1:] == (68,)
 
 
 @pytest.mark.parametrize("page", API, ids=lambda page: page.name)

@@ -111,7 +111,7 @@ def test_disabled_mode_waits_for_a_masked_reset(env_id):
     env = make_vec(env_id, 3, autoreset_mode="Disabled")
     _, (last, *_) = run_to_an_end(env)
     after, reward, terminated, *_ = env.step(np.ones_like(still(env)))
-    assert np.array_equal(after[1], last[1]) and reward[1] == 0 and not terminated[1]
+    assert np.array_equal(after[1], last[1]) and reward[1] == 0 and terminated[1]
     assert not np.array_equal(after[0], last[0])
     observation, _ = env.reset(options={"reset_mask": np.array([False, True, False])})
     assert np.array_equal(observation[[0, 2]], after[[0, 2]])

@@ -71,9 +71,11 @@ def film(
         fresh = env.render()
         still = [new if on else old for new, old, on in zip(fresh, still, running)]
         running &= ~(terminated | truncated)
-    frames += [_row(still)] * 15
+    rate = env.metadata["render_fps"]
+    # the end stands for half a second
+    frames += [_row(still)] * max(1, round(rate / 2))
     env.close()
-    write_video(path, frames[::stride], fps=env.metadata["render_fps"] / stride)
+    write_video(path, frames[::stride], fps=rate / stride)
 
 
 def _row(images: list[np.ndarray]) -> np.ndarray:

@@ -21,6 +21,7 @@ from endings import refused, stopped
 from scoring import HELD_OUT, run_episodes, score
 
 from clothgym import files
+from clothgym.folders import expand_paths
 from clothgym.registration import ENVIRONMENTS, checked_id
 
 __all__ = ["HELD_OUT", "run_episodes", "score"]
@@ -56,6 +57,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Everything is checked here, before torch is imported; errors look like those of a wrong flag."""
+        expand_paths(self)
         self.suite = self.suite or len(self.env) > 1
         self.env = tuple(checked_id(one) for one in self.env or (ENVIRONMENTS if self.suite else ("ClothDrape-v0",)))
         if self.episodes < 1:

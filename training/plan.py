@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from scoring import HELD_OUT, score
 from tqdm import tqdm
 
+from clothgym.folders import expand_paths
 from clothgym.registration import checked_id
 
 NARROWEST = 0.05  # least standard deviation of an action that is drawn
@@ -78,6 +79,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Everything is checked here, before numba is loaded; errors look like those of a wrong flag."""
+        expand_paths(self)
         self.env = checked_id(self.env)
         least = {"episodes": 1, "seed": 0, "population": 2, "elites": 1, "iterations": 1, "horizon": 0, "execute": 0, "repeat": 1}
         for name, low in (least | {"threads": 1, "model_steps": 1}).items():
@@ -142,11 +144,7 @@ class Planner:
 
     def steps_per_action(self) -> int:
         """Control steps of one call of ``step``: more than one for macro actions."""
-        if getattr(self.env.task, "action_mode", "velocity") != "pick_place":
-            return 1
-        from clothgym.envs.pick_place import STEPS  # imported here: flags are checked before numba is loaded
-
-        return STEPS
+        return self.env.task.control_steps
 
     def plan(self, before: NDArray, rng: np.random.Generator) -> Plan:
         """The best sequence of actions found from the present state.

@@ -90,7 +90,7 @@ class Args:
             later = self.stages if first["n_timesteps"] < self.timesteps else []
             self.stages = [(own | first["env_kwargs"], min(first["n_timesteps"], self.timesteps)), *later]
         self.env_kwargs = own
-        self.folder = self.run or Path("runs") / f"{self.env}_single_file_{self.seed}"
+        self.folder = self.run.expanduser() if self.run else Path("runs") / f"{self.env}_single_file_{self.seed}"
         if (self.folder / "policy.npz").exists() or (self.folder / "config.json").exists():  # the latter is of train.py
             raise ValueError(f"{self.folder} holds a run already: choose another folder with --run")
 

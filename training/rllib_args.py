@@ -11,6 +11,7 @@ import policies
 import yaml
 
 import clothgym
+from clothgym.folders import expand_paths
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
@@ -42,6 +43,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Everything is checked here, before what is slow is imported; errors look like those of a wrong flag."""
+        expand_paths(self)
         self.env = checked_id(self.env)
         for name, least in {"timesteps": 1, "runners": 0, "envs_per_runner": 1, "cpus_per_runner": 1, "learners": 0,
                             "checkpoint_seconds": 0, "final_episodes": 1}.items():  # fmt: skip

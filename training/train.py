@@ -29,6 +29,7 @@ from endings import going_on, refused, stopped
 
 import clothgym
 from clothgym import files
+from clothgym.folders import expand_paths
 from clothgym.registration import checked_id
 
 HERE = Path(__file__).parent
@@ -74,6 +75,7 @@ class Args:
 
     def __post_init__(self) -> None:
         """Everything is checked here, before what is slow is imported; errors look like those of a wrong flag."""
+        expand_paths(self)
         self.env = checked_id(self.env)
         for name in ("timesteps", "evaluations", "eval_episodes", "final_episodes", "threads"):
             value = getattr(self, name)

@@ -22,6 +22,8 @@ import yaml
 from endings import refused, stopped
 from scoring import HELD_OUT, run_episodes
 
+from clothgym.folders import expand_paths
+
 VALIDATION = HELD_OUT + 2_000_000  # first seed of the episodes by which trials are compared
 
 
@@ -45,6 +47,7 @@ class Args:
     """Only show what the study has found."""
 
     def __post_init__(self) -> None:
+        expand_paths(self)
         for name in ("timesteps", "trials", "episodes", "seeds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name} {getattr(self, name)}: must be at least 1")

@@ -19,12 +19,14 @@ import importlib.util
 import os
 import stat
 import sys
-import warnings
 from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
 import numba
+
+from clothgym.folders import CACHE, named
+from clothgym.warning import warn_caller
 
 # modules and folders without kernels, from which none below them takes a constant: who edits them need not compile
 WITHOUT_KERNELS = {"__main__", "adapters", "cli", "playground"}
@@ -72,13 +74,13 @@ def name_of(function: Any) -> str:
 
 
 def _default_root() -> Path:
-    if os.environ.get("CLOTHGYM_CACHE_DIR"):
-        return Path(os.environ["CLOTHGYM_CACHE_DIR"])
-    if os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(os.environ["NUMBA_CACHE_DIR"]) / "clothgym"
+    if own := named(CACHE):
+        return own
+    if numba_s := named("NUMBA_CACHE_DIR"):
+        return numba_s / "clothgym"
     if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", Path.home())) / "clothgym" / "kernels"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "clothgym" / "kernels"
+        return (named("LOCALAPPDATA") or Path.home()) / "clothgym" / "kernels"
+    return (named("XDG_CACHE_HOME") or Path.home() / ".cache") / "clothgym" / "kernels"
 
 
 class CacheFolder:
@@ -98,9 +100,9 @@ class CacheFolder:
         root = NOWHERE
         try:
             root = _default_root()
-            folders = package_folders()
-            path = root / source_digest(folders)
-            core = root / source_digest({"clothgym": folders["clothgym"]}, ABOVE_CORE)
+            packages = package_folders()
+            path = root / source_digest(packages)
+            core = root / source_digest({"clothgym": packages["clothgym"]}, ABOVE_CORE)
             for folder in (root, path, core):
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 _refuse_others(folder, stat.S_IWGRP | stat.S_IWOTH, "chmod go-w")
@@ -115,11 +117,10 @@ class CacheFolder:
         """Go on without writing to the folder, and say so once."""
         if self.writable:
             self.writable = False
-            warnings.warn(
+            warn_caller(
                 f"clothgym cannot use its kernel cache {str(root or self.path.parent)!r} ({error}): kernels that it lacks are "
                 "compiled again in each process, for a minute or two. Set CLOTHGYM_CACHE_DIR to a folder of your own that can "
-                "be written.",
-                stacklevel=2,
+                "be written."
             )
 
     def read(self, path: Path) -> memoryview | None:

@@ -8,17 +8,21 @@ with the same results, and slower to start.
 
 from __future__ import annotations
 
+import functools
 import os
-import warnings
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any, NamedTuple, cast
 
 import numba
+import numpy as np
 
 from clothgym._jit.cache import cache_folder, name_of
+from clothgym.warning import warn_caller
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": False, "nogil": True, "boundscheck": False}
+# NUMBA_DISABLE_JIT=1: kernels are plain Python, for debuggers and coverage
+WITHOUT_JIT = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 
 
 class Flags(NamedTuple):
@@ -67,7 +71,7 @@ def _plainly(function: FunctionType, apart: bool, flags: Flags) -> Any:
 def _choose() -> Callable[[FunctionType, bool, Flags], Any]:
     """How this process makes dispatchers.  CLOTHGYM_PLAIN_NUMBA=1: plainly; =0: with internals, whether tested or not."""
     wish = os.environ.get("CLOTHGYM_PLAIN_NUMBA", "")
-    if wish == "1":
+    if wish == "1" or WITHOUT_JIT:
         return _plainly
     try:
         from clothgym._jit import numba_internals
@@ -75,16 +79,27 @@ def _choose() -> Callable[[FunctionType, bool, Flags], Any]:
         numba_internals.check(tested_only=wish != "0")
         return _with_internals
     except (ImportError, AttributeError, TypeError) as error:
-        warnings.warn(
+        warn_caller(
             f"clothgym does not know numba {numba.__version__} ({error}): kernels are compiled plainly, which changes no results, "
             "but the first start of each scene takes minutes. Install a tested version, or set CLOTHGYM_PLAIN_NUMBA=1 to accept "
-            "this without a warning.",
-            stacklevel=2,
+            "this without a warning."
         )
         return _plainly
 
 
 _make = _choose()
+
+
+def _in_python(function: Callable[..., Any], flags: Flags) -> Any:
+    """A kernel that is not compiled: it divides by zero without a word, as a compiled one does."""
+
+    @functools.wraps(function)
+    def uncompiled(*args: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return function(*args)
+
+    uncompiled.py_func, uncompiled.flags = function, flags  # type: ignore[attr-defined]
+    return uncompiled
 
 
 def kernel(function: Callable[..., Any], apart: bool = False, flags: Flags = COUNTED) -> Any:
@@ -96,8 +111,8 @@ def kernel(function: Callable[..., Any], apart: bool = False, flags: Flags = COU
     optimizes it again there: right for what is short, and minutes in all for what is long and has many callers.
     flags: the compiler's, see ``disjoint``.
     """
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        return function
+    if WITHOUT_JIT:
+        return _in_python(function, flags)
     dispatcher = _make(cast(FunctionType, function), apart, flags)
     dispatcher.flags = flags
     return dispatcher
@@ -126,7 +141,7 @@ def inlined(function: Callable[..., Any]) -> Any:
     It is compiled there alone.  A kernel's code is optimized again in each kernel above it, so a chain of long ones with one caller
     each would be optimized as often as it is long.
     """
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if WITHOUT_JIT:
         return function
     return numba.njit(inline="always", **OPTIONS)(function)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 import clothgym
 from clothgym import files, policies
 from clothgym.registration import checked_id
+from clothgym.warning import warn_caller
 
 # the last checkpoint and the one before it, what they were trained with, and what the finished run has exported
 CHECKPOINT, BEFORE, CONFIG, POLICY = "checkpoint.pt", "checkpoint_before.pt", "config.json", "policy.npz"
@@ -127,7 +127,7 @@ def load_last(folder: Path) -> dict[str, Any]:
         if not (folder / BEFORE).is_file():
             raise
         state = load_tensors(folder / BEFORE)
-        warnings.warn(f"{error}; using the one before it, {BEFORE}, of step {state['num_timesteps']:,}", stacklevel=2)
+        warn_caller(f"{error}; using the one before it, {BEFORE}, of step {state['num_timesteps']:,}")
         return state
 
 

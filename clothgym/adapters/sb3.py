@@ -55,6 +55,8 @@ class ClothSB3VecEnv(VecEnv):
         super().__init__(
             env.num_envs, channels_first_space(env.task.observed.mode, env.single_observation_space), env.single_action_space
         )
+        # SB3's own has only render modes; its recorder of videos looks here for their rate
+        self.metadata = dict(env.metadata)
 
     def reset(self) -> Any:
         observation, _ = self.env.reset(seed=self._seed, options=self._next_options)

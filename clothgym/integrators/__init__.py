@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,6 +15,7 @@ from clothgym.integrators.rk4 import RK4
 from clothgym.integrators.semi_implicit_euler import SEMI_IMPLICIT_EULER
 from clothgym.integrators.verlet import VERLET
 from clothgym.integrators.xpbd import XPBD
+from clothgym.warning import warn_caller
 
 INTEGRATORS: dict[str, Integrator] = {
     method.name: method
@@ -42,7 +42,7 @@ def get(integrator: str | Mapping[str, Any] | Integrator) -> Integrator:
         for name in set(options) - set(method.options):
             others = [other.name for other in INTEGRATORS.values() if name in other.options]
             if others:
-                warnings.warn(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is ignored", stacklevel=3)
+                warn_caller(f"{method.name} has no option {name!r} ({', '.join(others)} has): it is ignored")
                 del options[name]
         return method.with_options(**options)
     known("integrator", integrator, INTEGRATORS)

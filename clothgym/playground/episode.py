@@ -89,7 +89,7 @@ class EpisodeStage(Stage):
         self.about = f"{(type(self.env).__doc__ or '').strip().splitlines()[0]}"
         s = task.simulation
         self._own = self.settings = settings_of(s, task.wind)
-        self.recording = Recording(self.env_id, s.mesh, s.time_step, task.camera(), (s.integrator.name,), task.strain_shown)
+        self.recording = Recording(self.env_id, s.mesh, task.step_seconds, task.camera(), (s.integrator.name,), task.strain_shown)
         self.reset()
 
     def _made(self) -> Any:
@@ -160,7 +160,7 @@ class EpisodeStage(Stage):
         self.played.append((before, action, float(reward)))
         self.info = info
         self._cost = time.perf_counter() - begun
-        self._time += self.simulation.time_step
+        self._time += self.env.task.step_seconds
         self.total += reward
         self._over = terminated or truncated
         if self._over:

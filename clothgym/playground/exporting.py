@@ -136,7 +136,7 @@ def export(
         ValueError, FileExistsError, ImportError: something that does not fit, said before anything is simulated.
         RuntimeError: the sheet has blown up; what came before is kept.
     """
-    path = Path(out)
+    path = Path(out).expanduser()
     if path.suffix not in ("", ".png", ".gif", ".mp4", ".glb"):
         raise ValueError(f"out={str(out)!r}: must end in .png, .gif, .mp4 or .glb, or be a folder (without an ending) for meshes")
     meshes = path.suffix in ("", ".glb")
@@ -151,10 +151,12 @@ def export(
         raise ImportError(f"out={str(out)!r}: a {path.suffix} needs {NEEDED[path.suffix]}: pip install 'clothgym[video]'")
     if seconds is not None:
         positive("seconds", seconds)
-    step = time_step_of(Gallery().checked(name))
-    rate = 1 / (step * stride_for(name, step, fps))
+    # a rate that there is not is said before anything is made
+    stride_for(name, time_step_of(Gallery().checked(name)), fps)
     stage = stage_named(name, seed, policy, settings)
     recording = stage.recording
+    # the actions of an environment may last longer than those of its id
+    rate = 1 / (recording.time_step * stride_for(name, recording.time_step, fps))
     if path.suffix == ".png" and seconds is not None:
         seconds += 1 / rate  # the first frame is at 0
     frames = moments(stage, seconds, fps, say)

@@ -24,6 +24,8 @@ from clothgym import files
 from clothgym.checks import one_of
 from clothgym.registration import checked_id
 
+__all__ = ["Policy", "available", "load", "read"]
+
 FOLDER = Path(__file__).parent
 KIND, VERSION = "policy", 1
 ADVICE = "name another file, or export it again from its run"

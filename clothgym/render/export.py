@@ -22,7 +22,7 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
         ValueError: another ending, or an array that is not an image.
         ImportError: pillow is missing.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.suffix != ".png":
         raise ValueError(f"picture path={str(path)!r}: must end in .png")
     image = np.asarray(image)
@@ -48,7 +48,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
         OSError: the disk is full, or the folder cannot be written; then nothing is kept.
         ImportError: pillow (for a gif) or imageio-ffmpeg (for an mp4) is missing.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"video path={str(path)!r}: must end in .gif or .mp4")
     if not (np.isfinite(fps) and fps > 0):

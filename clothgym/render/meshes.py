@@ -66,7 +66,7 @@ class MeshSequence:
         self, folder: str | Path, triangles: ArrayLike, uv: ArrayLike | None = None, kind: str = "obj", color: Color = CORAL
     ) -> None:
         one_of("mesh kind", kind, *KINDS)
-        self.folder, self.kind, self.written = Path(folder), kind, 0
+        self.folder, self.kind, self.written = Path(folder).expanduser(), kind, 0
         self._cloth = _checked_cloth(triangles, uv, color)
         without_frames(self.folder).mkdir(parents=True, exist_ok=True)
 
@@ -118,7 +118,7 @@ def write_animation(
     Raises:
         ValueError: another ending, positions that do not fit, or solids that change in number or kind on the way.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if path.suffix != ".glb":
         raise ValueError(f"animation path={str(path)!r}: must end in .glb")
     cloth = _checked_cloth(triangles, uv, color)

@@ -122,7 +122,7 @@ def record(name: str) -> Recorded:
         "seed": HELD_OUT,
         "options": options,
         "digest": about["digest"],
-        "time_step": stride * task.physics.time_step,
+        "time_step": stride * task.step_seconds,
         "shape": shape,
         "side": task.physics.side,
         "holes": holes,

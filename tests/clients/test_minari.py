@@ -1,4 +1,4 @@
-"""Minari records datasets of our environments, with their infos, and makes the environment again (pip install "minari[create]")."""
+"""Minari records datasets of our environments, with their infos, and makes the environment again (pip install "minari[hdf5]")."""
 
 import gymnasium as gym
 import numpy as np

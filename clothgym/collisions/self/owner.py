@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -29,6 +28,7 @@ from clothgym.contact_memory import (
 from clothgym.geometry.intersections import first_intersection
 from clothgym.mesh import ClothMesh
 from clothgym.state import Layout, State
+from clothgym.warning import warn_caller
 
 MODES = ("fast", "strict")
 REACH = 1.4  # how far a query sees, in thicknesses
@@ -228,11 +228,10 @@ class SelfCollision:
         new = np.flatnonzero(uncertain & ~self._reported)
         if len(new):
             self._reported[new] = True
-            warnings.warn(
+            warn_caller(
                 f"environment {new[0]}: in control step {steps[new[0]]} the sheet is more than {FARTHEST:g} m from the origin: "
                 f"{BEYOND}",
                 RuntimeWarning,
-                stacklevel=3,
             )
 
     def report(self) -> SelfContacts | None:

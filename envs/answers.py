@@ -1,0 +1,89 @@
+"""What a step has brought, as ``info``; and that it stands: an environment that is over gives its last answer until it is reset.
+
+An answer is whether and how the episode has ended, the record of info, and what the physics tells beside it.  What is of one step
+alone and is summed over an episode, the reward with its terms and a cost, is zero after the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.envs.episode import LAST, names_of
+
+if TYPE_CHECKING:
+    from clothgym.envs.task import Task
+    from clothgym.simulation import Simulation
+
+ENDS = ("terminated", "truncated", "failure")  # fields of ``Task.outcome``: whether and how an episode has ended
+COST = "cost"  # of a step, where a constraint is the task
+# what ``info_of_physics`` may tell beside the record of info
+PHYSICAL = (("self_contacts", np.int64), ("clamped_moves", np.int64), ("attachment_lag", np.float64))
+
+
+def info_of_physics(simulation: Simulation) -> dict[str, NDArray]:
+    """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
+    held lags behind [m]."""
+    limiting, contacts = simulation.limiting, simulation.self_contacts
+    info = {} if limiting is None else {"strain_before_limiting": limiting.before}
+    if contacts is not None:
+        info |= {"self_contacts": contacts.rows, "clamped_moves": contacts.clamped, "attachment_lag": contacts.lag}
+    return info
+
+
+def note_physics(task: Task, envs: NDArray) -> None:
+    """Write what the physics tells of these environments beside the record of info, or into it."""
+    for name, values in info_of_physics(task.simulation).items():
+        record = task.info if name in names_of(task.info) else task.physical
+        record[name][envs] = values[envs]
+
+
+@contextmanager
+def standing(task: Task) -> Iterator[None]:
+    """Within it a control step is made: the answers of environments that were over before it stand, and others are noted."""
+    over = task.episode["over"].copy()
+    # the usual case, at once
+    if not over.any():
+        yield
+        note_physics(task, task._everyone)
+        return
+    kept_info, kept_ends = task.info[over], {name: task.outcome[name][over] for name in ENDS}
+    yield
+    note_physics(task, np.flatnonzero(~over))
+    task.info[over] = kept_info
+    for name, values in kept_ends.items():
+        task.outcome[name][over] = values
+    # what is of one step alone
+    task.outcome["reward"][over], task.terms[over] = 0, np.zeros((), task.terms.dtype)
+    if COST in names_of(task.info):
+        task.info[COST][over] = 0
+
+
+def of_batch(task: Task) -> dict[str, Any]:
+    """Info of the last step of each environment, or of the reset since then: arrays over the batch, fresh copies."""
+    info: dict[str, Any] = {name: task.info[name].copy() for name in names_of(task.info)}
+    if task.simulation.self_collision is not None:
+        info |= {name: task.physical[name].copy() for name, _ in PHYSICAL}
+    info["failure"] = task.outcome["failure"].copy()
+    return info | {f"reward/{name}": task.terms[name].copy() for name in names_of(task.terms)}
+
+
+def of_one(task: Task, env: int) -> dict[str, Any]:
+    """The same of one environment, as plain Python values."""
+    info = dict(zip(names_of(task.info), task.info[env].item()))
+    if task.simulation.self_collision is not None:
+        info |= dict(zip(names_of(task.physical), task.physical[env].item()))
+    info["failure"] = task.outcome["failure"][env].item()
+    return info | {f"reward/{name}": value for name, value in zip(names_of(task.terms), task.terms[env].item())}
+
+
+def remembered(task: Task) -> dict[str, NDArray]:
+    """All of the answers that a state must hold, live, by name."""
+    own = {name: task.outcome[name] for name in ENDS}
+    for record in (task.info, task.physical):
+        own |= {LAST + name: record[name] for name in names_of(record)}
+    return own
