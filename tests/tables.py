@@ -37,7 +37,15 @@ def mesh_edge(radius=0.0, friction=0.3, thickness=0.001, half=0.3, resolution=12
     vertices = np.concatenate([np.insert(outline, 1, y, axis=1) for y in (-half, half)])
     sides = [t for a in range(n) for b in [(a + 1) % n] for t in ((a, a + n, b + n), (a, b + n, b))]
     caps = [t for a in range(1, n - 1) for t in ((0, a, a + 1), (n, n + a + 1, n + a))]
-    return [MeshCollider(vertices=vertices, triangles=sides + caps, friction=friction, thickness=thickness, resolution=resolution)]
+    return [
+        MeshCollider(
+            vertices=vertices,
+            triangles=np.array(sides + caps)[:, ::-1],
+            friction=friction,
+            thickness=thickness,
+            resolution=resolution,
+        )
+    ]
 
 
 def pull_of(friction, radius, on_table, length=SIDE):

@@ -36,7 +36,7 @@ resolve_sheet = placeholder("resolve_sheet", "of (r, s, m, triangles, shapes, co
 class Room(NamedTuple):
     """What contact of a block remembers until the next search, and its scratch.
 
-    touches: of each lane, (lanes, most, TOUCH_COLUMNS); which: triangle and solid of each, (lanes, most, 2); count: their number,
+    touches: of each lane, (lanes, most, TOUCH_COLUMNS); which: triangle and solid of each, (lanes, most, 2); number: how many,
     (lanes, 1).
     edges, pushes, counts: of each lane, see ``particle_contact.resolve_particles``.
     kept: impulses of triangles at solids [N s], (colliders, triangles, 3).  rows: (PARTICLE_ROWS, particles).  chosen: (2
@@ -48,7 +48,7 @@ class Room(NamedTuple):
 
     touches: NDArray
     which: NDArray
-    count: NDArray
+    number: NDArray
     edges: NDArray
     pushes: NDArray
     counts: NDArray
@@ -97,26 +97,26 @@ def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, carried, step, look
     h: the substep [s].  carried: time for which the velocity has already moved the positions [s].  step: of the control step,
     before which no touch has borne anything.  look_every: substeps after which touches are searched for again.
     """
-    touches, which, count = room.touches[lane], room.which[lane], room.count[lane]
+    touches, which, number = room.touches[lane], room.which[lane], room.number[lane]
     edges, pushes, counts = room.edges[lane], room.pushes[lane], room.counts[lane]
     # search for touches with all solids but planes, which touch particles first; those found again keep their impulses
     if step % look_every == 0:
         kept = room.kept
         kept[:] = 0
         if step > 0:
-            for n in range(count[0]):
+            for n in range(number[0]):
                 for e in range(3):
                     kept[which[n, 1], which[n, 0], e] = touches[n, T_IMPULSE + e]
-        count[0] = 0
+        number[0] = 0
         for k in range(shapes.kinds.shape[0]):
             counts[k] = 0
             if shapes.kinds[k] != KIND_PLANE:
                 search(
-                    r, triangles, shapes, k, colliders[k], touches, which, count, edges, pushes, counts, kept, room.rows,
+                    r, triangles, shapes, k, colliders[k], touches, which, number, edges, pushes, counts, kept, room.rows,
                     room.chosen, room.scratch,
                 )  # fmt: skip
     # touches follow, bear what lies on them, and are corrected
-    found = touches[: count[0]]
+    found = touches[: number[0]]
     follow_touches(r, triangles, colliders, found, which, room.scratch)
     bear_touches(r, s, m, triangles, found, which, carried)
     press_touches(r, s, m, triangles, colliders, found, which, h, carried)
@@ -179,7 +179,7 @@ def _resolve_lanes(x, v, w, triangles, shapes, colliders, h, carried, step, look
         any_near |= near[l]
         # what was found before the last search is not what is there now
         if not near[l] and step % look_every == 0:
-            room.count[l, 0] = 0
+            room.number[l, 0] = 0
             room.counts[l] = 0
     if not any_near:
         return
