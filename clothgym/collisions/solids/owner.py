@@ -22,6 +22,7 @@ from clothgym.collisions.solids.shapes import (
     check_rows,
 )
 from clothgym.collisions.solids.signed_distance import Shapes
+from clothgym.collisions.solids.touch_response import MOVED_ROWS, R_REMAINDER
 from clothgym.elements import SurfaceArrays
 from clothgym.state import Layout, State
 
@@ -32,7 +33,7 @@ class Solids:
     Attributes:
         colliders: as given.
         shapes: what all environments share.
-        rows, homes: numbers that kernels read, now and after a reset, (blocks, colliders, COLLIDER_ROWS, lanes).
+        rows, homes: numbers that kernels read, now and after a reset, (blocks, colliders, MOVED_ROWS, lanes).
     """
 
     def __init__(self, layout: Layout, colliders: Sequence[Collider], time_step: float, dtype: np.dtype) -> None:
@@ -42,8 +43,8 @@ class Solids:
         self.homes: NDArray
 
     def described(self) -> NDArray[np.float64]:
-        """Rows of the colliders as given, (colliders, COLLIDER_ROWS)."""
-        return np.array([c.rows() for c in self.colliders]).reshape(-1, COLLIDER_ROWS)
+        """Rows of the colliders as given, (colliders, MOVED_ROWS)."""
+        return _rows(self.colliders)
 
     def check(self, state: State) -> None:
         """Refuse numbers that no collider has, see ``check_rows``."""
@@ -66,7 +67,7 @@ class Solids:
     def replace(self, index: int, others: Sequence[Collider], block: NDArray, lane: NDArray) -> None:
         """Replace collider ``index`` by others of the same kind, one for each environment."""
         check_replacement(self.colliders, index, others, len(block))
-        self.rows[block, index, :, lane] = self.homes[block, index, :, lane] = np.array([c.rows() for c in others])
+        self.rows[block, index, :, lane] = self.homes[block, index, :, lane] = _rows(others)
 
     def move(self, index: int, targets: ArrayLike | None, velocities: ArrayLike | None, env: NDArray) -> None:
         """See ``Simulation.move_colliders``."""
@@ -78,7 +79,8 @@ class Solids:
         now = after
         if targets is not None:
             x = vectors("targets", targets, len(env))
-            now = (x - self.rows[block, index, R_POINT : R_POINT + 3, lane]) / self.time_step
+            point, remainder = (self.rows[block, index, first : first + 3, lane] for first in (R_POINT, R_REMAINDER))
+            now = (x - point - remainder) / self.time_step
         self.rows[block, index, R_VELOCITY : R_VELOCITY + 3, lane] = now
         self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 
@@ -99,6 +101,13 @@ class Solids:
         out = np.zeros((self.layout.blocks, self.layout.lanes), x.dtype)
         deepest(0, self.layout.blocks, x, surface.triangles, self.shapes, self.rows, out)
         return self.layout.to_public(out)
+
+
+def _rows(colliders: Sequence[Collider]) -> NDArray[np.float64]:
+    """Rows of colliders that are where they were put, (colliders, MOVED_ROWS)."""
+    rows = np.zeros((len(colliders), MOVED_ROWS))
+    rows[:, :COLLIDER_ROWS] = np.array([c.rows() for c in colliders]).reshape(-1, COLLIDER_ROWS)
+    return rows
 
 
 def _shapes(colliders: Sequence[Collider], dtype: np.dtype) -> Shapes:

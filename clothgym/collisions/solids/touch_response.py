@@ -18,7 +18,7 @@ import numpy as np
 from clothgym._jit import apart, inlined, kernel, uncounted
 from clothgym.collisions.solids.contact_law import FASTEST, RELAXED, touch_change
 from clothgym.collisions.solids.deepest_point import to_triangle
-from clothgym.collisions.solids.shapes import R_FRICTION, R_POINT, R_VELOCITY
+from clothgym.collisions.solids.shapes import COLLIDER_ROWS, R_FRICTION, R_POINT, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import S_CONTACT, S_CORE, S_CORNERS, S_RHO, S_SPOT, S_WEIGHTS
 
 # rows of a touch: three weights; offset of its plane from the solid's point along the normal; normal; impulse [N s]; the ball's
@@ -27,13 +27,25 @@ T_WEIGHTS, T_OFFSET, T_NORMAL, T_IMPULSE, T_CORE, T_RHO = 0, 3, 4, 7, 10, 13
 TOUCH_ROWS = 14
 
 
+# behind a collider's rows: what its position could not hold [m]
+R_REMAINDER = COLLIDER_ROWS
+MOVED_ROWS = COLLIDER_ROWS + 3
+
+
 @kernel
 def move_solids(colliders, h):
-    """Move each solid by its velocity for a substep h [s]; colliders: rows, (colliders, COLLIDER_ROWS, lanes)."""
+    """Move each solid by its velocity for a substep h [s], with compensated summation (see ``integrators.base``).
+
+    colliders: rows, (colliders, MOVED_ROWS, lanes).
+    """
     for k in range(colliders.shape[0]):
         for c in range(3):
             for l in range(colliders.shape[2]):
-                colliders[k, R_POINT + c, l] += h * colliders[k, R_VELOCITY + c, l]
+                point = colliders[k, R_POINT + c, l]
+                change = h * colliders[k, R_VELOCITY + c, l] + colliders[k, R_REMAINDER + c, l]
+                now = point + change
+                colliders[k, R_REMAINDER + c, l] = change - (now - point)
+                colliders[k, R_POINT + c, l] = now
 
 
 @inlined
