@@ -8,11 +8,11 @@ of the chosen model:
     add_bend_products(x, p, y, elements, scale, scratch)
         ``y <- y + scale K p``, with K their stiffness matrix for a rigidity of 1, without the part that could make it indefinite.
         scale: the rigidity times a factor of the caller's, (lanes,).  p, y: (3, particles, lanes).
-    project_bends(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch)
-        one Gauss-Seidel pass of extended position-based dynamics over the hinges, in place; the equations are in
-        ``integrators.xpbd``.  start: positions at the start of the substep.  inverse_alpha_tilde: ``1/alpha~ = B h^2``, (lanes,).
-        gamma: ``tau/h``, (lanes,).  relaxation: share of each correction that is applied.  lam: the multipliers, (hinges, 3,
-        lanes), updated; or (0, 3, lanes) for a single pass, which needs none.
+    project_bends(y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation, lam, scratch)
+        one Gauss-Seidel pass of extended position-based dynamics over the hinges, which changes velocities u; the equations, y and
+        u are those of ``integrators.xpbd``.  inverse_alpha_tilde: ``1/alpha~ = B h^2``, (lanes,).  gamma: ``tau/h``, (lanes,).
+        relaxation: share of each correction that is applied.  lam: the multipliers, (hinges, 3, lanes), updated; or (0, 3, lanes)
+        for a single pass, which needs none.
 
 In all of them x [m] and v [m/s] are (3, particles, lanes), and w [1/kg] is (particles, lanes).  ``elements``, ``elastic``,
 ``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles are adjacent in memory the same forces are in
@@ -46,7 +46,7 @@ add_bend_products = placeholder(
 )
 project_bends = placeholder(
     "project_bends",
-    "of (x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch): moves particles towards the hinges' rest",
+    "of (y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation, lam, scratch): changes velocities towards the hinges' rest",
 )
 
 
@@ -64,8 +64,8 @@ def add_no_products(x, p, y, elements, scale, scratch):
 
 
 @kernel
-def project_nothing(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
-    """Moves nothing."""
+def project_nothing(y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+    """Changes nothing."""
 
 
 # --- quadratic: isometric bending, Bergou et al. 2006 -------------------------------------------------------------------
@@ -122,44 +122,40 @@ def add_quadratic_products(x, p, y, elements, scale, scratch):
 
 
 @kernel
-def project_quadratic(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+def project_quadratic(y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
     """One pass over the hinges with the constraint ``C = sum_i q_i x_i``, a vector: ``grad_i C = q_i`` in each component.
 
-    C is linear, so one projection solves it exactly.  Equations as in ``integrators.xpbd``, over alpha~, with its signs.
+    C is linear, so one projection solves it exactly.  Equations as in ``integrators.xpbd``, over alpha~ and h, with its signs.
     """
     members, _, _, curves = bends
-    one = x.dtype.type(1)
-    curve, before, inverse = scratch.rows[0], scratch.rows[1], scratch.rows[2]
+    one, zero = y.dtype.type(1), y.dtype.type(0)
+    curve, rate, inverse = scratch.rows[0], scratch.rows[1], scratch.rows[2]
     keeps = lam.shape[0] > 0
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         q = curves[s]
         a, b, c, d = w[i], w[j], w[k], w[m]
         # one over the denominator, the same for all components; mobility: sum_i w_i |grad_i C|^2
-        for l in range(x.shape[2]):
+        for l in range(y.shape[2]):
             mobility = q[0] * q[0] * a[l] + q[1] * q[1] * b[l] + q[2] * q[2] * c[l] + q[3] * q[3] * d[l]
             inverse[l] = one / (inverse_alpha_tilde[l] * (one + gamma[l]) * mobility + one)
         for e in range(3):
-            # C now, and at the start of the substep
-            xe, se = x[e], start[e]
-            _combine(xe[i], xe[j], xe[k], xe[m], q, curve)
-            _combine(se[i], se[j], se[k], se[m], q, before)
+            # C/h at the start of the substep, and how it has changed
+            ye, ue = y[e], u[e]
+            _combine(ye[i], ye[j], ye[k], ye[m], q, curve)
+            _combine(ue[i], ue[j], ue[k], ue[m], q, rate)
             # delta lambda, in place of C
+            for l in range(y.shape[2]):
+                error = inverse_alpha_tilde[l] * (curve[l] + (one + gamma[l]) * rate[l])
+                curve[l] = (error - (lam[s, e, l] if keeps else zero)) * inverse[l]
             if keeps:
-                own_lam = lam[s, e]
-                for l in range(x.shape[2]):
-                    error = inverse_alpha_tilde[l] * (curve[l] + gamma[l] * (curve[l] - before[l]))
-                    curve[l] = (error - own_lam[l]) * inverse[l]
-                    own_lam[l] += curve[l]
-            else:
-                for l in range(x.shape[2]):
-                    error = inverse_alpha_tilde[l] * (curve[l] + gamma[l] * (curve[l] - before[l]))
-                    curve[l] = error * inverse[l]
-            # x_i <- x_i + w_i grad_i C delta lambda
+                for l in range(y.shape[2]):
+                    lam[s, e, l] += curve[l]
+            # u_i <- u_i + w_i grad_i C delta lambda
             for n in range(4):
-                xn, wn = xe[members[s, n]], w[members[s, n]]
-                for l in range(x.shape[2]):
-                    xn[l] -= relaxation * wn[l] * q[n] * curve[l]
+                un, wn = ue[members[s, n]], w[members[s, n]]
+                for l in range(y.shape[2]):
+                    un[l] -= relaxation * wn[l] * q[n] * curve[l]
 
 
 # --- hinge: the angle between triangles, Grinspun et al. 2003 -----------------------------------------------------------
@@ -280,9 +276,9 @@ def hinge_rates(pi, pj, pk, pm, s, out):
 
 @inlined
 def hinge_rows(scratch, lanes):
-    """The parts of ``Scratch.rows`` that hinges use: angle, rate, slopes (12, lanes), geometry (11, lanes), and two more rows."""
+    """Parts of ``Scratch.rows`` for hinges: angle, rate, slopes (12, lanes), geometry (11, lanes), a row, corners (12, lanes)."""
     rows = scratch.reshape(scratch.size)[: WORK_ROWS * lanes].reshape((WORK_ROWS, lanes))
-    return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26]
+    return rows[0], rows[1], rows[2:14], rows[14:25], rows[25], rows[26:38]
 
 
 @inlined
@@ -340,46 +336,50 @@ def add_hinge_products(x, p, y, elements, scale, scratch):
 
 
 @kernel
-def project_hinges(x, start, w, bends, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
+def project_hinges(y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation, lam, scratch):
     """One pass over the hinges with the constraint ``C = theta - theta_0``; equations as in ``integrators.xpbd``, over alpha~.
 
-    A hinge of weight s has ``1/alpha~ = s B h^2``.  Signs as in the code there.
+    A hinge of weight s has ``1/alpha~ = s B h^2``.  Signs as in the code there.  Angles are the same for lengths over h; their
+    slopes are h times those of ``hinge_angles``.
     """
     members, weight, rest_angle, _ = bends
-    one = x.dtype.type(1)
-    angle, rate, slopes, geometry, before, mobility = hinge_rows(scratch.rows, x.shape[2])
+    one, zero, per_square = y.dtype.type(1), y.dtype.type(0), y.dtype.type(1) / (h * h)
+    angle, rate, slopes, geometry, mobility, places = hinge_rows(scratch.rows, y.shape[2])
     keeps = lam.shape[0] > 0
     for s in range(members.shape[0]):
-        # theta and grad theta, and grad C . x now and at the start of the substep
+        # the corners at the end of the substep, as seen from the first: small numbers
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
-        hinge_angles(_at(x, i), _at(x, j), _at(x, k), _at(x, m), angle, slopes, geometry)
-        hinge_rates(_at(x, i), _at(x, j), _at(x, k), _at(x, m), slopes, rate)
-        hinge_rates(_at(start, i), _at(start, j), _at(start, k), _at(start, m), slopes, before)
-        # sum_i w_i |grad_i C|^2
+        for row in range(12):
+            e, p = row % 3, members[s, row // 3]
+            for l in range(y.shape[2]):
+                places[row, l] = (y[e, p, l] - y[e, i, l]) + (u[e, p, l] - u[e, i, l])
+        # theta, grad theta, and grad C . (x - x^n)
+        hinge_angles(places[:3], places[3:6], places[6:9], places[9:], angle, slopes, geometry)
+        hinge_rates(_at(u, i), _at(u, j), _at(u, k), _at(u, m), slopes, rate)
+        # sum_i w_i |grad_i C|^2 h^2
         mobility[:] = 0
         for corner in range(4):
             wm = w[members[s, corner]]
             for e in range(3):
                 slope = slopes[3 * corner + e]
-                for l in range(x.shape[2]):
+                for l in range(y.shape[2]):
                     mobility[l] += wm[l] * slope[l] * slope[l]
         # delta lambda, in place of the angle
         share, rest = weight[s], rest_angle[s]
-        for l in range(x.shape[2]):
+        for l in range(y.shape[2]):
             stiff = share * inverse_alpha_tilde[l]
-            error = stiff * (angle[l] - rest + gamma[l] * (rate[l] - before[l]))
-            own_lam = lam[s, 0, l] if keeps else x.dtype.type(0)
-            angle[l] = (error - own_lam) / (stiff * (one + gamma[l]) * mobility[l] + one)
+            error = stiff * (angle[l] - rest + gamma[l] * rate[l])
+            angle[l] = (error - (lam[s, 0, l] if keeps else zero)) / (stiff * per_square * (one + gamma[l]) * mobility[l] + one)
         if keeps:
-            for l in range(x.shape[2]):
+            for l in range(y.shape[2]):
                 lam[s, 0, l] += angle[l]
-        # x_i <- x_i + w_i grad_i C delta lambda
+        # u_i <- u_i + w_i grad_i C delta lambda/h
         for corner in range(4):
             wm = w[members[s, corner]]
             for e in range(3):
-                xe, slope = x[e, members[s, corner]], slopes[3 * corner + e]
-                for l in range(x.shape[2]):
-                    xe[l] -= relaxation * wm[l] * slope[l] * angle[l]
+                ue, slope = u[e, members[s, corner]], slopes[3 * corner + e]
+                for l in range(y.shape[2]):
+                    ue[l] -= relaxation * wm[l] * slope[l] * (angle[l] * per_square)
 
 
 # --- the table ----------------------------------------------------------------------------------------------------------

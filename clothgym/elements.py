@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from clothgym._jit import kernel
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
-WORK_ROWS = 27  # of ``Scratch.rows``
+WORK_ROWS = 38  # of ``Scratch.rows``
 ALIKE = 1e-6  # relative difference up to which the springs of a kind count as equally long
 # kinds of springs on a grid, with the rows and columns from the first end to the second
 KINDS = ((STRUCTURAL_X, 0, 1), (STRUCTURAL_Y, 1, 0), (SHEAR, 1, 1), (SHEAR, 1, -1), (BEND_X, 0, 2), (BEND_Y, 2, 0))

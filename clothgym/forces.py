@@ -24,6 +24,9 @@ TINY = 1e-30  # added to a spring's squared length [m^2]: a spring of length zer
 add_spring_forces = placeholder(
     "add_spring_forces", "of (x, v, f, elements, elastic, scratch): adds the springs' and their dampers' forces to f [N]"
 )
+set_spring_forces = placeholder(
+    "set_spring_forces", "of (x, v, start, f, elements, elastic, scratch): sets f to start and those forces [N]"
+)
 add_spring_products = placeholder(
     "add_spring_products",
     "of (x, p, y, elements, along, across, bend, scratch): adds the springs' stiffness matrix times p to y",
@@ -82,6 +85,20 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
             x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], v0[i], v1[i], v2[i], v0[j], v1[j], v2[j], stiffness[kind[s]], weight[s],
             rest_length[s], damping_time, f0[i], f1[i], f2[i], f0[j], f1[j], f2[j],
         )  # fmt: skip
+
+
+@uncounted
+def set_lane_forces(x, v, start, f, elements, elastic, scratch):
+    """``f`` is ``start`` plus the forces of ``add_lane_forces`` [N]; start, f: (3, particles, lanes)."""
+    _copy(start.reshape(f.size), f.reshape(f.size))
+    add_lane_forces(x, v, f, elements, elastic, scratch)
+
+
+@disjoint
+def _copy(start, f):
+    """``f <- start``, flat arrays."""
+    for e in range(f.shape[0]):
+        f[e] = start[e]
 
 
 @kernel

@@ -23,7 +23,7 @@ from clothgym.elements import Elastic
 from clothgym.forces import add_air_forces
 from clothgym.grid_forces import kernels_of
 from clothgym.guards import mark_diverged
-from clothgym.integrators.base import room_for_work
+from clothgym.integrators.base import Work, room_for_work
 
 # of the integrator, see ``integrators.base``
 substep = placeholder("substep", "of an integrator: moves a block on by h [s] under springs, bending, gravity, drag and push")
@@ -42,11 +42,15 @@ room_for_contact = placeholder("room_for_contact", "of (x, triangles, shapes): m
 
 class Motion(NamedTuple):
     """Positions x [m] and velocities v [m/s], (blocks, 3, particles, lanes), and inverse masses w, zero where something is held
-    [1/kg], (blocks, particles, lanes)."""
+    [1/kg], (blocks, particles, lanes).
+
+    remainders: what positions and velocities could not hold, see ``integrators.base``, (blocks, 2, 3, particles, lanes).
+    """
 
     x: NDArray
     v: NDArray
     w: NDArray
+    remainders: NDArray
 
 
 class Schedule(NamedTuple):
@@ -95,10 +99,11 @@ def room_for_block(x, offset, room, triangles, shapes):
 def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, room):
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
-    work, push, touches = room
+    (fields, of_springs, of_bends, scratch), push, touches = room
     shapes = solids.shapes
     for b in range(first, last):
         x, v, w, colliders, limited = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.limited[b]
+        work = Work(fields, of_springs, of_bends, scratch, motion.remainders[b])
         elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b])
         drag_rate, resistance, gravity, wind = fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b]
         push[:] = 0

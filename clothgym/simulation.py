@@ -188,7 +188,7 @@ class Simulation(Observed):
         chosen = None if envs is None else self.layout.alone(envs, self.integrator.name)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
-        motion, outcome = Motion(self._x, self._v, self._w), Outcome(self._limited, self._diverged)
+        motion, outcome = Motion(self._x, self._v, self._w, self._remainders), Outcome(self._limited, self._diverged)
         solids = Solid(self._solids.shapes, self._solids.rows)
 
         def work(first: int, last: int) -> None:
@@ -316,13 +316,12 @@ class Simulation(Observed):
         """Put environments back, see ``reset``, to what ``checked_start`` has returned."""
         self.turn.begin(env.tolist())
         block, lane = self.layout.at(env)
-        self._x[block, :, :, lane] = np.swapaxes(x, 1, 2)
-        self._v[block, :, :, lane] = np.swapaxes(v, 1, 2)
+        self._x[block, :, :, lane], self._v[block, :, :, lane] = np.swapaxes(x, 1, 2), np.swapaxes(v, 1, 2)
+        self._remainders[block, ..., lane] = 0
         self._solids.begin(block, lane)
         self._attachments.begin(block, lane, x)
         self._steps[env] = 0
-        self._diverged[block, lane] = False
-        self._limited[block, :, lane] = 0
+        self._diverged[block, lane], self._limited[block, :, lane] = False, 0
         self._reported[env] = False
         self._apply_masses(block, lane)
         self._contact.begin(block, lane, self._x)
@@ -386,6 +385,7 @@ class Simulation(Observed):
         return State(
             positions=self.positions,
             velocities=self.velocities,
+            remainders=public(self._remainders),
             free_inverse_mass=public(self._free_w),
             **self._attachments.public(),
             **{name: public(value) for name, value in self._fabric._asdict().items()},
@@ -421,7 +421,7 @@ class Simulation(Observed):
         blocks, dtype = self.layout.to_blocks, self.dtype
         self._x = self.layout.vectors_to_blocks(state.positions, dtype)
         self._v = self.layout.vectors_to_blocks(state.velocities, dtype)
-        self._free_w = blocks(state.free_inverse_mass, dtype)
+        self._remainders, self._free_w = blocks(state.remainders, dtype), blocks(state.free_inverse_mass, dtype)
         self._attachments.restore(state)
         self._solids.restore(state)
         self._fabric = Fabric(*(blocks(getattr(state, name), dtype) for name in Fabric._fields))

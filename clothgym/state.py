@@ -27,12 +27,13 @@ from clothgym.mesh import NUM_KINDS, ClothMesh
 
 # lanes in a block: wide enough to hide the loop's overhead, narrow enough that a 25 x 25 sheet stays near the L2 cache
 WIDEST_BLOCK = 128
-VERSION = 1  # of the format of files
+VERSION = 2  # of the format of files
 # least and greatest values in a state; all others lie within LARGEST
 NOT_NEGATIVE = ("free_inverse_mass", "stiffness", "rigidity", "damping_time", "drag_rate", "resistance", "parameters")
 RANGES: dict[str, tuple[float, float]] = {name: (0, LARGEST) for name in NOT_NEGATIVE}
 RANGES |= {"openings": (0, 1), "wanted_openings": (0, 1), "steps": (0, 2**62)}
-MAY_DIVERGE = ("positions", "velocities", "attachment_positions", "attachment_targets")  # with an environment; a reset mends them
+# diverge with an environment; a reset mends them
+MAY_DIVERGE = ("positions", "velocities", "remainders", "attachment_positions", "attachment_targets")
 VECTOR = 16  # float32 lanes of the widest vector unit in use; blocks are padded to a multiple of it
 
 
@@ -176,6 +177,7 @@ class State:
 
     Attributes (first axis is the environment unless said):
         positions, velocities: [m], [m/s], (num_envs, particles, 3).
+        remainders: what positions and velocities could not hold, see ``integrators.base``, (num_envs, 2, 3, particles).
         free_inverse_mass: inverse masses were nothing held [1/kg], (num_envs, particles).
         anchors: the anchored particles, (num_envs, anchors).
         holder: which attachment holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
@@ -193,6 +195,7 @@ class State:
 
     positions: NDArray
     velocities: NDArray
+    remainders: NDArray
     free_inverse_mass: NDArray
     anchors: NDArray
     holder: NDArray
@@ -324,6 +327,7 @@ def at_rest(
     return State(
         positions=each(mesh.rest_positions),
         velocities=np.zeros((num_envs, mesh.num_particles, 3)),
+        remainders=np.zeros((num_envs, 2, 3, mesh.num_particles)),
         free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
         anchors=each(anchors),
         holder=np.full((num_envs, mesh.num_particles), -1, np.int32),

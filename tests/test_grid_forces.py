@@ -8,15 +8,16 @@ import pytest
 from clothgym import Material, Simulation, disc, grid
 from clothgym.bending import BENDING, add_hinge_forces, add_hinge_products, add_quadratic_forces, add_quadratic_products
 from clothgym.elements import KINDS, Elastic, element_arrays, grid_of, grid_surface_of, is_regular, room_for_forces, surface_arrays
-from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products
+from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products, set_lane_forces
 from clothgym.grid_forces import (
     add_grid_air_forces,
     add_grid_forces,
     add_grid_hinge_forces,
     add_grid_hinge_products,
     add_grid_products,
+    set_grid_forces,
 )
-from clothgym.integrators.base import advance_velocities
+from clothgym.integrators.base import Work, advance_velocities, kick_and_drift, room_for_work
 
 SHAPES = [(2, 2), (2, 3), (5, 2), (4, 7), (9, 9)]
 STIFFNESS = np.array([210, 190, 0, 90, 3, 2, 0.0])
@@ -124,11 +125,38 @@ def test_springs_of_no_length_leave_their_neighbors_alone():
     assert np.isfinite(f).all()
 
 
-def test_held_particles_keep_their_velocity():
-    v, w = np.ones((3, 5, 1), np.float32), np.array([1, 0, 1, 0, 1], np.float32)[:, None]
-    f, gravity = np.full((3, 5, 1), 2, np.float32), np.full((3, 1), 4, np.float32)
-    advance_velocities(v, w, f, gravity, np.full(1, 1, np.float32), np.float32(0.5))
-    assert np.allclose(v[:, [0, 2, 4]], (1 + 0.5 * (2 + 4)) / 1.5) and np.array_equal(v[:, [1, 3]], np.ones((3, 2, 1)))
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_held_particles_keep_their_velocity(lanes):
+    v, w = np.ones((3, 5, lanes), np.float32), np.repeat(np.array([1, 0, 1, 0, 1], np.float32)[:, None], lanes, 1)
+    f, gravity = np.full((3, 5, lanes), 2, np.float32), np.full((3, lanes), 4, np.float32)
+    work = Work(*room_for_work(v, np.zeros(0, np.int64), (1, 0, 0)), np.zeros((2, 3, 5, lanes), np.float32))
+    x, also = np.zeros_like(v), v.copy()
+    advance_velocities(v, w, f, gravity, np.full(lanes, 1, np.float32), np.float32(0.5), work)
+    assert np.allclose(v[:, [0, 2, 4]], (1 + 0.5 * (2 + 4)) / 1.5) and np.array_equal(v[:, [1, 3]], np.ones((3, 2, lanes)))
+    work.remainders[:] = 0
+    kick_and_drift(x, also, w, f, gravity, np.full(lanes, 1, np.float32), np.float32(0.5), work, np.float32(1), np.float32(2))
+    assert np.array_equal(also, v) and np.array_equal(x, 2 * v)
+
+
+@pytest.mark.parametrize("bending", ["springs", "quadratic"])
+def test_forces_begin_with_what_they_are_given(bending):
+    """The bits of adding to it: on a grid by kinds, and on one lane and several, spring by spring."""
+    mesh = grid(5, 6, 0.3, 0.4)
+    x, v, _ = thrown(mesh, np.float32)
+    start = np.random.default_rng(1).normal(size=x.shape).astype(np.float32)
+    elements = grid_of(mesh, np.dtype(np.float32), bending)
+    added, set_to = start.copy(), np.full_like(start, np.nan)
+    add_grid_forces(x, v, added, elements, properties(np.float32), room_for_forces(x, elements.offset))
+    set_grid_forces(x, v, start, set_to, elements, properties(np.float32), room_for_forces(x, elements.offset))
+    assert np.array_equal(added.view(np.uint32), set_to.view(np.uint32))
+    single = element_arrays(mesh, np.dtype(np.float32), False, True)
+    for lanes in (1, 4):
+        elastic = Elastic(*(np.repeat(part, lanes, -1) for part in properties(np.float32)))
+        x_l, v_l, start_l = (np.repeat(a, lanes, 2) for a in (x, v, start))
+        added, set_to = start_l.copy(), np.full_like(start_l, np.nan)
+        add_lane_forces(x_l, v_l, added, single, elastic, room_for_forces(x_l, np.zeros(0, np.int64)))
+        set_lane_forces(x_l, v_l, start_l, set_to, single, elastic, room_for_forces(x_l, np.zeros(0, np.int64)))
+        assert np.array_equal(added, set_to)
 
 
 def test_only_regular_grids_go_by_kinds():

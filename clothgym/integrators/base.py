@@ -7,15 +7,20 @@ To add one, write a file whose last function is its whole substep, a kernel with
 on one block of lanes, and describe it by an ``Integrator``.  The substep advances positions ``x`` [m] and velocities ``v``
 [m/s], (3, particles, lanes), by ``h`` [s].
 
+In float32 the changes of a small substep are no larger than the last bit of x and v, and rounding would lose or double them, with
+the same sign in thousands of substeps.  So sums over substeps are compensated (Kahan 1965): what x and v could not hold is kept in
+``work.remainders``, and is a part of the next change.  ``advance`` and ``change_velocities`` do so.  A velocity must not be derived
+from a difference of positions: their rounding over h is no small velocity.
+
 * ``w``: inverse masses [1/kg], (particles, lanes).  A particle with ``w = 0`` is held: it keeps its velocity, and moves with it.
-* ``elements``, ``elastic``: an ``elements.Elements`` and the block's ``elements.Elastic``.  Import ``add_spring_forces`` and
-  ``add_spring_products`` from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and ``project_bends`` from ``bending``.
-  ``_jit.specialize`` replaces them with those of the chosen bending model and memory layout.
+* ``elements``, ``elastic``: an ``elements.Elements`` and the block's ``elements.Elastic``.  Import ``set_spring_forces``,
+  ``add_spring_forces`` and ``add_spring_products`` from ``forces``, and ``add_bend_forces``, ``add_bend_products`` and
+  ``project_bends`` from ``bending``.  ``_jit.specialize`` replaces them with those of the chosen bending model and memory layout.
 * ``drag_rate`` [1/s], (lanes,).  ``gravity`` [m/s^2], (3, lanes).
 * ``push``: external forces [N], (3, particles, lanes), such as the air's.  They change slowly compared with the springs' forces.
   Read only.
 * ``options``: the values of ``Integrator.options``, in that order.  ``plan``: what ``Integrator.prepare`` returned.
-* ``work``: a ``Work``.  Its content is lost when the substep ends.
+* ``work``: a ``Work``.  Its content is lost when the substep ends, but for the remainders.
 
 The simulation resolves contact after each substep, on the positions and velocities that the substep leaves.
 """
@@ -30,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.checks import count, number
 from clothgym.elements import Scratch, room_for_forces
 from clothgym.forces import Oscillators
@@ -43,13 +48,15 @@ class Work(NamedTuple):
     """Scratch of a substep.
 
     fields: arrays of the positions' shape, (fields, 3, particles, lanes).  of_springs, of_bends: Lagrange multipliers, (springs,
-    lanes) and (hinges, 3, lanes); empty for methods without them.  scratch: for the forces of elements.
+    lanes) and (hinges, 3, lanes); empty for methods without them.  scratch: for the forces of elements.  remainders: what
+    positions [m] and velocities [m/s] could not hold, not scratch but a part of the state, (2, 3, particles, lanes).
     """
 
     fields: NDArray
     of_springs: NDArray
     of_bends: NDArray
     scratch: Scratch
+    remainders: NDArray
 
 
 class Preparation(NamedTuple):
@@ -154,10 +161,13 @@ def _rebuilt(attributes: dict[str, Any]) -> Integrator:
 
 @kernel
 def room_for_work(x, offset, room):
-    """The ``Work`` of one block with positions ``x``; offset: see ``elements.room_for_forces``; room: see ``Integrator.room``."""
+    """The scratch of a ``Work`` of one block with positions ``x``, in its order.
+
+    offset: see ``elements.room_for_forces``.  room: see ``Integrator.room``.
+    """
     _, particles, lanes = x.shape
     fields, springs, bends = room
-    return Work(
+    return (
         np.empty((fields, 3, particles, lanes), x.dtype),
         np.empty((springs, lanes), x.dtype),
         np.empty((bends, 3, lanes), x.dtype),
@@ -166,79 +176,147 @@ def room_for_work(x, offset, room):
 
 
 @disjoint
-def _gain(v, w, f, g, keep, h):
-    """``v <- (v + h (f w + g)) keep`` for the free particles of one sheet; v, w, f: one component each, (particles,)."""
-    zero, one = v.dtype.type(0), v.dtype.type(1)
+def _change(v, w, f, remainder, g, share, loss):
+    """One component of ``change_velocities`` for one sheet: v, w, f, remainder (particles,); g, share and loss are numbers."""
+    zero = v.dtype.type(0)
     for p in range(v.shape[0]):
-        # choose between factors, not between results: that would be a masked store, which is slow on many processors
-        gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
-        v[p] = (v[p] + gain) * share
-
-
-@kernel
-def advance_velocities(v, w, f, gravity, drag_rate, h):
-    """``v <- (v + h (w f + g)) / (1 + h b)``: forces, gravity g, and linear drag of rate b, which is implicit.
-
-    Held particles keep their velocity.  v [m/s] and f [N]: (3, particles, lanes).
-    """
-    one, zero = v.dtype.type(1), v.dtype.type(0)
-    particles, lanes = v.shape[1], v.shape[2]
-    for c in range(3):
-        vc, fc = v[c].reshape(particles * lanes), f[c].reshape(particles * lanes)
-        if lanes == 1:
-            _gain(vc, w.reshape(particles), fc, gravity[c, 0], one / (one + h * drag_rate[0]), h)
-            continue
-        for p in range(particles):
-            for l in range(lanes):
-                free = (v[c, p, l] + h * (f[c, p, l] * w[p, l] + gravity[c, l])) * (one / (one + h * drag_rate[l]))
-                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
+        change = share * (f[p] * w[p] + g) - loss * v[p] + remainder[p]
+        # choose between changes, not between results: that would be a masked store, which is slow on many processors
+        change = change if w[p] > zero else zero
+        now = v[p] + change
+        remainder[p] = change - (now - v[p])
+        v[p] = now
 
 
 @disjoint
-def _fall(v, w, f, g, keep, h):
-    """``v <- v keep + h (f w + g)`` for the free particles of one sheet; v, w, f: one component each, (particles,)."""
-    zero, one = v.dtype.type(0), v.dtype.type(1)
-    for p in range(v.shape[0]):
-        gain, share = (h * (f[p] * w[p] + g), keep) if w[p] > zero else (zero, one)
-        v[p] = v[p] * share + gain
+def _change_in_lanes(v, w, f, remainder, g, share, loss):
+    """``_change`` of one particle: all arrays (lanes,)."""
+    zero = v.dtype.type(0)
+    for l in range(v.shape[0]):
+        change = share[l] * (f[l] * w[l] + g[l]) - loss[l] * v[l] + remainder[l]
+        change = change if w[l] > zero else zero
+        now = v[l] + change
+        remainder[l] = change - (now - v[l])
+        v[l] = now
 
 
-@kernel
-def predict_velocities(v, w, push, gravity, drag_rate, h):
+@uncounted
+def change_velocities(v, w, f, gravity, drag_rate, h, work, of_force, of_drag):
+    """``v <- v + h (w f + g)/(1 + of_force h b) - h b v/(1 + of_drag h b)``, compensated: forces, gravity g, and drag of rate b.
+
+    Held particles keep their velocity.  v [m/s] and f [N]: (3, particles, lanes).  of_force, of_drag: how implicit the drag is,
+    numbers from 0 to 1.
+    """
+    one = v.dtype.type(1)
+    particles, lanes = v.shape[1], v.shape[2]
+    remainder, share, loss = work.remainders[1], work.scratch.rows[0], work.scratch.rows[1]
+    for l in range(lanes):
+        share[l] = h / (one + of_force * h * drag_rate[l])
+        loss[l] = h * drag_rate[l] / (one + of_drag * h * drag_rate[l])
+    for c in range(3):
+        vc, fc, rc, gc = v[c], f[c], remainder[c], gravity[c]
+        if lanes == 1:
+            flat = particles
+            _change(vc.reshape(flat), w.reshape(flat), fc.reshape(flat), rc.reshape(flat), gc[0], share[0], loss[0])
+            continue
+        for p in range(particles):
+            _change_in_lanes(vc[p], w[p], fc[p], rc[p], gc, share, loss)
+
+
+@uncounted
+def advance_velocities(v, w, f, gravity, drag_rate, h, work):
+    """``v <- (v + h (w f + g)) / (1 + h b)``: the drag of rate b is implicit; see ``change_velocities``."""
+    one = v.dtype.type(1)
+    change_velocities(v, w, f, gravity, drag_rate, h, work, one, one)
+
+
+@uncounted
+def predict_velocities(v, w, push, gravity, drag_rate, h, work):
     """``v <- v/(1 + h b) + h (w push + g)``: the velocities of free particles without springs and bending.
 
     The drag of rate b acts on the old velocity only.  So implicit methods come to rest where the forces balance, whatever the
-    substep is.  v [m/s] and push [N]: (3, particles, lanes).
+    substep is.  push: [N], see ``change_velocities``.
     """
-    one, zero = v.dtype.type(1), v.dtype.type(0)
-    particles, lanes = v.shape[1], v.shape[2]
-    for c in range(3):
-        vc, fc = v[c].reshape(particles * lanes), push[c].reshape(particles * lanes)
-        if lanes == 1:
-            _fall(vc, w.reshape(particles), fc, gravity[c, 0], one / (one + h * drag_rate[0]), h)
-            continue
-        for p in range(particles):
-            for l in range(lanes):
-                free = v[c, p, l] * (one / (one + h * drag_rate[l])) + h * (push[c, p, l] * w[p, l] + gravity[c, l])
-                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
-
-
-@kernel
-def advance_positions(x, v, h):
-    """``x <- x + h v``, for held particles too; (3, particles, lanes)."""
-    _advance(x.reshape(x.size), v.reshape(v.size), h)
+    one = v.dtype.type(1)
+    change_velocities(v, w, push, gravity, drag_rate, h, work, one - one, one)
 
 
 @disjoint
-def _advance(x, v, h):
-    """``advance_positions`` on flat arrays."""
+def _kick_one(x, v, w, f, rx, rv, g, share, loss, reach):
+    """One component of ``kick_and_drift`` for one sheet: arrays (particles,); g, share and loss are numbers."""
+    zero = v.dtype.type(0)
+    for p in range(v.shape[0]):
+        change = share * (f[p] * w[p] + g) - loss * v[p] + rv[p]
+        change = change if w[p] > zero else zero
+        now = v[p] + change
+        rv[p] = change - (now - v[p])
+        v[p] = now
+        change = reach * now + rx[p]
+        there = x[p] + change
+        rx[p] = change - (there - x[p])
+        x[p] = there
+
+
+@disjoint
+def _kick_in_lanes(x, v, w, f, rx, rv, g, share, loss, reach):
+    """``_kick_one`` of one particle: all arrays (lanes,)."""
+    zero = v.dtype.type(0)
+    for l in range(v.shape[0]):
+        change = share[l] * (f[l] * w[l] + g[l]) - loss[l] * v[l] + rv[l]
+        change = change if w[l] > zero else zero
+        now = v[l] + change
+        rv[l] = change - (now - v[l])
+        v[l] = now
+        change = reach * now + rx[l]
+        there = x[l] + change
+        rx[l] = change - (there - x[l])
+        x[l] = there
+
+
+@uncounted
+def kick_and_drift(x, v, w, f, gravity, drag_rate, h, work, implicit, reach):
+    """``change_velocities`` with both shares ``implicit``, and then ``x <- x + reach v``, in one pass, which is faster than two."""
+    one = v.dtype.type(1)
+    n, lanes = v.shape[1], v.shape[2]
+    share, loss = work.scratch.rows[0], work.scratch.rows[1]
+    for l in range(lanes):
+        share[l] = h / (one + implicit * h * drag_rate[l])
+        loss[l] = drag_rate[l] * share[l]
+    for c in range(3):
+        xc, vc, fc, rx, rv, g = x[c], v[c], f[c], work.remainders[0, c], work.remainders[1, c], gravity[c]
+        if lanes == 1:
+            _kick_one(
+                xc.reshape(n), vc.reshape(n), w.reshape(n), fc.reshape(n), rx.reshape(n), rv.reshape(n), g[0], share[0], loss[0],
+                reach,
+            )  # fmt: skip
+            continue
+        for p in range(n):
+            _kick_in_lanes(xc[p], vc[p], w[p], fc[p], rx[p], rv[p], g, share, loss, reach)
+
+
+@uncounted
+def advance(x, v, remainder, h):
+    """``x <- x + h v``, compensated, for held particles too; x, v, remainder: (3, particles, lanes).
+
+    What the sum could not hold is in ``remainder``, exactly so where the change is not larger than x.  Serves for velocities and
+    their rates, too.
+    """
+    _advance(x.reshape(x.size), v.reshape(v.size), remainder.reshape(x.size), h)
+
+
+@disjoint
+def _advance(x, v, remainder, h):
+    """``advance`` on flat arrays."""
     for e in range(x.shape[0]):
-        x[e] += h * v[e]
+        change = h * v[e] + remainder[e]
+        now = x[e] + change
+        remainder[e] = change - (now - x[e])
+        x[e] = now
 
 
 @kernel
 def move_on(x, v, start, h):
-    """``x <- start + h v``, for held particles too; (3, particles, lanes)."""
+    """``x <- start + h v``, for held particles too: where they would be at the end of a substep; (3, particles, lanes)."""
     _move_on(x.reshape(x.size), v.reshape(v.size), start.reshape(start.size), h)
 
 
@@ -281,7 +359,7 @@ def _add_to(a, b):
         a[e] += b[e]
 
 
-@kernel
+@uncounted
 def copy_to(a, b):
     """``a <- b``, arrays of the same shape."""
     _copy_to(a.reshape(a.size), b.reshape(b.size))

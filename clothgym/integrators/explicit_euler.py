@@ -14,8 +14,8 @@ import numpy as np
 
 from clothgym._jit import uncounted
 from clothgym.bending import add_bend_forces
-from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import Integrator, advance_positions, advance_velocities, copy_to
+from clothgym.forces import Oscillators, frequency_bound, largest_frequency, set_spring_forces
+from clothgym.integrators.base import Integrator, advance, advance_velocities
 
 
 def _stable_substep(w: float, damping_time: float) -> float:
@@ -43,12 +43,11 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     """
     # forces at the old positions and velocities
     f = work.fields[0]
-    copy_to(f, push)
-    add_spring_forces(x, v, f, elements, elastic, work.scratch)
+    set_spring_forces(x, v, push, f, elements, elastic, work.scratch)
     add_bend_forces(x, v, f, elements, elastic, work.scratch)
     # positions first: they must see the old velocities
-    advance_positions(x, v, h)
-    advance_velocities(v, w, f, gravity, drag_rate, h)
+    advance(x, v, work.remainders[0], h)
+    advance_velocities(v, w, f, gravity, drag_rate, h, work)
 
 
 EXPLICIT_EULER = Integrator(

@@ -28,7 +28,7 @@ import numpy as np
 from clothgym._jit import disjoint, kernel
 from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
-from clothgym.integrators.base import Integrator, add_to, copy_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import Integrator, add_to, advance, copy_to, move_on, predict_velocities, weigh
 
 GRAVITY = 9.81  # [m/s^2]
 LOST = 0.02  # share of its amplitude that a swing may lose in a period
@@ -173,7 +173,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         for l in range(lanes):
             across[kind, l] = -stiffness[kind, l] * h * h
     # v*
-    predict_velocities(v, w, push, gravity, drag_rate, h)
+    predict_velocities(v, w, push, gravity, drag_rate, h, work)
     copy_to(start, x)
     total[:] = 0
     for newton in range(newton_iterations):
@@ -230,10 +230,11 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
                 rho[l] = after[l] if step[l] > zero else zero
                 step[l] = share
         # v = v* + total
-        add_to(v, d)
+        advance(v, d, work.remainders[1], t(1))
         add_to(total, d)
     # positions with the new velocities
-    move_on(x, v, start, h)
+    copy_to(x, start)
+    advance(x, v, work.remainders[0], h)
 
 
 IMPLICIT_EULER = Integrator(

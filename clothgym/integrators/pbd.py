@@ -25,7 +25,7 @@ from clothgym._jit import disjoint, kernel
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
 from clothgym.integrators.base import Integrator
-from clothgym.integrators.xpbd import TINY, predict, take_velocities
+from clothgym.integrators.xpbd import TINY, arrive, set_out
 from clothgym.mesh import SHEAR
 
 USUAL = 1 / 300  # a usual substep [s]
@@ -43,39 +43,45 @@ def surely_allowed(o: Oscillators) -> float:
 
 
 @disjoint
-def _project_rigid(xi, yi, zi, xj, yj, zj, mi, mj, share, r):
+def _project_rigid(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, share, r, tiny):
     """Project one spring, in lanes: ``dp_i = k' w_i/(w_i + w_j) (|d| - r) d/|d|``, ``dp_j = -w_j/w_i dp_i`` (their section 3.3).
 
-    d: the vector from i to j.  xi ... zj: components of both ends [m]; mi, mj: inverse masses [1/kg]; all (lanes,).  share: k'.
-    r: rest length [m].
+    d: the vector from i to j at the end of the substep, over h.  xi ... zj: components of both ends' places over h [m/s]; ui ...
+    wj: of their velocities [m/s], which change by dp/h; mi, mj: inverse masses [1/kg]; all (lanes,).  share: k'.  r: rest length
+    over h [m/s].  tiny: see ``xpbd.TINY``.
     """
-    tiny = xi.dtype.type(TINY)
+    massless = xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
-        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
+        dx, dy, dz = (xj[l] - xi[l]) + (uj[l] - ui[l]), (yj[l] - yi[l]) + (vj[l] - vi[l]), (zj[l] - zi[l]) + (wj[l] - wi[l])
         d2 = dx * dx + dy * dy + dz * dz + tiny
-        # the displacement of a unit of inverse mass, over d
-        s = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + tiny))
-        xi[l] += mi[l] * s * dx
-        yi[l] += mi[l] * s * dy
-        zi[l] += mi[l] * s * dz
-        xj[l] -= mj[l] * s * dx
-        yj[l] -= mj[l] * s * dy
-        zj[l] -= mj[l] * s * dz
+        # the change of velocity of a unit of inverse mass, over d
+        s = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + massless))
+        ui[l] += mi[l] * s * dx
+        vi[l] += mi[l] * s * dy
+        wi[l] += mi[l] * s * dz
+        uj[l] -= mj[l] * s * dx
+        vj[l] -= mj[l] * s * dy
+        wj[l] -= mj[l] * s * dz
 
 
 @kernel
-def project_rigid_springs(x, w, springs, stretch, bend):
-    """One pass over the springs: remove the share ``stretch``, or ``bend`` for springs that bend, of each one's error, in place.
+def project_rigid_springs(y, u, w, springs, h, stretch, bend):
+    """One pass over the springs, which changes u: remove the share ``stretch`` of each error, or ``bend`` for springs that bend.
 
-    x [m]: (3, particles, lanes).  w [1/kg]: (particles, lanes).
+    y, u: see ``xpbd.set_out``.  w [1/kg]: (particles, lanes).
     """
     ends, rest_length, kind, _ = springs
-    x0, x1, x2 = x[0], x[1], x[2]
+    per_step = y.dtype.type(1) / h
+    tiny = y.dtype.type(TINY) * per_step * per_step
+    y0, y1, y2, u0, u1, u2 = y[0], y[1], y[2], u[0], u[1], u[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         share = bend if kind[s] > SHEAR else stretch
-        _project_rigid(x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], w[i], w[j], share, rest_length[s])
+        _project_rigid(
+            y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], share,
+            rest_length[s] * per_step, tiny,
+        )  # fmt: skip
 
 
 @kernel
@@ -106,24 +112,24 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     """``p = x + h v*``, then ``dp_i = -k' w_i grad_i C C / sum_j w_j |grad_j C|^2`` for each constraint C in turn, then
     ``v = (p - x)/h`` and ``x <- p`` (their sections 3.2 and 3.3).
 
-    v* is the velocity after gravity, drag and the air.  Arguments, shapes and units are those of ``integrators.base``.
+    v* is the velocity after gravity, drag and the air.  As in ``xpbd``, velocities u stand for p: they change by dp/h.
+    Arguments, shapes and units are those of ``integrators.base``.
     """
     _, rigidity, damping_time = elastic
     t = x.dtype.type
     iterations, stretch, bend = options
-    start = work.fields[0]
     # bends are projected as in xpbd: rigid, without damping, and by the share k'
     inverse_alpha_tilde, gamma = np.empty_like(rigidity), np.empty_like(rigidity)
     inverse_alpha_tilde[:] = RIGID
     gamma[:] = 0
     # k' of stretch and of bend
     share_stretch, share_bend = t(share_of_a_pass(stretch, iterations)), t(share_of_a_pass(bend, iterations))
-    # predict positions, project the constraints, and derive the velocities
-    predict(x, v, w, start, gravity, push, drag_rate, h)
+    # v*; project the constraints; the new velocities and positions
+    y, u = set_out(x, v, w, gravity, push, drag_rate, h, work)
     for _ in range(iterations):
-        project_rigid_springs(x, w, elements.springs, share_stretch, share_bend)
-        project_bends(x, start, w, elements.bends, inverse_alpha_tilde, gamma, share_bend, work.of_bends, work.scratch)
-    take_velocities(x, v, w, start, h)
+        project_rigid_springs(y, u, w, elements.springs, h, share_stretch, share_bend)
+        project_bends(y, u, w, elements.bends, h, inverse_alpha_tilde, gamma, share_bend, work.of_bends, work.scratch)
+    arrive(x, v, h, work)
 
 
 PBD = Integrator(
@@ -137,5 +143,6 @@ PBD = Integrator(
     surely_allowed=surely_allowed,
     any_order=False,
     options=MappingProxyType({"iterations": 10, "stretch": 0.9, "bend": 0.1}),
+    fields=2,
     ignored=frozenset({"stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time"}),
 )

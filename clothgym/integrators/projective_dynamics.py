@@ -29,7 +29,7 @@ from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
-from clothgym.integrators.base import Integrator, Preparation, add_to, copy_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import Integrator, Preparation, add_to, advance, copy_to, move_on, predict_velocities, weigh
 
 # h w of the stiffest mode up to which ten iterations come close enough to the fixed point (see docs/physics.md)
 STIFFEST = 4.0
@@ -287,7 +287,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     lower, force = np.empty((most, most, lanes), x.dtype), np.empty((held.shape[0], 3, lanes), x.dtype)
     factorize_held(w, slot, held, members, count, lower)
     # v*
-    predict_velocities(v, w, push, gravity, drag_rate, h)
+    predict_velocities(v, w, push, gravity, drag_rate, h, work)
     copy_to(start, x)
     total[:] = 0
     for _ in range(iterations):
@@ -300,10 +300,11 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         # the global step, with the held particles in place
         solve(plan, r, y)
         keep_held(r, slot, held, members, count, lower, force)
-        add_to(v, r)
+        advance(v, r, work.remainders[1], x.dtype.type(1))
         add_to(total, r)
     # positions with the new velocities
-    move_on(x, v, start, h)
+    copy_to(x, start)
+    advance(x, v, work.remainders[0], h)
 
 
 PROJECTIVE_DYNAMICS = Integrator(

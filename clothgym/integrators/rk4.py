@@ -14,8 +14,8 @@ import numpy as np
 
 from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.bending import add_bend_forces
-from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import Integrator, copy_to, move_on
+from clothgym.forces import Oscillators, frequency_bound, largest_frequency, set_spring_forces
+from clothgym.integrators.base import Integrator, advance, copy_to
 
 
 def _amplification(h: float, w: float, damping_time: float) -> float:
@@ -106,16 +106,17 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     sum_v[:] = 0
     for stage in range(4):
         # the forces at this stage
-        copy_to(f, push)
-        add_spring_forces(x, v, f, elements, elastic, work.scratch)
+        set_spring_forces(x, v, push, f, elements, elastic, work.scratch)
         add_bend_forces(x, v, f, elements, elastic, work.scratch)
         # add the derivative with its weight, and go on to the next stage; where the last one goes is overwritten below
         share = t(1) if stage == 0 or stage == 3 else t(2)
         reach = h if stage == 2 else t(0.5) * h
         _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share, reach)
     # y_1 from y_0 and the sum
-    move_on(x, sum_x, start_x, h / t(6))
-    move_on(v, sum_v, start_v, h / t(6))
+    copy_to(x, start_x)
+    copy_to(v, start_v)
+    advance(x, sum_x, work.remainders[0], h / t(6))
+    advance(v, sum_v, work.remainders[1], h / t(6))
 
 
 RK4 = Integrator(

@@ -13,8 +13,8 @@ import numpy as np
 
 from clothgym._jit import uncounted
 from clothgym.bending import add_bend_forces
-from clothgym.forces import Oscillators, add_spring_forces, frequency_bound, largest_frequency
-from clothgym.integrators.base import Integrator, advance_positions, advance_velocities, copy_to
+from clothgym.forces import Oscillators, frequency_bound, largest_frequency, set_spring_forces
+from clothgym.integrators.base import Integrator, kick_and_drift
 
 
 def stable_substep(w: float, damping_time: float) -> float:
@@ -40,12 +40,10 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     """
     # forces at the old positions and velocities
     f = work.fields[0]
-    copy_to(f, push)
-    add_spring_forces(x, v, f, elements, elastic, work.scratch)
+    set_spring_forces(x, v, push, f, elements, elastic, work.scratch)
     add_bend_forces(x, v, f, elements, elastic, work.scratch)
     # velocities first: the positions advance with the new ones
-    advance_velocities(v, w, f, gravity, drag_rate, h)
-    advance_positions(x, v, h)
+    kick_and_drift(x, v, w, f, gravity, drag_rate, h, work, x.dtype.type(1), h)
 
 
 # the bound is that of the flat sheet; stretched and folded sheets have slightly higher frequencies, hence the margin of a fifth

@@ -11,40 +11,11 @@ rule.
 
 from __future__ import annotations
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import uncounted
 from clothgym.bending import add_bend_forces
-from clothgym.forces import add_spring_forces
-from clothgym.integrators.base import Integrator, advance_positions, copy_to
+from clothgym.forces import set_spring_forces
+from clothgym.integrators.base import Integrator, advance, kick_and_drift
 from clothgym.integrators.semi_implicit_euler import largest_substep, surely_allowed
-
-
-@disjoint
-def _kick_one(v, w, f, g, slow, h):
-    """One component of ``_kick`` for one sheet: v, w, f (particles,).  slow: ``h b/2``, the drag in half a substep."""
-    one, zero = v.dtype.type(1), v.dtype.type(0)
-    for p in range(v.shape[0]):
-        gain, share = (h * (f[p] * w[p] + g), slow) if w[p] > zero else (zero, zero)
-        v[p] = (v[p] * (one - share) + gain) / (one + share)
-
-
-@kernel
-def _kick(v, w, f, gravity, drag_rate, h):
-    """``v <- (v (1 - h b/2) + h (w f + g)) / (1 + h b/2)`` for free particles, with the drag's rate b [1/s].
-
-    v [m/s] and f [N]: (3, particles, lanes).
-    """
-    one, zero, half = v.dtype.type(1), v.dtype.type(0), v.dtype.type(0.5)
-    particles, lanes = v.shape[1], v.shape[2]
-    for c in range(3):
-        if lanes == 1:
-            vc, fc = v[c].reshape(particles), f[c].reshape(particles)
-            _kick_one(vc, w.reshape(particles), fc, gravity[c, 0], half * h * drag_rate[0], h)
-            continue
-        for p in range(particles):
-            for l in range(lanes):
-                slow = half * h * drag_rate[l]
-                free = (v[c, p, l] * (one - slow) + h * (f[c, p, l] * w[p, l] + gravity[c, l])) / (one + slow)
-                v[c, p, l] = free if w[p, l] > zero else v[c, p, l]
 
 
 @uncounted
@@ -54,16 +25,13 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     b is the drag's rate.  Arguments, shapes and units are those of ``integrators.base``.
     """
     f = work.fields[0]
-    half = x.dtype.type(0.5) * h
+    share = x.dtype.type(0.5)
     # drift: half a substep with the old velocities
-    advance_positions(x, v, half)
-    # kick: a whole substep with the forces at the midpoint
-    copy_to(f, push)
-    add_spring_forces(x, v, f, elements, elastic, work.scratch)
+    advance(x, v, work.remainders[0], share * h)
+    # kick: a whole substep with the forces at the midpoint; and drift: half a substep with the new velocities
+    set_spring_forces(x, v, push, f, elements, elastic, work.scratch)
     add_bend_forces(x, v, f, elements, elastic, work.scratch)
-    _kick(v, w, f, gravity, drag_rate, h)
-    # drift: half a substep with the new velocities
-    advance_positions(x, v, half)
+    kick_and_drift(x, v, w, f, gravity, drag_rate, h, work, share, share * h)
 
 
 VERLET = Integrator(

@@ -8,6 +8,11 @@ For a constraint C with multiplier lambda, inverse masses w, positions x and tho
     delta lambda = (-C - alpha~ lambda - gamma grad C . (x - x^n)) / ((1 + gamma) sum_i w_i |grad_i C|^2 + alpha~),
     lambda <- lambda + delta lambda,    x_i <- x_i + w_i grad_i C delta lambda.
 
+In float32 the corrections of small substeps are not much more than the last bit of x, and their rounding over h would be a velocity
+that no force has made.  So the velocities ``u = (x - x^n)/h`` are what is corrected, by ``w_i grad_i C delta lambda/h``; x follows
+once, at the end.  In the meantime lengths are over h, ``(x_j - x_i)/h = (y_j - y_i) + (u_j - u_i)`` with ``y = x^n/h``, and y and u
+are seen from a particle in the middle: no bit of them depends on where the sheet is, nor on how fast it moves as a whole.
+
 For a spring ``C = |d| - r``, with d from the first end i to the second end j and r the rest length.  ``alpha~ = 1/(k h^2)`` is its
 compliance over h^2, and ``gamma = alpha~ beta~/h = tau/h`` with the damping time tau.  The multipliers start from zero in each
 substep.  One pass never reads them; with ``iterations`` above 1 they accumulate, and the passes converge to backward Euler.
@@ -28,9 +33,9 @@ import numpy as np
 from clothgym._jit import apart, disjoint, kernel
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
-from clothgym.integrators.base import Integrator, advance_positions, copy_to, predict_velocities
+from clothgym.integrators.base import Integrator, predict_velocities
 
-TINY = 1e-12  # added to a spring's squared length, which may be zero [m^2]
+TINY = 1e-12  # added to a spring's squared length, which may be zero [m^2]; over h^2 where lengths are over h
 FIVE_PERCENT = 0.229  # h sqrt(k/m) at which one pass leaves a long chain 5 % too soft
 
 
@@ -49,229 +54,226 @@ def surely_allowed(o: Oscillators) -> float:
 
 
 @disjoint
-def _project(xi, yi, zi, xj, yj, zj, ai, bi, ci, aj, bj, cj, wi, wj, compliant, r, alpha_tilde, gamma):
+def _set_out_one(x, middle, remainder, v, v_middle, per_step, places, motion):
+    """``set_out`` for one component of one sheet, (particles,); middle, v_middle: numbers."""
+    for p in range(x.shape[0]):
+        places[p] = ((x[p] - middle) + remainder[p]) * per_step
+        motion[p] = v[p] - v_middle
+
+
+@disjoint
+def _set_out_lanes(x, middle, remainder, v, v_middle, per_step, places, motion):
+    """``set_out`` for one component of one particle; all arrays (lanes,)."""
+    for l in range(x.shape[0]):
+        places[l] = ((x[l] - middle[l]) + remainder[l]) * per_step
+        motion[l] = v[l] - v_middle[l]
+
+
+@kernel
+def set_out(x, v, w, gravity, push, drag_rate, h, work):
+    """``v <- v*``, the velocity of free fall with drag and ``push`` [N]; and what projections go on from, see the module.
+
+    Returns y: places over h, with what x could not hold, and u: velocities, both [m/s], (3, particles, lanes), as seen from the
+    particle in the middle of the list.
+    """
+    predict_velocities(v, w, push, gravity, drag_rate, h, work)
+    y, u, remainder = work.fields[0], work.fields[1], work.remainders[0]
+    particles, lanes = w.shape
+    m, per_step = particles // 2, x.dtype.type(1) / h
+    for c in range(3):
+        xc, vc, rc, yc, uc = x[c], v[c], remainder[c], y[c], u[c]
+        if lanes == 1:
+            n = particles
+            _set_out_one(xc.reshape(n), xc[m, 0], rc.reshape(n), vc.reshape(n), vc[m, 0], per_step, yc.reshape(n), uc.reshape(n))
+            continue
+        for p in range(particles):
+            _set_out_lanes(xc[p], xc[m], rc[p], vc[p], vc[m], per_step, yc[p], uc[p])
+    return y, u
+
+
+@disjoint
+def _arrive_one(x, v, rx, rv, u, v_middle, h):
+    """``arrive`` for one component of one sheet, (particles,); v_middle: a number."""
+    for p in range(x.shape[0]):
+        # v and what projections have changed; then x
+        change = (u[p] - (v[p] - v_middle)) + rv[p]
+        now = v[p] + change
+        rv[p] = change - (now - v[p])
+        v[p] = now
+        change = h * now + rx[p]
+        there = x[p] + change
+        rx[p] = change - (there - x[p])
+        x[p] = there
+
+
+@disjoint
+def _arrive_lanes(x, v, rx, rv, u, v_middle, h):
+    """``arrive`` for one component of one particle; all arrays (lanes,)."""
+    for l in range(x.shape[0]):
+        change = (u[l] - (v[l] - v_middle[l])) + rv[l]
+        now = v[l] + change
+        rv[l] = change - (now - v[l])
+        v[l] = now
+        change = h * now + rx[l]
+        there = x[l] + change
+        rx[l] = change - (there - x[l])
+        x[l] = there
+
+
+@kernel
+def arrive(x, v, h, work):
+    """What projections have changed of u is added to v, and ``x <- x + h v``; both compensated, see ``integrators.base``."""
+    u, rx, rv = work.fields[1], work.remainders[0], work.remainders[1]
+    particles, lanes = x.shape[1], x.shape[2]
+    m, middle = particles // 2, work.scratch.rows[0]
+    for c in range(3):
+        for l in range(lanes):
+            middle[l] = v[c, m, l]
+        if lanes == 1:
+            n = particles
+            _arrive_one(x[c].reshape(n), v[c].reshape(n), rx[c].reshape(n), rv[c].reshape(n), u[c].reshape(n), middle[0], h)
+            continue
+        for p in range(particles):
+            _arrive_lanes(x[c, p], v[c, p], rx[c, p], rv[c, p], u[c, p], middle, h)
+
+
+@disjoint
+def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, compliant, r, tiny, alpha_tilde, gamma):
     """Project one spring, in lanes; all arrays (lanes,).
 
-    xi ... zj: components of both ends [m]; ai ... cj: the same at the start of the substep; wi, wj: inverse masses [1/kg].
-    compliant: one over the spring's weight.  r: rest length [m].
+    xi ... zj: components of both ends' places over h [m/s]; ui ... wj: of their velocities [m/s]; mi, mj: inverse masses [1/kg].
+    compliant: one over the spring's weight.  r: rest length over h [m/s].  tiny: see ``TINY``.
     """
-    one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
+    one = xi.dtype.type(1)
     for l in range(xi.shape[0]):
-        # d, and how it has changed since the start of the substep
-        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
-        ux, uy, uz = dx - (aj[l] - ai[l]), dy - (bj[l] - bi[l]), dz - (cj[l] - ci[l])
+        # how d changes in the substep, and d at its end, over h
+        ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        dx, dy, dz = (xj[l] - xi[l]) + ux, (yj[l] - yi[l]) + uy, (zj[l] - zi[l]) + uz
         d2 = dx * dx + dy * dy + dz * dz + tiny
         g = gamma[l]
         # eq. 26: the error is |d| (C + gamma grad C . (x - x^n)), and delta lambda is over |d|, as it multiplies d below
         error = d2 - r * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
-        delta_lambda = error / (d2 * ((one + g) * (wi[l] + wj[l]) + compliant * alpha_tilde[l]))
+        delta_lambda = error / (d2 * ((one + g) * (mi[l] + mj[l]) + compliant * alpha_tilde[l]))
         px, py, pz = delta_lambda * dx, delta_lambda * dy, delta_lambda * dz
-        # x <- x + w grad C delta lambda
-        xi[l] += wi[l] * px
-        yi[l] += wi[l] * py
-        zi[l] += wi[l] * pz
-        xj[l] -= wj[l] * px
-        yj[l] -= wj[l] * py
-        zj[l] -= wj[l] * pz
+        # u <- u + w grad C delta lambda
+        ui[l] += mi[l] * px
+        vi[l] += mi[l] * py
+        wi[l] += mi[l] * pz
+        uj[l] -= mj[l] * px
+        vj[l] -= mj[l] * py
+        wj[l] -= mj[l] * pz
 
 
 @apart
-def project_springs(x, start, w, springs, alpha_tilde, gamma):
-    """A single pass over the springs, in place: eq. 26 with lambda = 0.
+def project_springs(y, u, w, springs, h, alpha_tilde, gamma):
+    """A single pass over the springs, which changes u: eq. 26 with lambda = 0.
 
-    x, and start: positions at the start of the substep [m], (3, particles, lanes).  w [1/kg]: (particles, lanes).
-    alpha_tilde: ``1/(k h^2)`` [1/kg], (kinds, lanes).  gamma: ``tau/h``, (lanes,).
+    y, u: see ``set_out``.  w [1/kg]: (particles, lanes).  alpha_tilde: ``1/(k h^2)`` [1/kg], (kinds, lanes).  gamma: ``tau/h``,
+    (lanes,).
     """
     # a single environment has its own loop: loops over one lane are slow
-    if x.shape[2] == 1:
-        rows = (3, x.shape[1])
-        _project_springs_of_one(x.reshape(rows), start.reshape(rows), w[:, 0], springs, alpha_tilde[:, 0], gamma[0])
+    if y.shape[2] == 1:
+        rows = (3, y.shape[1])
+        _project_springs_of_one(y.reshape(rows), u.reshape(rows), w[:, 0], springs, h, alpha_tilde[:, 0], gamma[0])
         return
     # spring by spring, each in all lanes
     ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
-    x0, x1, x2, s0, s1, s2 = x[0], x[1], x[2], start[0], start[1], start[2]
+    one, per_step = y.dtype.type(1), y.dtype.type(1) / h
+    tiny = y.dtype.type(TINY) * per_step * per_step
+    y0, y1, y2, u0, u1, u2 = y[0], y[1], y[2], u[0], u[1], u[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         _project(
-            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], s0[i], s1[i], s2[i], s0[j], s1[j], s2[j], w[i], w[j], one / weight[s],
-            rest_length[s], alpha_tilde[kind[s]], gamma,
+            y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], one / weight[s],
+            rest_length[s] * per_step, tiny, alpha_tilde[kind[s]], gamma,
         )  # fmt: skip
 
 
 @kernel
-def _project_springs_of_one(x, start, w, springs, alpha_tilde, gamma):
-    """``project_springs`` for one environment: x, start (3, particles), w (particles,), alpha_tilde (kinds,)."""
+def _project_springs_of_one(y, u, w, springs, h, alpha_tilde, gamma):
+    """``project_springs`` for one environment: y, u (3, particles), w (particles,), alpha_tilde (kinds,)."""
     ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
-    tiny = x.dtype.type(TINY)
+    one, per_step = y.dtype.type(1), y.dtype.type(1) / h
+    tiny = y.dtype.type(TINY) * per_step * per_step
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
-        # d, and how it has changed since the start of the substep
-        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
-        ux, uy, uz = dx - (start[0, j] - start[0, i]), dy - (start[1, j] - start[1, i]), dz - (start[2, j] - start[2, i])
+        # how d changes in the substep, and d at its end, over h
+        ux, uy, uz = u[0, j] - u[0, i], u[1, j] - u[1, i], u[2, j] - u[2, i]
+        dx, dy, dz = (y[0, j] - y[0, i]) + ux, (y[1, j] - y[1, i]) + uy, (y[2, j] - y[2, i]) + uz
         d2 = dx * dx + dy * dy + dz * dz + tiny
         compliant = one / weight[s]
-        # eq. 26 as in ``_project``, and the move
-        error = d2 - rest_length[s] * np.sqrt(d2) + gamma * (ux * dx + uy * dy + uz * dz)
+        # eq. 26 as in ``_project``, and the change of velocities
+        error = d2 - rest_length[s] * per_step * np.sqrt(d2) + gamma * (ux * dx + uy * dy + uz * dz)
         delta_lambda = error / (d2 * ((one + gamma) * (w[i] + w[j]) + compliant * alpha_tilde[kind[s]]))
         px, py, pz = delta_lambda * dx, delta_lambda * dy, delta_lambda * dz
-        x[0, i] += w[i] * px
-        x[1, i] += w[i] * py
-        x[2, i] += w[i] * pz
-        x[0, j] -= w[j] * px
-        x[1, j] -= w[j] * py
-        x[2, j] -= w[j] * pz
+        u[0, i] += w[i] * px
+        u[1, i] += w[i] * py
+        u[2, i] += w[i] * pz
+        u[0, j] -= w[j] * px
+        u[1, j] -= w[j] * py
+        u[2, j] -= w[j] * pz
 
 
 @disjoint
-def _project_undamped(xi, yi, zi, xj, yj, zj, wi, wj, compliant, r, alpha_tilde):
-    """``_project`` with gamma = 0: eq. 18."""
-    tiny = xi.dtype.type(TINY)
+def _project_with_memory(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, weight, r, tiny, inverse_alpha_tilde, gamma, lam):
+    """``_project`` with a multiplier, ``lam`` [kg m/s], (lanes,), which it updates; all arrays (lanes,)."""
+    one = xi.dtype.type(1)
     for l in range(xi.shape[0]):
-        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
-        d2 = dx * dx + dy * dy + dz * dz + tiny
-        delta_lambda = (d2 - r * np.sqrt(d2)) / (d2 * (wi[l] + wj[l] + compliant * alpha_tilde[l]))
-        xi[l] += wi[l] * delta_lambda * dx
-        yi[l] += wi[l] * delta_lambda * dy
-        zi[l] += wi[l] * delta_lambda * dz
-        xj[l] -= wj[l] * delta_lambda * dx
-        yj[l] -= wj[l] * delta_lambda * dy
-        zj[l] -= wj[l] * delta_lambda * dz
-
-
-@kernel
-def project_undamped_springs(x, w, springs, alpha_tilde):
-    """``project_springs`` with gamma = 0: the same bits at half the cost."""
-    if x.shape[2] == 1:
-        _project_undamped_springs_of_one(x.reshape((3, x.shape[1])), w[:, 0], springs, alpha_tilde[:, 0])
-        return
-    # spring by spring, each in all lanes
-    ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
-    x0, x1, x2 = x[0], x[1], x[2]
-    for s in range(ends.shape[0]):
-        i = ends[s, 0]
-        j = ends[s, 1]
-        _project_undamped(
-            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], w[i], w[j], one / weight[s], rest_length[s], alpha_tilde[kind[s]]
-        )
-
-
-@kernel
-def _project_undamped_springs_of_one(x, w, springs, alpha_tilde):
-    """``project_undamped_springs`` for one environment: x (3, particles), w (particles,), alpha_tilde (kinds,)."""
-    ends, rest_length, kind, weight = springs
-    one = x.dtype.type(1)
-    tiny = x.dtype.type(TINY)
-    for s in range(ends.shape[0]):
-        i = ends[s, 0]
-        j = ends[s, 1]
-        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
-        d2 = dx * dx + dy * dy + dz * dz + tiny
-        compliant = one / weight[s]
-        delta_lambda = (d2 - rest_length[s] * np.sqrt(d2)) / (d2 * (w[i] + w[j] + compliant * alpha_tilde[kind[s]]))
-        x[0, i] += w[i] * delta_lambda * dx
-        x[1, i] += w[i] * delta_lambda * dy
-        x[2, i] += w[i] * delta_lambda * dz
-        x[0, j] -= w[j] * delta_lambda * dx
-        x[1, j] -= w[j] * delta_lambda * dy
-        x[2, j] -= w[j] * delta_lambda * dz
-
-
-@disjoint
-def _project_with_memory(xi, yi, zi, xj, yj, zj, ai, bi, ci, aj, bj, cj, wi, wj, weight, r, inverse_alpha_tilde, gamma, lam):
-    """``_project`` with a multiplier, ``lam`` [kg m], (lanes,), which it updates; all arrays (lanes,)."""
-    one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
-    for l in range(xi.shape[0]):
-        dx, dy, dz = xj[l] - xi[l], yj[l] - yi[l], zj[l] - zi[l]
-        ux, uy, uz = dx - (aj[l] - ai[l]), dy - (bj[l] - bi[l]), dz - (cj[l] - ci[l])
+        ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
+        dx, dy, dz = (xj[l] - xi[l]) + ux, (yj[l] - yi[l]) + uy, (zj[l] - zi[l]) + uz
         inverse = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
         length = (dx * dx + dy * dy + dz * dz) * inverse
         g = gamma[l]
         # eq. 26 over alpha~: (C + gamma grad C . (x - x^n))/alpha~, and delta lambda
         k = weight * inverse_alpha_tilde[l]
         error = k * (length - r + g * (ux * dx + uy * dy + uz * dz) * inverse)
-        delta_lambda = (error - lam[l]) / (k * (one + g) * (wi[l] + wj[l]) + one)
+        delta_lambda = (error - lam[l]) / (k * (one + g) * (mi[l] + mj[l]) + one)
         lam[l] += delta_lambda
-        # x <- x + w grad C delta lambda, with grad C = d/|d|
+        # u <- u + w grad C delta lambda, with grad C = d/|d|
         p = delta_lambda * inverse
-        xi[l] += wi[l] * p * dx
-        yi[l] += wi[l] * p * dy
-        zi[l] += wi[l] * p * dz
-        xj[l] -= wj[l] * p * dx
-        yj[l] -= wj[l] * p * dy
-        zj[l] -= wj[l] * p * dz
+        ui[l] += mi[l] * p * dx
+        vi[l] += mi[l] * p * dy
+        wi[l] += mi[l] * p * dz
+        uj[l] -= mj[l] * p * dx
+        vj[l] -= mj[l] * p * dy
+        wj[l] -= mj[l] * p * dz
 
 
 @kernel
-def project_springs_with_memory(x, start, w, springs, inverse_alpha_tilde, gamma, lam):
-    """One of several passes over the springs, in place: eq. 26 with the multipliers ``lam`` [kg m], (springs, lanes).
+def project_springs_with_memory(y, u, w, springs, h, inverse_alpha_tilde, gamma, lam):
+    """One of several passes over the springs: eq. 26 with the multipliers ``lam`` over h [kg m/s], (springs, lanes).
 
     inverse_alpha_tilde: ``k h^2`` [kg], (kinds, lanes).  The equation is multiplied by it, so that a stiffness of zero is no
     division by zero.  Other arguments as for ``project_springs``.
     """
     ends, rest_length, kind, weight = springs
-    x0, x1, x2, s0, s1, s2 = x[0], x[1], x[2], start[0], start[1], start[2]
+    per_step = y.dtype.type(1) / h
+    tiny = y.dtype.type(TINY) * per_step * per_step
+    y0, y1, y2, u0, u1, u2 = y[0], y[1], y[2], u[0], u[1], u[2]
     for s in range(ends.shape[0]):
         i = ends[s, 0]
         j = ends[s, 1]
         _project_with_memory(
-            x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], s0[i], s1[i], s2[i], s0[j], s1[j], s2[j], w[i], w[j], weight[s],
-            rest_length[s], inverse_alpha_tilde[kind[s]], gamma, lam[s],
+            y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], weight[s],
+            rest_length[s] * per_step, tiny, inverse_alpha_tilde[kind[s]], gamma, lam[s],
         )  # fmt: skip
 
 
 @kernel
-def predict(x, v, w, start, gravity, push, drag_rate, h):
-    """``start <- x``, then ``x <- x + h v*``: free fall with drag and ``push`` [N]; held particles move with their velocity.
-
-    x and start [m], v [m/s]: (3, particles, lanes).
-    """
-    predict_velocities(v, w, push, gravity, drag_rate, h)
-    copy_to(start, x)
-    advance_positions(x, v, h)
-
-
-@disjoint
-def _take_component(x, v, w, start, h, per_step):
-    """One component of ``take_velocities``, on flat arrays.  per_step: ``1/h`` [1/s]."""
-    zero = x.dtype.type(0)
-    for e in range(x.shape[0]):
-        projected = x[e] - (start[e] + h * v[e])
-        v[e] += projected * per_step if w[e] > zero else zero
-
-
-@kernel
-def take_velocities(x, v, w, start, h):
-    """``v <- (x - start)/h`` for free particles; x, start [m], v [m/s]: (3, particles, lanes).
-
-    It is computed as ``v + (x - (start + h v))/h``, with v the predicted velocity.  The plain quotient in float32 would round
-    gravity's ``g h^2`` to a multiple of the last bit of the position, and more so with smaller substeps.
-    """
-    for c in range(3):
-        _take_component(
-            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), start[c].reshape(w.size), h, x.dtype.type(1) / h
-        )
-
-
-@kernel
 def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, plan, work):
-    """``x~ = x^n + h v*``; ``iterations`` passes of eq. 26 over springs, then hinges; ``v = (x - x^n)/h``.
+    """``v = v*``; ``iterations`` passes of eq. 26 over springs, then hinges, at ``x^n + h v``; ``x = x^n + h v``.
 
-    v* is the velocity after gravity, drag and the air, and x^n is ``start``.  Arguments, shapes and units are those of
-    ``integrators.base``.
+    v* is the velocity after gravity, drag and the air.  Arguments, shapes and units are those of ``integrators.base``.
     """
     stiffness, rigidity, damping_time = elastic
     springs, bends = elements.springs, elements.bends
     one = x.dtype.type(1)
     lanes = x.shape[2]
     iterations = options[0]
-    start = work.fields[0]
-    # keep the positions, and predict new ones
-    predict(x, v, w, start, gravity, push, drag_rate, h)
+    # v*, and what projections go on from
+    y, u = set_out(x, v, w, gravity, push, drag_rate, h, work)
     # alpha~ and gamma: of springs by kind, and of bends
     inverse_alpha_tilde, alpha_tilde, gamma, inverse_alpha_tilde_bend = (
         np.empty_like(stiffness), np.empty_like(stiffness), np.empty_like(damping_time), np.empty_like(rigidity)
@@ -280,27 +282,22 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         for l in range(lanes):
             inverse_alpha_tilde[kind, l] = stiffness[kind, l] * h * h
             alpha_tilde[kind, l] = one / (stiffness[kind, l] * h * h)
-    damped = False
     for l in range(lanes):
         inverse_alpha_tilde_bend[l] = rigidity[l] * h * h
         gamma[l] = damping_time[l] / h
-        damped |= gamma[l] > 0
     if iterations == 1:
         # a single pass: lambda is zero
-        if damped:
-            project_springs(x, start, w, springs, alpha_tilde, gamma)
-        else:
-            project_undamped_springs(x, w, springs, alpha_tilde)
-        project_bends(x, start, w, bends, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
+        project_springs(y, u, w, springs, h, alpha_tilde, gamma)
+        project_bends(y, u, w, bends, h, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
     else:
         # several passes: lambda starts from zero, and accumulates
         work.of_springs[:] = 0
         work.of_bends[:] = 0
         for _ in range(iterations):
-            project_springs_with_memory(x, start, w, springs, inverse_alpha_tilde, gamma, work.of_springs)
-            project_bends(x, start, w, bends, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
-    # the velocities follow from the displacements
-    take_velocities(x, v, w, start, h)
+            project_springs_with_memory(y, u, w, springs, h, inverse_alpha_tilde, gamma, work.of_springs)
+            project_bends(y, u, w, bends, h, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
+    # the new velocities, and positions with them
+    arrive(x, v, h, work)
 
 
 XPBD = Integrator(
@@ -314,5 +311,6 @@ XPBD = Integrator(
     surely_allowed=surely_allowed,
     any_order=False,
     options=MappingProxyType({"iterations": 1}),
+    fields=2,
     multipliers=True,
 )

@@ -14,6 +14,7 @@ from clothgym.collisions.solids.shapes import (
     COLLIDER_ROWS,
     R_AFTER,
     R_POINT,
+    R_REMAINDER,
     R_VELOCITY,
     Collider,
     check_index,
@@ -77,7 +78,8 @@ class Solids:
         now = after
         if targets is not None:
             x = vectors("targets", targets, len(env))
-            now = (x - self.rows[block, index, R_POINT : R_POINT + 3, lane]) / self.time_step
+            point, remainder = (self.rows[block, index, first : first + 3, lane] for first in (R_POINT, R_REMAINDER))
+            now = (x - point - remainder) / self.time_step
         self.rows[block, index, R_VELOCITY : R_VELOCITY + 3, lane] = now
         self.rows[block, index, R_AFTER : R_AFTER + 3, lane] = after
 

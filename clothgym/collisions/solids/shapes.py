@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym.checks import count, finite, members, not_negative, number, shown, vector
 
 # rows of a collider: a point of it; its x, y and z axes; half sides b; radius r with the thickness; friction; velocity; squared
-# distance from the point beyond which nothing touches it; thickness; velocity after the next control step
+# distance from the point beyond which nothing touches it; thickness; velocity after the next control step; what the point could not
+# hold of its motion [m]
 R_POINT, R_AXES, R_HALF, R_RADIUS, R_FRICTION, R_VELOCITY, R_REACH2, R_THICKNESS, R_AFTER = 0, 3, 12, 15, 16, 17, 20, 21, 22
-COLLIDER_ROWS = 25
+R_REMAINDER = 25
+COLLIDER_ROWS = 28
 
 STRAIGHT = 1e-4  # by how much products of a collider's axes, in float32, may differ from those of unit vectors at right angles
 

@@ -19,7 +19,7 @@ from clothgym._jit import inlined, kernel, uncounted
 from clothgym.collisions.solids.contact_law import FASTEST, RELAXED, touch_change
 from clothgym.collisions.solids.deepest_point import to_triangle
 from clothgym.collisions.solids.edges import LEAST_COSINE
-from clothgym.collisions.solids.shapes import R_FRICTION, R_POINT, R_VELOCITY
+from clothgym.collisions.solids.shapes import R_FRICTION, R_POINT, R_REMAINDER, R_VELOCITY
 from clothgym.collisions.solids.signed_distance import S_CONTACT, S_CORE, S_CORNERS, S_RHO, S_SPOT, S_WEIGHTS
 
 # columns of a touch: three weights; offset of its plane from the solid's point along the normal; normal; impulse [N s]; the ball's
@@ -31,11 +31,18 @@ TOUCH_COLUMNS = 17
 
 @kernel
 def move_solids(colliders, h):
-    """Move each solid by its velocity for a substep h [s]; colliders: rows, (colliders, COLLIDER_ROWS, lanes)."""
+    """Move each solid by its velocity for a substep h [s], with compensated summation (see ``integrators.base``).
+
+    colliders: rows, (colliders, COLLIDER_ROWS, lanes).
+    """
     for k in range(colliders.shape[0]):
         for c in range(3):
             for l in range(colliders.shape[2]):
-                colliders[k, R_POINT + c, l] += h * colliders[k, R_VELOCITY + c, l]
+                point = colliders[k, R_POINT + c, l]
+                change = h * colliders[k, R_VELOCITY + c, l] + colliders[k, R_REMAINDER + c, l]
+                now = point + change
+                colliders[k, R_REMAINDER + c, l] = change - (now - point)
+                colliders[k, R_POINT + c, l] = now
 
 
 @inlined
