@@ -9,8 +9,8 @@ segment-to-segment contact method for large deformation solid mechanics, section
 
 So distances are measured along the solid's normal n, and impulses act along a direction e of their own, see ``contact_law``.  It is
 the normal of the smoothed sheet, interpolated between normals at its particles, as far as the solid has normals of that direction
-nearby: e lies between the solid's normals at two corners of one triangle.  On a flat side, on a round one that is wide compared
-with the triangles, and in a hollow, e is n.
+nearby: e lies between the solid's normals at two corners of one triangle.  On a flat side, in a hollow, at spheres and capsules,
+and where the sheet does not lie along the edge, as it does not at a corner of a box, e is n.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from clothgym._jit import inlined, uncounted
 
 WIDE = 0.71  # cosine of the angle between the solid's normals at two corners beyond which an edge is between them: 45 degrees
+ASLANT = 0.3  # sine of the angle between the sheet's normal and the plane of the solid's normals beyond which e is n
 LEAST_COSINE = 0.3  # between n and e; where it is less, e is n
 # rows of scratch, one column a particle: normals of the solid, and of the sheet; the best direction so far, and its cosine with the
 # sheet's normal, or UNBENT where no edge is near
@@ -48,8 +49,11 @@ def _square(r, i, j):
 
 
 @inlined
-def _between(sx, sy, sz, ax, ay, az, bx, by, bz, zero):
-    """The unit vector between unit vectors a and b that is closest to s, in their plane."""
+def _between(sx, sy, sz, ax, ay, az, bx, by, bz, zero, aslant2):
+    """The unit vector between unit vectors a and b that is closest to s, in their plane; a, where s is too far from that plane.
+
+    aslant2: the least square of the part of s in the plane, over that of s.
+    """
     # t: at right angles to a, towards b; b = cosine a + sine t
     cosine = ax * bx + ay * by + az * bz
     tx, ty, tz = bx - cosine * ax, by - cosine * ay, bz - cosine * az
@@ -58,7 +62,7 @@ def _between(sx, sy, sz, ax, ay, az, bx, by, bz, zero):
     # s in the plane
     u, v = sx * ax + sy * ay + sz * az, sx * tx + sy * ty + sz * tz
     length = np.sqrt(u * u + v * v)
-    if v <= zero or not length > zero:
+    if v <= zero or not u * u + v * v > aslant2 * (sx * sx + sy * sy + sz * sz):
         return ax, ay, az
     if cosine * v > sine * u:
         return bx, by, bz
@@ -91,7 +95,7 @@ def _add_sheet_normals(r, triangles, normals):
 @inlined
 def _turn_particle(rows, i, j):
     """Turn the direction at particle i towards the sheet's normal, as far as the solid's normal at particle j."""
-    zero, one = rows.dtype.type(0), rows.dtype.type(1)
+    zero, one, aslant2 = rows.dtype.type(0), rows.dtype.type(1), rows.dtype.type(1 - ASLANT * ASLANT)
     nx, ny, nz = rows[E_SOLID, i], rows[E_SOLID + 1, i], rows[E_SOLID + 2, i]
     sx, sy, sz = rows[E_SHEET, i], rows[E_SHEET + 1, i], rows[E_SHEET + 2, i]
     # either side of the sheet may face the solid
@@ -100,7 +104,7 @@ def _turn_particle(rows, i, j):
     if rows[E_COSINE, i] == UNBENT:
         rows[E_PUSH, i], rows[E_PUSH + 1, i], rows[E_PUSH + 2, i] = nx, ny, nz
         rows[E_COSINE, i] = sx * nx + sy * ny + sz * nz
-    ex, ey, ez = _between(sx, sy, sz, nx, ny, nz, rows[E_SOLID, j], rows[E_SOLID + 1, j], rows[E_SOLID + 2, j], zero)
+    ex, ey, ez = _between(sx, sy, sz, nx, ny, nz, rows[E_SOLID, j], rows[E_SOLID + 1, j], rows[E_SOLID + 2, j], zero, aslant2)
     cosine = sx * ex + sy * ey + sz * ez
     if cosine > rows[E_COSINE, i]:
         rows[E_PUSH, i], rows[E_PUSH + 1, i], rows[E_PUSH + 2, i] = ex, ey, ez
@@ -147,6 +151,7 @@ def push_of_touch(r, triangle, weights, nx, ny, nz, rows):
     rows: as ``find_edges`` has left them.  Returns its three components; n where no edge is near.
     """
     zero, one, normals = r.dtype.type(0), r.dtype.type(1), rows[E_SOLID : E_SOLID + 3]
+    aslant2 = r.dtype.type(1 - ASLANT * ASLANT)
     ex, ey, ez = nx, ny, nz
     # the smoothed sheet's normal
     sx, sy, sz = zero, zero, zero
@@ -162,9 +167,24 @@ def push_of_touch(r, triangle, weights, nx, ny, nz, rows):
         i, j = triangle[c], triangle[(c + 1) % 3]
         if _bent(r, normals, i, j):
             tx, ty, tz = _between(
-                sx, sy, sz, normals[0, i], normals[1, i], normals[2, i], normals[0, j], normals[1, j], normals[2, j], zero
+                sx,
+                sy,
+                sz,
+                normals[0, i],
+                normals[1, i],
+                normals[2, i],
+                normals[0, j],
+                normals[1, j],
+                normals[2, j],
+                zero,
+                aslant2,
             )
+            # the triangle, too, must lie along the edge, whose direction is at right angles to both normals
+            bx = normals[1, i] * normals[2, j] - normals[2, i] * normals[1, j]
+            by = normals[2, i] * normals[0, j] - normals[0, i] * normals[2, j]
+            bz = normals[0, i] * normals[1, j] - normals[1, i] * normals[0, j]
+            along = nx * bx + ny * by + nz * bz
             cosine = sx * tx + sy * ty + sz * tz
-            if cosine > best:
+            if cosine > best and along * along < r.dtype.type(ASLANT * ASLANT) * (bx * bx + by * by + bz * bz):
                 best, ex, ey, ez = cosine, tx, ty, tz
     return ex, ey, ez

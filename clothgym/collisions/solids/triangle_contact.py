@@ -226,6 +226,9 @@ def _find_edges(r, triangles, shapes, k, collider, touching, edges, pushes, rows
     distances from its box.  bent: scratch, (triangles,).
     """
     n, c = r.shape[1], collider.reshape(collider.shape[0])
+    # spheres and capsules have no edges
+    if shapes.kinds[k] == KIND_ROUNDED_BOX and c[R_RADIUS] > c[R_THICKNESS]:
+        return -1
     near = touching
     for p in range(n):
         near |= rows[P_GAP, p] < c[R_RADIUS] + c[R_THICKNESS]
