@@ -31,7 +31,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, kernel
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.self.broad_phase import TINY
 from clothgym.collisions.self.topology import Real
 
@@ -97,42 +97,41 @@ def smooth_out(pairs, faces, smooth):
 
 
 @kernel
-def rises(p, v, nx, ny, nz, slope, triangles, around, around_triangles):
+def rises(p, v, nx, ny, nz, slope, pairs):
     """Whether the sheet rises from vertex v towards a neighbor, along n by more than ``slope`` times their distance."""
-    for m in range(around[v], around[v + 1]):
+    for m in range(pairs.around[v], pairs.around[v + 1]):
         for c in range(3):
-            q = triangles[around_triangles[m], c]
+            q = pairs.triangles[pairs.around_triangles[m], c]
             dx, dy, dz = p[q, 0] - p[v, 0], p[q, 1] - p[v, 1], p[q, 2] - p[v, 2]
             if nx * dx + ny * dy + nz * dz > TOUCHING + slope * np.sqrt(dx * dx + dy * dy + dz * dz):
                 return True
     return False
 
 
-@inlined
+@kernel
 def owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, kinds):
-    """Whether triangle t = ijk owns its contact with vertex v, whose closest point has the barycentric weights a, b and c; whether
-    no neighbor of that point is closer along the direction n; and whether the sheet is smooth there.
+    """Whether triangle t = ijk has a contact with vertex v, whose closest point has the barycentric weights a, b and c; and whether
+    the sheet is smooth there.
 
     A closest point inside the triangle belongs to this pair alone.  One on an edge or a corner is shared by several triangles: only
-    the one that owns the edge or corner has the contact; of two vertices, which meet twice, only the one with the lower number.
+    the one that owns the edge or corner has the contact, and only if no neighbor is closer along the direction n; of two vertices,
+    which meet twice, only the one with the lower number.
     """
     # inside
     if a != 0.0 and b != 0.0 and c != 0.0:
-        return True, True, True
+        return True, True
     # on a corner
     if (a == 0.0) + (b == 0.0) + (c == 0.0) == 2:
         corner = i if a != 0.0 else (j if b != 0.0 else k)
-        if pairs.vertex_owner[corner] != t or v > corner:
-            return False, False, False
-        rising = rises(p, corner, nx, ny, nz, 0.0, pairs.triangles, pairs.around, pairs.around_triangles)
-        return True, not rising, kinds[corner] == SMOOTH
+        owned = pairs.vertex_owner[corner] == t and v < corner and not rises(p, corner, nx, ny, nz, 0.0, pairs)
+        return owned, kinds[corner] == SMOOTH
     # on an edge
     edge = pairs.triangle_edges[t, 0] if a == 0.0 else (pairs.triangle_edges[t, 1] if b == 0.0 else pairs.triangle_edges[t, 2])
     if pairs.edge_owner[edge] != t:
-        return False, False, False
+        return False, False
     one, two, other = pairs.edges[edge, 0], pairs.edges[edge, 1], pairs.edge_triangles[edge, 1]
-    rising = height(p, opposite(pairs.triangles, other, one, two), one, nx, ny, nz) > TOUCHING
-    return True, not rising, other != t and (kinds[one] != CREASED or kinds[two] != CREASED)
+    owned = height(p, opposite(pairs.triangles, other, one, two), one, nx, ny, nz) <= TOUCHING
+    return owned, other != t and (kinds[one] != CREASED or kinds[two] != CREASED)
 
 
 @inlined
@@ -156,16 +155,6 @@ def towards(mx, my, mz, nx, ny, nz):
         return nx, ny, nz
     scale = scale if share > 0.0 else -scale
     return scale * mx, scale * my, scale * mz
-
-
-@inlined
-def sided(normals, v, nx, ny, nz):
-    """The same for the unit normal at vertex v, which is zero on a crease."""
-    share = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
-    if not abs(share) >= ALIGNED:
-        return nx, ny, nz
-    sign = 1.0 if share > 0.0 else -1.0
-    return sign * normals[v, 0], sign * normals[v, 1], sign * normals[v, 2]
 
 
 @inlined
@@ -197,27 +186,23 @@ def rise_of_triangle(p, normals, i, j, k, a, b, c, nx, ny, nz):
     return rise + rise_at(p, normals, k, c, qx, qy, qz, nx, ny, nz)
 
 
-@inlined
-def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, is_closest, pairs, smooth):
+@apart
+def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, pairs, smooth):
     """The contact of vertex v with the sheet about triangle ijk, from the closest point's weights, gap [m] and direction.
 
-    is_smooth, is_closest: see ``owns``.  Returns the weights of the point of the triangle's plane below v along the contact's
-    normal, the gap along it [m], which is 0 where there is no contact, the normal, and how far the smooth sheet lies
+    is_smooth: whether the sheet is, see ``owns``.  Returns the weights of the point of the triangle's plane that is below v along
+    the contact's normal, the gap along it [m], which is 0 where there is no contact, the normal, and how far the smooth sheet lies
     above that point [m].
     """
     ahead, normals, kinds = smooth.ahead, smooth.normals, smooth.kinds
-    if not is_closest:
-        return a, b, c, 0.0, nx, ny, nz, 0.0
-    # on a border or a crease: along the normal at v, if there is one near the direction; else along that, unless v's sheet rises
+    # on a border or a crease: along the normal at v, if there is one and v can be the closest
     if not is_smooth:
-        share = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
-        if abs(share) >= ALIGNED:
-            sx, sy, sz = sided(normals, v, nx, ny, nz)
-            return a, b, c, gap * abs(share), sx, sy, sz, rise_of_triangle(p, normals, i, j, k, a, b, c, sx, sy, sz)
-        slipping = kinds[v] == SMOOTH
-        if not slipping:
-            slipping = rises(p, v, -nx, -ny, -nz, SLOPE, pairs.triangles, pairs.around, pairs.around_triangles)
-        return a, b, c, 0.0 if slipping else gap, nx, ny, nz, 0.0
+        if kinds[v] == SMOOTH:
+            share = normals[v, 0] * nx + normals[v, 1] * ny + normals[v, 2] * nz
+            sx, sy, sz = towards(normals[v, 0], normals[v, 1], normals[v, 2], nx, ny, nz)
+            rise = rise_of_triangle(p, normals, i, j, k, a, b, c, sx, sy, sz)
+            return a, b, c, gap * abs(share) if abs(share) >= ALIGNED else 0.0, sx, sy, sz, rise
+        return a, b, c, 0.0 if rises(p, v, -nx, -ny, -nz, SLOPE, pairs) else gap, nx, ny, nz, 0.0
     # the triangle's sides and normal, and the point of its plane that is next to v
     ux, uy, uz = ahead[j, 0] - ahead[i, 0], ahead[j, 1] - ahead[i, 1], ahead[j, 2] - ahead[i, 2]
     wx, wy, wz = ahead[k, 0] - ahead[i, 0], ahead[k, 1] - ahead[i, 1], ahead[k, 2] - ahead[i, 2]
@@ -227,13 +212,12 @@ def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, is_closest, pa
     sb, sc = weights_of(dx, dy, dz, ux, uy, uz, wx, wy, wz, fx, fy, fz, square)
     # the mean of the smooth sheets' normals there and at v
     hx, hy, hz = towards(fx, fy, fz, nx, ny, nz)
-    ix, iy, iz = sided(normals, i, hx, hy, hz)
-    jx, jy, jz = sided(normals, j, hx, hy, hz)
-    kx, ky, kz = sided(normals, k, hx, hy, hz)
-    sa = 1.0 - sb - sc
-    mx, my, mz = sa * ix + sb * jx + sc * kx, sa * iy + sb * jy + sc * ky, sa * iz + sb * jz + sc * kz
+    mx, my, mz = 0.0, 0.0, 0.0
+    for q, share in ((i, 1.0 - sb - sc), (j, sb), (k, sc)):
+        ex, ey, ez = towards(normals[q, 0], normals[q, 1], normals[q, 2], hx, hy, hz)
+        mx, my, mz = mx + share * ex, my + share * ey, mz + share * ez
     mx, my, mz = towards(mx, my, mz, hx, hy, hz)
-    ex, ey, ez = sided(normals, v, mx, my, mz)
+    ex, ey, ez = towards(normals[v, 0], normals[v, 1], normals[v, 2], mx, my, mz)
     mx, my, mz = towards(mx + ex, my + ey, mz + ez, mx, my, mz)
     steep = mx * fx + my * fy + mz * fz
     if not steep * steep >= ALIGNED * ALIGNED * square:
@@ -262,7 +246,7 @@ def can_touch(p, e, i, j, nx, ny, nz, pairs):
     return True
 
 
-@inlined
+@apart
 def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, pairs, smooth):
     """The contact of edge e = ij with edge f = kl, from the parameters s and t of their closest points, gap [m] and direction n.
 
@@ -273,7 +257,7 @@ def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, pairs, smooth):
     # the mean of the sheets' normals
     mx, my, mz = 0.0, 0.0, 0.0
     for q, share in ((i, 1.0 - s), (j, s), (k, 1.0 - t), (l, t)):
-        ex, ey, ez = sided(normals, q, nx, ny, nz)
+        ex, ey, ez = towards(normals[q, 0], normals[q, 1], normals[q, 2], nx, ny, nz)
         mx, my, mz = mx + share * ex, my + share * ey, mz + share * ez
     mx, my, mz = towards(mx, my, mz, nx, ny, nz)
     # the points on each other along it; edges that are nearly parallel have none, and touch only where no face rises beside them

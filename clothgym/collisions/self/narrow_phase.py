@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel, uncounted
+from clothgym._jit import apart, inlined, kernel
 from clothgym.collisions.self.broad_phase import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
 from clothgym.collisions.self.contact_normals import SmoothSheet, on_edges, on_vertex, owns, smooth_out
 from clothgym.contact_memory import (
@@ -52,7 +52,6 @@ CLOSE = 0.8  # share of the reach within which a pair becomes a gap constraint
 SHARE = 0.45  # gamma_p: share of a pair's distance that each side may move by; less than a half
 SLOP = 0.01  # share of the thickness by which contacts may sink in: at rest they touch, and keep their impulses
 GROUP_JAMMED = -2  # in place of the pair of leaves of a gap constraint: it has been enforced since the last query
-DEEP = 0.8  # share of the thickness below which pairs push apart along their distance, whatever the smooth sheets do
 MARGIN = 1e-5  # part of the certified distance kept for rounding in float32 within 16 m of the origin [m]
 
 
@@ -137,16 +136,15 @@ def thickness_of(gap, rise, thickness, least):
     return min(thickness + rise, max(least + rise, gap / (1.0 - SLOP)))
 
 
-@uncounted
+@apart
 def vertex_contacts(
-    p, candidates, pairs, smooth, between_layers, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits, closest,
+    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits, closest,
     contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
     """Evaluate pairs of a vertex and a triangle: certify their distances, lower the bounds of their vertices, and write contacts
     and gap constraints.  Returns the numbers of both.
 
-    candidates: vertex, triangle and group, (candidates, 3).  smooth: see ``contact_normals``.  between_layers: whether contacts
-    are those of smooth sheets, as for all but near pairs.  reach: within which pairs matter;
+    candidates: vertex, triangle and group, (candidates, 3).  smooth: see ``contact_normals``.  reach: within which pairs matter;
     extra: how much farther around each vertex, which is also how much more than its share it may move [m], (particles,).
     thickness: of the cloth; least: the smallest thickness of a contact: a closer one is pushed apart only so far, and otherwise
     only kept from approaching.  margin: beyond the thickness within which a pair is a contact.  close: distance, less the extra of
@@ -186,21 +184,14 @@ def vertex_contacts(
         # a contact, if it is certified and within the thickness, and belongs to this triangle: of smooth sheets
         if certified <= 0.0 or certified > thickness + margin:
             continue
-        owned, is_closest, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, smooth.kinds)
+        owned, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, smooth.kinds)
         if not owned:
             continue
-        sa, sb, sc, mx, my, mz, gap, rise = a, b, c, nx, ny, nz, certified, 0.0
-        if between_layers:
-            sa, sb, sc, gap, mx, my, mz, rise = on_vertex(
-                p, v, i, j, k, a, b, c, certified, nx, ny, nz, is_smooth, is_closest, pairs, smooth
-            )
-        if gap > 0.0:
-            a, b, c, nx, ny, nz, kept = sa, sb, sc, mx, my, mz, thickness_of(gap, rise, thickness, least)
-        elif certified < DEEP * thickness:
-            kept = thickness_of(certified, 0.0, thickness, least)
-        else:
+        a, b, c, gap, nx, ny, nz, rise = on_vertex(p, v, i, j, k, a, b, c, certified, nx, ny, nz, is_smooth, pairs, smooth)
+        if gap <= 0.0:
             continue
         if contact_count < particles.shape[0]:
+            kept = thickness_of(gap, rise, thickness, least)
             write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, kept, contact_count, particles, coefficients)
             contact_count += 1
         else:
@@ -208,9 +199,9 @@ def vertex_contacts(
     return contact_count, constraint_count
 
 
-@uncounted
+@apart
 def edge_contacts(
-    p, candidates, pairs, smooth, between_layers, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
+    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
     contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
     """Evaluate pairs of edges; arguments and results as in ``vertex_contacts``, candidates: (candidates, 2).
@@ -253,16 +244,11 @@ def edge_contacts(
         # a contact, if it is certified and within the thickness
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if inside and smooth.ridges[e] and smooth.ridges[f] and certified > 0.0 and certified <= thickness + margin:
-            so, to, mx, my, mz, gap, rise = s, t, nx, ny, nz, certified, 0.0
-            if between_layers:
-                so, to, gap, mx, my, mz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, pairs, smooth)
-            if gap > 0.0:
-                s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, least)
-            elif certified < DEEP * thickness:
-                kept = thickness_of(certified, 0.0, thickness, least)
-            else:
+            s, t, gap, nx, ny, nz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, pairs, smooth)
+            if gap <= 0.0:
                 continue
             if contact_count < particles.shape[0]:
+                kept = thickness_of(gap, rise, thickness, least)
                 write_contact(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, kept, contact_count, particles, coefficients)
                 contact_count += 1
             else:
@@ -372,13 +358,13 @@ def query(p, ahead, pairs, reach, extra, held, bounds, limits, particles, coeffi
     # an int64, since a literal has a type of its own and the kernel would be compiled twice
     none = np.int64(0)
     contact_count, constraint_count = vertex_contacts(
-        p, corners, pairs, smooth, False, near, extra, thin, -np.inf, margin, close, stop, standoff,
+        p, corners, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff,
         held, bounds, limits, closest, none, particles, coefficients, none, members, planes, report,
     )  # fmt: skip
     # near pairs belong to no pair of leaves
     members[:constraint_count, G_GROUP] = -1
     contact_count, constraint_count = edge_contacts(
-        p, sides, pairs, smooth, False, near, extra, thin, -np.inf, margin, close, stop, standoff, held, bounds, limits, contact_count,
+        p, sides, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff, held, bounds, limits, contact_count,
         particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     # all other pairs: vertices and triangles, layers, then edges
@@ -386,7 +372,7 @@ def query(p, ahead, pairs, reach, extra, held, bounds, limits, particles, coeffi
     closest = np.zeros((leaves.shape[0], 4))
     closest[:, 0] = far
     contact_count, constraint_count = vertex_contacts(
-        p, corners, pairs, smooth, True, far, extra, thick, thick, margin, close, stop, standoff,
+        p, corners, pairs, smooth, far, extra, thick, thick, margin, close, stop, standoff,
         held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
@@ -396,7 +382,7 @@ def query(p, ahead, pairs, reach, extra, held, bounds, limits, particles, coeffi
     )  # fmt: skip
     sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
     contact_count, constraint_count = edge_contacts(
-        p, sides, pairs, smooth, True, far, extra, thick, -np.inf, margin, close, stop, standoff, held, bounds, limits, contact_count,
+        p, sides, pairs, smooth, far, extra, thick, -np.inf, margin, close, stop, standoff, held, bounds, limits, contact_count,
         particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     # bounds and limits: gamma_p times the smallest distances, less the margin

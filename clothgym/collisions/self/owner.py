@@ -280,7 +280,7 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     extra = np.zeros(mesh.num_particles)
     leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
     sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), reach, extra)
-    coefficients = False, reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
+    coefficients = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
     no_contacts = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype)
     none = *no_contacts, 0, np.empty((0, G_SIZE), np.int32), np.empty((0, 4)), np.empty(REPORT_SIZE)
     smooth = SmoothSheet(p, np.zeros(p.shape), np.zeros(len(p), np.uint8), np.zeros(len(pairs.edges), bool))
