@@ -15,7 +15,7 @@ from clothgym.starts import MANEUVERS
 def test_a_restored_state_goes_on_to_the_bit(tmp_path):
     mesh = sheet(13)
     made = MANEUVERS["z-fold"](mesh, seeds=range(2), self_collision="strict")
-    for _ in range(40):
+    for _ in range(25):
         made.step()
     first = made.simulation
     assert first.self_contacts.rows.min() > 10
