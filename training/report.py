@@ -3,6 +3,7 @@
     python training/report.py                                # write them anew
     python training/report.py --check                        # only say what is stale, with status 1
     python training/report.py --digests                      # first note what each environment does now: some minutes
+    python training/report.py --policies                     # first score committed policies of older code: some minutes
     python training/report.py --add runs/ClothDrape-v0_*     # first take these runs' results, and the policies that are chosen
 
 A result carries the digest of what its environment did when it was made (``clothgym.lab.digests``); the present ones are in
@@ -23,7 +24,7 @@ import suite
 import tyro
 from curves import CURVES, draw_curves, stale_curves
 from endings import refused
-from results import RESULTS, ROOT, Result, add, groups, is_present, learned, note_digests, read_digests
+from results import RESULTS, ROOT, Result, add, groups, is_present, learned, note_digests, note_policies, read_digests
 
 from clothgym import files
 from clothgym.registration import ENVIRONMENTS
@@ -40,6 +41,8 @@ class Args:
     """Folders of finished runs whose results are to be committed."""
     digests: bool = False
     """Note what each environment does now."""
+    policies: bool = False
+    """Score the committed policies that were trained on older code on the code at hand."""
     check: bool = False
     """Write nothing; say which pages are stale."""
 
@@ -234,6 +237,8 @@ def main(args: Args) -> None:
         add(args.add)
         if args.digests:
             note_digests()
+        if args.policies:
+            note_policies()
         if not args.check:
             CURVES.mkdir(exist_ok=True)
             for path in stale_curves(learned()):

@@ -12,14 +12,18 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scoring import HELD_OUT
+
 from clothgym import files
 from clothgym.adapters.runs import POLICY
+from clothgym.lab.bench import machine
 from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
 from clothgym.registration import ENVIRONMENTS
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
-RUNS, DIGESTS = RESULTS / "training", RESULTS / "digests.json"
+RUNS, DIGESTS, TODAY = RESULTS / "training", RESULTS / "digests.json", RESULTS / "policies.json"
 COMMITTED = ROOT / "clothgym" / "policies"
 KEPT = ("config.json", "evaluation.json", "progress.jsonl")
 ADVICE = "make it with  python training/report.py --digests"
@@ -70,6 +74,34 @@ def note_digests() -> None:
         digests[name] = digest_of(env_id, kwargs)
         print(name, digests[name], flush=True)
     files.write_json(DIGESTS, {"digests": digests})
+
+
+def first_successes(env_id: str, learner: str) -> int:
+    """How many of the first hundred held-out episodes a committed policy ends with success, on the code at hand."""
+    from clothgym import policies
+
+    policy = policies.load(env_id, learner)
+    env = policy.make_vec(100, autoreset_mode="Disabled")
+    seen, _ = env.reset(seed=HELD_OUT)
+    over = np.zeros(100, bool)
+    while not over.all():
+        seen, _, over, _, info = env.step(policy(seen))
+    return int(info["is_success"].sum())
+
+
+def note_policies() -> None:
+    """Score committed policies that were trained on older code on the code at hand."""
+    from clothgym import policies
+
+    digests, noted = read_digests(), {}
+    for env_id, learners in policies.available().items():
+        for learner in learners:
+            about = policies.load(env_id, learner).about
+            if not is_present(about, digests):
+                digest = digests[name_of(env_id, about["env_kwargs"])]
+                noted[f"{env_id} {learner}"] = {"digest": digest, "first_successes": first_successes(env_id, learner)}
+                print(env_id, learner, noted[f"{env_id} {learner}"], "then", about["first_successes"], flush=True)
+    files.write_json(TODAY, {"machine": machine(), "policies": noted})
 
 
 def add(folders: Iterable[Path]) -> None:

@@ -11,6 +11,9 @@ So distances are measured along the solid's normal n, and impulses act along a d
 the normal of the smoothed sheet, interpolated between normals at its particles, as far as the solid has normals of that direction
 nearby: e lies between the solid's normals at two corners of one triangle.  On a flat side, in a hollow, at spheres and capsules,
 and where the sheet does not lie along the edge, as it does not at a corner of a box, e is n.
+
+A push along e can do work, which over a whole row of triangles adds up to nothing; at rest it may keep a sheet trembling.  So
+particles that are pushed so also have a small drag.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ from clothgym._jit import inlined, uncounted
 
 WIDE = 0.71  # cosine of the angle between the solid's normals at two corners beyond which an edge is between them: 45 degrees
 ASLANT = 0.3  # sine of the angle between the sheet's normal and the plane of the solid's normals beyond which e is n
+EDGE_DRAG = 30.0  # rate at which particles that an edge pushes lose velocity relative to the solid [1/s]
 LEAST_COSINE = 0.3  # between n and e; where it is less, e is n
 # rows of scratch, one column a particle: normals of the solid, and of the sheet; the best direction so far, and its cosine with the
 # sheet's normal, or UNBENT where no edge is near

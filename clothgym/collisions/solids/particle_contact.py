@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from clothgym._jit import disjoint, inlined, uncounted
 from clothgym.collisions.solids.contact_law import TINY, contact_change, edge_change
-from clothgym.collisions.solids.edges import EDGE_ROWS, LEAST_COSINE
+from clothgym.collisions.solids.edges import EDGE_DRAG, EDGE_ROWS, LEAST_COSINE
 from clothgym.collisions.solids.shapes import (
     KIND_PLANE,
     KIND_ROUNDED_BOX,
@@ -136,13 +136,13 @@ def measure_in_scratch(rows, first, last, collider, shapes, k, within, scratch):
 
 
 @uncounted
-def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz, friction, carried):
+def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz, friction, h, carried):
     """Apply the contact law to those of particles ``first`` to ``last`` that are near an edge, and mark them as done.
 
     contacts: signed distances [m] and normals, (4, particles).  edges: particles, (edges,).  pushes: directions, (edges, 3).
     """
     zero, one, tiny = r.dtype.type(0), r.dtype.type(1), r.dtype.type(TINY)
-    least_cosine = r.dtype.type(LEAST_COSINE)
+    least_cosine, keep = r.dtype.type(LEAST_COSINE), one / (one + h * r.dtype.type(EDGE_DRAG))
     for n in range(edges.shape[0]):
         p = edges[n]
         if p < first or p >= last or not (contacts[0, p] < zero and m[p] > zero):
@@ -157,18 +157,19 @@ def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz,
         r[0, p] += mx
         r[1, p] += my
         r[2, p] += mz
-        s[0, p] += cx
-        s[1, p] += cy
-        s[2, p] += cz
+        # a drag takes what the push along e may have added
+        s[0, p] = sx + (s[0, p] + cx - sx) * keep
+        s[1, p] = sy + (s[1, p] + cy - sy) * keep
+        s[2, p] = sz + (s[2, p] + cz - sz) * keep
         contacts[0, p] = zero
 
 
 @uncounted
-def resolve_particles(r, s, m, shapes, colliders, carried, edges, pushes, counts, rows, scratch):
+def resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, counts, rows, scratch):
     """Resolve one sheet's particles' contacts with solids.
 
     r: positions [m], s: velocities [m/s], (3, particles).  m: inverse masses [1/kg], (particles,).  colliders: rows, (colliders,
-    COLLIDER_ROWS, 1).  carried: time for which the velocity has already moved the positions [s].
+    COLLIDER_ROWS, 1).  h: the substep [s].  carried: time for which the velocity has already moved the positions [s].
     edges: particles near an edge of each solid, (colliders, particles), and ``pushes``, the directions in which it pushes them,
     (colliders, particles, 3), see ``edges``; counts: how many, (colliders,).
     rows: scratch, (PARTICLE_ROWS, particles).  scratch: see ``signed_distance``.
@@ -212,7 +213,7 @@ def resolve_particles(r, s, m, shapes, colliders, carried, edges, pushes, counts
         # the contact law: first of particles near an edge, then of the others
         if counts[k] > 0:
             _respond_at_edges(
-                r, s, m, a, b, rows[P_GAP : P_GAP + 4], edges[k, : counts[k]], pushes[k], sx, sy, sz, friction, carried
+                r, s, m, a, b, rows[P_GAP : P_GAP + 4], edges[k, : counts[k]], pushes[k], sx, sy, sz, friction, h, carried
             )
         _respond(
             r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried

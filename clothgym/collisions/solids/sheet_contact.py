@@ -121,14 +121,14 @@ def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, carried, step, look
     bear_touches(r, s, m, triangles, found, which, carried)
     press_touches(r, s, m, triangles, colliders, found, which, h, carried)
     # particles
-    resolve_particles(r, s, m, shapes, colliders, carried, edges, pushes, counts, room.rows, room.scratch)
+    resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, counts, room.rows, room.scratch)
 
 
 @uncounted
 def _resolve_particles_alone(r, s, m, triangles, shapes, colliders, h, carried, step, look_every, room, lane):
     """The same without what is between the particles."""
     resolve_particles(
-        r, s, m, shapes, colliders, carried, room.edges[lane], room.pushes[lane], room.counts[lane], room.rows, room.scratch
+        r, s, m, shapes, colliders, h, carried, room.edges[lane], room.pushes[lane], room.counts[lane], room.rows, room.scratch
     )
 
 
