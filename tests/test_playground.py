@@ -115,7 +115,7 @@ def test_a_fabric_brings_its_figures_and_a_slider_is_a_figure():
     [
         ({"gravity": -1.0}, "gravity=-1.0"),
         ({"stretch_stiffness": float("nan")}, "stretch_stiffness=nan"),
-        ({"bend_rigidity": 2e-3}, "lower the shear stiffness or the rigidity"),
+        ({"bend_rigidity": 2e-3}, "lower the rigidity to"),
         ({"integrator": "xpdb"}, "did you mean 'xpbd'"),
         ({"substeps": 0}, "substeps=0"),
         ({"strain_limit": 12.0}, "10 % is 0.1"),

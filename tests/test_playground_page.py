@@ -61,7 +61,7 @@ def test_controls_turn_settings_and_follow_them():
     visitor.tick()
     handles["bending stiffness µN m"].turn(200.0)
     visitor.tick()
-    assert "lower the shear stiffness or the rigidity" in client.notifications[-1]
+    assert "lower the rigidity to" in client.notifications[-1]
     assert visitor.controls["bend_rigidity"].value == pytest.approx(0.225)
 
 
