@@ -17,6 +17,7 @@ import clothgym.envs
 from clothgym import Simulation, Sphere, State, files, grid
 from clothgym.envs.episode import TaskState
 from clothgym.playground.recording import Recording
+from clothgym.state import VERSION
 
 ROOT = Path(__file__).parent.parent
 READERS = [Recording.load, State.load, TaskState.load, lambda path: files.read_json(path, "object", "give another")]
@@ -110,7 +111,7 @@ def test_a_header_is_held_against_the_file_before_memory_is_taken(shape, tmp_pat
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("positions.npy", header.getvalue() + bytes(64))
-    (tmp_path / "it.npz").write_bytes(files.marked(buffer.getvalue(), "state", 1))
+    (tmp_path / "it.npz").write_bytes(files.marked(buffer.getvalue(), "state", VERSION))
     with pytest.raises(ValueError, match=r"it.npz' is no state .positions.npy has another size than its shape"):
         State.load(tmp_path / "it.npz")
 
@@ -120,15 +121,15 @@ def test_kind_version_and_pickles_are_told_apart(tmp_path):
     files.write_arrays(path, "recording", 1, {"a": np.arange(3)})
     with pytest.raises(ValueError, match="it is a recording"):
         State.load(path)
-    files.write_arrays(path, "state", 2, {"a": np.arange(3)})
-    with pytest.raises(ValueError, match="its format has version 2, this clothgym reads version 1"):
+    files.write_arrays(path, "state", VERSION + 1, {"a": np.arange(3)})
+    with pytest.raises(ValueError, match=f"its format has version {VERSION + 1}, this clothgym reads version {VERSION}"):
         State.load(path)
     np.savez(path, a=np.arange(3))
     with pytest.raises(ValueError, match="lacks the mark"):
         State.load(path)
     buffer = io.BytesIO()
     np.savez(buffer, a=np.array([{}]))
-    path.write_bytes(files.marked(buffer.getvalue(), "state", 1))
+    path.write_bytes(files.marked(buffer.getvalue(), "state", VERSION))
     with pytest.raises(ValueError, match="is no state"):
         State.load(path)
     with pytest.raises(ValueError, match="numbers and text only"):

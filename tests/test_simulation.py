@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from clothgym import INTEGRATORS, Material, Plane, Simulation, State, files, grid
+from clothgym.state import VERSION
 
 NAMES = list(INTEGRATORS)
 MESH = grid(5, 5, 0.2, 0.2)
@@ -87,7 +88,7 @@ def test_a_state_that_does_not_fit_is_refused(tmp_path):
             s.set_state(other.get_state())
     with pytest.raises(ValueError, match="envs=.0, 0.: names an environment twice"):
         s.reset(envs=[0, 0])
-    files.write_arrays(tmp_path / "old.npz", "state", 1, {"positions": np.zeros(3)})
+    files.write_arrays(tmp_path / "old.npz", "state", VERSION, {"positions": np.zeros(3)})
     with pytest.raises(ValueError, match="old.npz' is no state .it lacks anchors"):
         State.load(tmp_path / "old.npz")
 
