@@ -87,16 +87,21 @@ class ClothMesh:
         """Number of particles."""
         return len(self.rest_positions)
 
-    @cached_property
+    @property
     def pieces(self) -> int:
         """Number of parts that no particle holds together."""
+        return len(np.unique(self.piece_of))
+
+    @cached_property
+    def piece_of(self) -> Int:
+        """Of each particle the lowest index in its piece, (particles,)."""
         # each particle takes over the lowest label of its triangles until nothing changes
         label, before = np.arange(self.num_particles), None
         while before is None or not np.array_equal(label, before):
             before = label.copy()
             np.minimum.at(label, self.triangles, label[self.triangles].min(axis=1, keepdims=True))
             label = label[label]
-        return len(np.unique(label))
+        return frozen(label.astype(np.int32))
 
     @property
     def flat(self) -> bool:

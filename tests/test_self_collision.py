@@ -77,7 +77,7 @@ def looked_around(mesh, x, extra, most):
     room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((most, G_SIZE), np.int32), np.empty((most, 4))
     held = np.zeros(len(x), bool)
     _, constraints = query(
-        x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0, 0.0), extra, held, bounds, limits, *room, report
+        x, x, pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0, 0.0), extra, held, bounds, limits, *room, report
     )
     return bounds, limits, room[2][:constraints]
 

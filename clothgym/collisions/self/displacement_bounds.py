@@ -238,13 +238,14 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
     memory, setting = sheet.memory, sheet.setting
     start, bounds = memory.start[block], memory.bounds[block]
     particles = x.shape[1]
-    # copies of what the query reads
-    new_bounds, new_limits, extra = np.empty(particles), np.empty(particles), np.zeros(particles)
+    # copies of what the query reads; contacts are laid out where each vertex is after half of its way since the last query again
+    new_bounds, new_limits, extra, ahead = np.empty(particles), np.empty(particles), np.zeros(particles), np.empty(p.shape)
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
-            start[c, k, l] = x[c, k, l]
             p[k, c] = x[c, k, l]
+            ahead[k, c] = p[k, c] + 0.5 * (p[k, c] - start[c, k, l])
+            start[c, k, l] = x[c, k, l]
     report = memory.report[block, l]
     report[REPORT_QUERIES] += 1
     before = memory.contacts[block, l]
@@ -259,8 +260,8 @@ def look_around(x, v, w, sheet, block, l, h, p, limits, held):
     else:
         _look_ahead(v, sheet, l, h, extra)
         count, constraints = query(
-            p, sheet.pairs, reach, extra, held, new_bounds, new_limits, memory.particles[block, l], memory.coefficients[block, l],
-            memory.members[block, l], memory.planes[block, l], report,
+            p, ahead, sheet.pairs, reach, extra, held, new_bounds, new_limits, memory.particles[block, l],
+            memory.coefficients[block, l], memory.members[block, l], memory.planes[block, l], report,
         )  # fmt: skip
     memory.constraints[block, l] = constraints
     # fast mode takes no notice of distances: it queries when something may have come within reach

@@ -30,8 +30,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel
+from clothgym._jit import apart, inlined, kernel, uncounted
 from clothgym.collisions.self.broad_phase import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
+from clothgym.collisions.self.contact_normals import SmoothSheet, on_edges, on_vertex, owns, smooth_out
 from clothgym.contact_memory import (
     C_NORMAL,
     C_THICKNESS,
@@ -51,6 +52,7 @@ CLOSE = 0.8  # share of the reach within which a pair becomes a gap constraint
 SHARE = 0.45  # gamma_p: share of a pair's distance that each side may move by; less than a half
 SLOP = 0.01  # share of the thickness by which contacts may sink in: at rest they touch, and keep their impulses
 GROUP_JAMMED = -2  # in place of the pair of leaves of a gap constraint: it has been enforced since the last query
+DEEP = 0.5  # share of the thickness below which pairs push apart along their distance, whatever the smooth sheets do
 MARGIN = 1e-5  # part of the certified distance kept for rounding in float32 within 16 m of the origin [m]
 
 
@@ -125,30 +127,37 @@ def lower_limits(i, j, k, l, certified, left, close, extra, limits):
         limits[v] = min(limits[v], left if left >= close else certified - 2.0 * extra[v])
 
 
-@apart
+@inlined
+def thickness_of(gap, rise, thickness, least):
+    """Thickness of a contact [m], between smooth sheets that are closer than its vertices by ``rise``.
+
+    A contact closer than the thickness keeps its present gap, but not less than ``least``.
+    """
+    rise = min(max(rise, -0.5 * thickness), 0.5 * thickness)
+    return min(thickness + rise, max(least + rise, gap / (1.0 - SLOP)))
+
+
+@uncounted
 def vertex_contacts(
-    p, candidates, triangles, triangle_edges, vertex_owner, edge_owner, reach, extra, thickness, least, margin, close, stop,
-    standoff, held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
+    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
+    closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
     """Evaluate pairs of a vertex and a triangle: certify their distances, lower the bounds of their vertices, and write contacts
     and gap constraints.  Returns the numbers of both.
 
-    candidates: vertex, triangle and group, (candidates, 3).  reach: within which pairs matter; extra: how much farther around each
-    vertex, which is also how much more than its share it may move [m], (particles,).  thickness: of the cloth; least: the smallest
-    thickness of a contact: a closer one is pushed apart only so far, and otherwise only kept from approaching.  margin: beyond the
-    thickness within which a pair is a contact.  close: distance, less the extra of its vertices, within which a pair becomes a gap
-    constraint [m].  stop, standoff: see ``distance_to_keep``.  bounds, limits: become the smallest distances of each vertex, of all
-    its pairs and of those without a constraint [m], (particles,).  closest: becomes the smallest distance in each group [m] and its
-    direction, (groups, 4).
-
-    A closest point inside the triangle belongs to this pair alone.  One on an edge or a corner is shared by several triangles: only
-    the triangle that owns the edge or corner has the contact; of two vertices, which meet twice, only the one with the lower
-    number.
+    candidates: vertex, triangle and group, (candidates, 3).  smooth: see ``contact_normals``; contacts between different pieces of
+    a mesh are those of smooth sheets.  reach: within which pairs matter; extra: how much farther around each vertex, which is also
+    how much more than its share it may move [m], (particles,).
+    thickness: of the cloth; least: the smallest thickness of a contact: a closer one is pushed apart only so far, and otherwise
+    only kept from approaching.  margin: beyond the thickness within which a pair is a contact.  close: distance, less the extra of
+    its vertices, within which a pair becomes a gap constraint [m].  stop, standoff: see ``distance_to_keep``.  bounds, limits:
+    become the smallest distances of each vertex, of all its pairs and of those without a constraint [m], (particles,).  closest:
+    becomes the smallest distance in each group [m] and its direction, (groups, 4).
     """
     for m in range(candidates.shape[0]):
         # the closest points, and whether they are within reach
         v, t = candidates[m, 0], candidates[m, 1]
-        i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        i, j, k = pairs.triangles[t, 0], pairs.triangles[t, 1], pairs.triangles[t, 2]
         a, b, c, nx, ny, nz = gap_of_vertex(p, v, i, j, k)
         square, extras = nx * nx + ny * ny + nz * nz, extra[v] + max(extra[i], max(extra[j], extra[k]))
         if not square < (reach + extras) * (reach + extras):
@@ -177,35 +186,30 @@ def vertex_contacts(
         # a contact, if it is certified and within the thickness, and belongs to this triangle
         if certified <= 0.0 or certified > thickness + margin:
             continue
-        if b == 0.0 and c == 0.0:
-            owned = vertex_owner[i] == t and v < i
-        elif a == 0.0 and c == 0.0:
-            owned = vertex_owner[j] == t and v < j
-        elif a == 0.0 and b == 0.0:
-            owned = vertex_owner[k] == t and v < k
-        elif a == 0.0:
-            owned = edge_owner[triangle_edges[t, 0]] == t
-        elif b == 0.0:
-            owned = edge_owner[triangle_edges[t, 1]] == t
-        elif c == 0.0:
-            owned = edge_owner[triangle_edges[t, 2]] == t
-        else:
-            owned = True
-        if not owned:
+        owned, is_closest, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, smooth.kinds)
+        others = pairs.piece[v] != pairs.piece[i]
+        if not (owned and (is_closest or not others)):
             continue
-        # a contact closer than the thickness keeps its present gap, but not less than ``least``
+        sa, sb, sc, mx, my, mz, gap, rise = a, b, c, nx, ny, nz, certified, 0.0
+        if others:
+            sa, sb, sc, gap, mx, my, mz, rise = on_vertex(p, v, i, j, k, a, b, c, certified, nx, ny, nz, is_smooth, pairs, smooth)
+        if gap > 0.0:
+            a, b, c, nx, ny, nz, kept = sa, sb, sc, mx, my, mz, thickness_of(gap, rise, thickness, least)
+        elif certified < DEEP * thickness:
+            kept = thickness_of(certified, 0.0, thickness, least)
+        else:
+            continue
         if contact_count < particles.shape[0]:
-            contact_thickness = min(thickness, max(least, certified / (1.0 - SLOP)))
-            write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, contact_thickness, contact_count, particles, coefficients)
+            write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, kept, contact_count, particles, coefficients)
             contact_count += 1
         else:
             report[REPORT_DROPPED] += 1
     return contact_count, constraint_count
 
 
-@apart
+@uncounted
 def edge_contacts(
-    p, candidates, edges, ridges, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
+    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
     contact_count, particles, coefficients, constraint_count, members, planes, report,
 ):  # fmt: skip
     """Evaluate pairs of edges; arguments and results as in ``vertex_contacts``, candidates: (candidates, 2).
@@ -217,7 +221,7 @@ def edge_contacts(
     for m in range(candidates.shape[0]):
         # the closest points, and whether they are within reach
         e, f = candidates[m, 0], candidates[m, 1]
-        i, j, k, l = edges[e, 0], edges[e, 1], edges[f, 0], edges[f, 1]
+        i, j, k, l = pairs.edges[e, 0], pairs.edges[e, 1], pairs.edges[f, 0], pairs.edges[f, 1]
         extras = max(extra[i], extra[j]) + max(extra[k], extra[l])
         if segments_apart(
             p[i, 0], p[i, 1], p[i, 2], p[j, 0], p[j, 1], p[j, 2], p[k, 0], p[k, 1], p[k, 2], p[l, 0], p[l, 1], p[l, 2],
@@ -247,12 +251,18 @@ def edge_contacts(
             report[REPORT_DROPPED] += left < close
         # a contact, if it is certified and within the thickness
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
-        if inside and ridges[e] and ridges[f] and certified > 0.0 and certified <= thickness + margin:
+        if inside and smooth.ridges[e] and smooth.ridges[f] and certified > 0.0 and certified <= thickness + margin:
+            so, to, mx, my, mz, gap, rise = s, t, nx, ny, nz, certified, 0.0
+            if pairs.piece[i] != pairs.piece[k]:
+                so, to, gap, mx, my, mz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, pairs, smooth)
+            if gap > 0.0:
+                s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, least)
+            elif certified < DEEP * thickness:
+                kept = thickness_of(certified, 0.0, thickness, least)
+            else:
+                continue
             if contact_count < particles.shape[0]:
-                contact_thickness = min(thickness, max(least, certified / (1.0 - SLOP)))
-                write_contact(
-                    i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, contact_thickness, contact_count, particles, coefficients
-                )
+                write_contact(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, kept, contact_count, particles, coefficients)
                 contact_count += 1
             else:
                 report[REPORT_DROPPED] += 1
@@ -331,18 +341,17 @@ def constrain_layers(
 
 
 @inlined
-def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients, members, planes, report):
+def query(p, ahead, pairs, reach, extra, held, bounds, limits, particles, coefficients, members, planes, report):
     """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``coefficients``, and
     of gap constraints, which are in ``members`` and ``planes``.
 
-    p: positions in float64 [m], (particles, 3).  extra: how much farther than the reach to look around each vertex [m],
-    (particles,).
+    p: positions in float64 [m]; ahead: in the middle of the time that contacts last, see ``contact_normals``, both
+    (particles, 3).  extra: how much farther than the reach to look around each vertex [m], (particles,).
     held: which particles are attached, (particles,).
     bounds: becomes how far each vertex may move before its gap constraints are evaluated; limits: before a query is due [m],
     (particles,).  report: (REPORT_SIZE,).
     """
-    triangles, edges, triangle_edges = pairs.triangles, pairs.edges, pairs.triangle_edges
-    vertex_owner, edge_owner = pairs.vertex_owner, pairs.edge_owner
+    triangles, edges = pairs.triangles, pairs.edges
     # the distances of the query; pairs that are not found are farther apart than the least reach
     least_reach, margin, stop, standoff = min(reach.near, reach.far), reach.margin, reach.stop, reach.standoff
     close = CLOSE * least_reach
@@ -352,6 +361,12 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients,
     faces, ridges = np.empty((3, triangles.shape[0])), np.empty(edges.shape[0], np.bool_)
     faces_of(p, triangles, faces)
     ridges_of(faces, pairs.edge_triangles, ridges)
+    smooth = SmoothSheet(ahead, np.empty(p.shape), np.zeros(p.shape[0], np.uint8), ridges)
+    several = False
+    for v in range(p.shape[0]):
+        several |= pairs.piece[v] != pairs.piece[0]
+    if several:
+        smooth_out(pairs, faces, smooth)
     # near pairs: parts that share a leaf or whose leaves share a vertex
     near, far, thin, thick = reach.near, reach.far, reach.near_thickness, reach.far_thickness
     corners, sides = near_candidates(p, pairs, near, extra)
@@ -360,21 +375,21 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients,
     # an int64, since a literal has a type of its own and the kernel would be compiled twice
     none = np.int64(0)
     contact_count, constraint_count = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, near, extra, thin, 0.0, margin, close, stop, standoff,
+        p, corners, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff,
         held, bounds, limits, closest, none, particles, coefficients, none, members, planes, report,
     )  # fmt: skip
     # near pairs belong to no pair of leaves
     members[:constraint_count, G_GROUP] = -1
     contact_count, constraint_count = edge_contacts(
-        p, sides, edges, ridges, near, extra, thin, 0.0, margin, close, stop, standoff, held, bounds, limits, contact_count,
-        particles, coefficients, constraint_count, members, planes, report,
+        p, sides, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff, held, bounds, limits,
+        contact_count, particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     # all other pairs: vertices and triangles, layers, then edges
     leaves, gaps, corners = far_pairs(p, pairs, far, extra, faces)
     closest = np.zeros((leaves.shape[0], 4))
     closest[:, 0] = far
     contact_count, constraint_count = vertex_contacts(
-        p, corners, triangles, triangle_edges, vertex_owner, edge_owner, far, extra, thick, thick, margin, close, stop, standoff,
+        p, corners, pairs, smooth, far, extra, thick, thick, margin, close, stop, standoff,
         held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     layered = np.empty(leaves.shape[0], np.bool_)
@@ -384,8 +399,8 @@ def query(p, pairs, reach, extra, held, bounds, limits, particles, coefficients,
     )  # fmt: skip
     sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
     contact_count, constraint_count = edge_contacts(
-        p, sides, edges, ridges, far, extra, thick, 0.0, margin, close, stop, standoff, held, bounds, limits, contact_count,
-        particles, coefficients, constraint_count, members, planes, report,
+        p, sides, pairs, smooth, far, extra, thick, -np.inf, margin, close, stop, standoff, held, bounds, limits,
+        contact_count, particles, coefficients, constraint_count, members, planes, report,
     )  # fmt: skip
     # bounds and limits: gamma_p times the smallest distances, less the margin
     least = least_reach

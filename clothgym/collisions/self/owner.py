@@ -12,6 +12,7 @@ from clothgym import contact_memory
 from clothgym._jit import kernel
 from clothgym.checks import not_negative, positive
 from clothgym.collisions.self.broad_phase import Reach, far_pairs, far_sides
+from clothgym.collisions.self.contact_normals import SmoothSheet
 from clothgym.collisions.self.displacement_bounds import FARTHEST
 from clothgym.collisions.self.impulses import TOLERANCE
 from clothgym.collisions.self.narrow_phase import MARGIN, edge_contacts, gap_of_edges, gap_of_vertex, vertex_contacts
@@ -282,9 +283,9 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     coefficients = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
     no_contacts = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype)
     none = *no_contacts, 0, np.empty((0, G_SIZE), np.int32), np.empty((0, 4)), np.empty(REPORT_SIZE)
-    owners = pairs.triangles, pairs.triangle_edges, pairs.vertex_owner, pairs.edge_owner
-    vertex_contacts(p, corners, *owners, *coefficients, np.empty((len(leaves), 4)), 0, *none)
-    edge_contacts(p, sides, pairs.edges, np.zeros(len(pairs.edges), bool), *coefficients, 0, *none)
+    smooth = SmoothSheet(p, np.zeros(p.shape), np.zeros(len(p), np.uint8), np.zeros(len(pairs.edges), bool))
+    vertex_contacts(p, corners, pairs, smooth, *coefficients, np.empty((len(leaves), 4)), 0, *none)
+    edge_contacts(p, sides, pairs, smooth, *coefficients, 0, *none)
     apart = float(room.min())
     # of single triangles nothing is near, and of one alone nothing else
     shortest = np.sqrt(1 / pairs.rest_edges.max())

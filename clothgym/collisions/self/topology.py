@@ -45,6 +45,8 @@ class Pairs(NamedTuple):
     edge_triangles: both triangles of each edge, (edges, 2), the same twice on the border.
     rest_edges: 1 / (rest length)^2 of each edge [1/m^2], (edges,).
     vertex_owner, edge_owner: the triangle that owns each in contacts, (particles,), (edges,).
+    piece: which piece of the mesh each vertex belongs to, (particles,).
+    around: where the triangles around each vertex begin in ``around_triangles``, (particles + 1,).
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where those of each leaf begin in ``own_*``, (leaves + 1,).
     nodes: of the tree, each before its two children, the first of which follows it at once: see ``NODE_BEGIN``, (nodes, 3).
@@ -67,6 +69,9 @@ class Pairs(NamedTuple):
     rest_edges: Real
     vertex_owner: Int
     edge_owner: Int
+    piece: Int
+    around: Int
+    around_triangles: Int
     corners: Int
     leaf_vertices: Int
     own_vertices: Int
@@ -131,6 +136,9 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
         rest_edges=1 / length2,
         vertex_owner=_int(vertex_owner),
         edge_owner=_int(edge_owner),
+        piece=_int(mesh.piece_of),
+        around=_ranges(np.bincount(triangles.ravel(), minlength=len(x))),
+        around_triangles=_int(np.argsort(triangles.ravel(), kind="stable") // 3),
         corners=_int(corners),
         leaf_vertices=counted[0],
         own_vertices=_int(by_leaf[0]),
