@@ -32,16 +32,46 @@ def count_held(holder, anchors, out):
                     out[b, k, l] += 1
 
 
+@kernel
+def move_fingers(first, last, x, w, free_w, tips, opening, wanted, holder, limits, anchors):
+    """Begin a control step of blocks ``first`` to ``last``: fingers move by what ``limits`` allow, and grip or release.
+
+    tips: positions of the attachments [m], (blocks, attachments, 3, lanes).  holder: (blocks, particles, lanes).  opening, wanted:
+    (blocks, attachments, lanes).  limits: (attachments, 4).  anchors: the first particle of each anchor, (anchors,).
+    """
+    zero = x.dtype.type(0)
+    for b in range(first, last):
+        for k in range(anchors.shape[0], tips.shape[1]):
+            step = limits[k, FINGER_STEP]
+            for l in range(x.shape[3]):
+                before = opening[b, k, l]
+                now = min(max(wanted[b, k, l], before - step), before + step)
+                opening[b, k, l] = now
+                # they release as soon as they begin to open
+                if now > zero and before <= zero:
+                    for p in range(x.shape[2]):
+                        if holder[b, p, l] == k:
+                            holder[b, p, l] = FREE
+                            w[b, p, l] = free_w[b, p, l]
+                # they grip free particles within reach as soon as they have closed
+                elif now <= zero and before > zero:
+                    for p in range(x.shape[2]):
+                        away2 = zero
+                        for c in range(3):
+                            away2 += (x[b, c, p, l] - tips[b, k, c, l]) ** 2
+                        if away2 <= limits[k, REACH2] and holder[b, p, l] == FREE:
+                            holder[b, p, l] = k
+                            w[b, p, l] = zero
+
+
 @apart
-def steer(x, v, w, free_w, tips, targets, opening, wanted, holder, limits, anchors, time_step):
-    """Begin a control step of one block: move fingers, grip or release, and set the velocity of held particles.
+def steer(x, v, tips, targets, holder, limits, anchors, time_step):
+    """Set the velocity of held particles of one block for a control step.
 
     ``v = (target - tip)/time_step``, shortened to the speed limit.  tips: positions of the attachments [m], (attachments, 3,
-    lanes), advanced to the end of the control step.  holder: (particles, lanes).  opening, wanted: (attachments, lanes).  limits:
-    (attachments, 4).  anchors: the first particle of each anchor, (anchors,).
+    lanes), advanced to the end of the control step.  targets: likewise.  holder: (particles, lanes).
     """
     one = x.dtype.type(1)
-    zero = x.dtype.type(0)
     lanes = x.shape[2]
     move = np.empty((3, lanes), x.dtype)
     for k in range(tips.shape[0]):
@@ -51,27 +81,6 @@ def steer(x, v, w, free_w, tips, targets, opening, wanted, holder, limits, ancho
             for c in range(3):
                 for l in range(lanes):
                     tips[k, c, l] = x[c, p, l] if holder[p, l] == k else tips[k, c, l]
-        # the fingers of a gripper move
-        else:
-            step = limits[k, FINGER_STEP]
-            for l in range(lanes):
-                before = opening[k, l]
-                now = min(max(wanted[k, l], before - step), before + step)
-                opening[k, l] = now
-                # they release as soon as they begin to open
-                if now > zero and before <= zero:
-                    for p in range(x.shape[1]):
-                        if holder[p, l] == k:
-                            holder[p, l] = FREE
-                            w[p, l] = free_w[p, l]
-                # they grip free particles within reach as soon as they have closed
-                elif now <= zero and before > zero:
-                    for p in range(x.shape[1]):
-                        dx, dy, dz = x[0, p, l] - tips[k, 0, l], x[1, p, l] - tips[k, 1, l], x[2, p, l] - tips[k, 2, l]
-                        near = dx * dx + dy * dy + dz * dz <= limits[k, REACH2]
-                        if near and holder[p, l] == FREE:
-                            holder[p, l] = k
-                            w[p, l] = zero
         # velocity towards the target, up to the speed limit
         for l in range(lanes):
             dx, dy, dz = (
@@ -135,10 +144,10 @@ def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step
 
 
 @kernel
-def steer_blocks(first, last, x, v, w, free_w, tips, targets, opening, wanted, holder, limits, anchors, time_step):
+def steer_blocks(first, last, x, v, tips, targets, holder, limits, anchors, time_step):
     """``steer`` in blocks ``first`` to ``last``."""
     for b in range(first, last):
-        steer(x[b], v[b], w[b], free_w[b], tips[b], targets[b], opening[b], wanted[b], holder[b], limits, anchors, time_step)
+        steer(x[b], v[b], tips[b], targets[b], holder[b], limits, anchors, time_step)
 
 
 def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):

@@ -15,7 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from clothgym._jit import run_spans
-from clothgym.attachment_kernels import FREE, REACH2, SLIP2, bar_blocks, count_held, let_slip, pulls_with, settle_lag, steer_blocks
+from clothgym.attachment_kernels import (
+    FREE,
+    REACH2,
+    SLIP2,
+    bar_blocks,
+    count_held,
+    let_slip,
+    move_fingers,
+    pulls_with,
+    settle_lag,
+    steer_blocks,
+)
 from clothgym.bending import Bending
 from clothgym.checks import finite, indices, positive, spread, vector
 from clothgym.collisions import Solids
@@ -185,7 +196,10 @@ class Attachments:
         settle_lag(first, last, lag, behind, self.holder, self.anchors, self.limits[:, REACH2], w, free_w)
 
     def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids) -> None:
-        """Begin a control step of blocks ``first`` to ``last``: velocities of held particles, and grips, see ``steer``."""
+        """Begin a control step of blocks ``first`` to ``last``: grips, and velocities of held particles, see ``steer``."""
+        # what grippers take hold of now is carried, and kept out of solids, from this step on
+        if self.grippers:
+            move_fingers(first, last, x, w, free_w, self.x, self.opening, self.wanted, self.holder, self.limits, self.anchors)
         # where solids let the attachments go
         allowed, time_step = self.targets, x.dtype.type(self.time_step)
         if len(solids.colliders) and self.count:
@@ -194,10 +208,7 @@ class Attachments:
                 first, last, x, self.x, self.targets, self.holder, self.limits, self.anchors, time_step, solids.rows, solids.shapes,
                 allowed, self.blocked,
             )  # fmt: skip
-        steer_blocks(
-            first, last, x, v, w, free_w, self.x, allowed, self.opening, self.wanted, self.holder, self.limits, self.anchors,
-            time_step,
-        )  # fmt: skip
+        steer_blocks(first, last, x, v, self.x, allowed, self.holder, self.limits, self.anchors, time_step)
 
     def pulls(
         self,

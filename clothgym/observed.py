@@ -61,7 +61,8 @@ class Observed:
     def view(self) -> View:
         """Positions, velocities, springs and attachments in the memory of the kernels.  It is not a copy, and is read only."""
         attachments = self._attachments
-        return View(self._x, self._v, self._elements.springs, attachments.x, attachments.opening, attachments.holder)
+        held = attachments.x, attachments.opening, attachments.blocked, attachments.holder
+        return View(self._x, self._v, self._elements.springs, *held)
 
     @property
     def orders(self) -> Orders:

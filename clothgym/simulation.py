@@ -120,9 +120,8 @@ class Simulation(Observed):
         )
         self.anchors = self._attachments.anchors
         self.grippers = Grippers(self._attachments)
-        # what it touches: solids, and itself; attachments are stopped by solids with contact="sheet" alone
+        # what it touches: solids, and itself
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
-        self._barriers = self._solids if contact == "sheet" else Solids(self.layout, (), self.time_step, self.dtype)
         self.colliders = self._solids.colliders
         self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         # what its forces go over, and in float64 for the bounds of substeps
@@ -197,7 +196,7 @@ class Simulation(Observed):
                 memory = self._contact.sheet.memory
                 self._attachments.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
             held = self._attachments.holder[blocks].copy() if len(self.grippers) else None
-            self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._barriers)
+            self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
             if held is not None:
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)
             self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)

@@ -62,6 +62,7 @@ class View(NamedTuple):
     x, v: [m], [m/s], (block, 3, particles, lane).
     attachments: where anchors and then grippers are [m], (block, attachments, 3, lane).  openings: of their fingers, (block,
     attachments, lane).
+    blocked: whether solids stopped or deflected them in the last control step, (block, attachments, lane).
     holder: which of them holds each particle, or -1, (block, particles, lane).
     """
 
@@ -70,6 +71,7 @@ class View(NamedTuple):
     springs: SpringArrays
     attachments: NDArray
     openings: NDArray
+    blocked: NDArray
     holder: NDArray
 
 

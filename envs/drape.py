@@ -29,7 +29,7 @@ class DrapeTask(DrapingTask):
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
         draping.covering, draping.evaluate_cover, draping.observe_target, act=draping.let_go,
-        done=draping.holds_nothing, account=draping.account_reference, stop=draping.stop_at_target,
+        done=draping.holds_nothing, account=draping.account_reference,
     )  # fmt: skip
     acting_steps = 60
     settling_steps = 85

@@ -14,10 +14,10 @@ from clothgym.attachments import Gripper
 from clothgym.checks import shown
 from clothgym.envs import draping
 from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target, stop_at_target
+from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target
 from clothgym.envs.episode import Fields
 from clothgym.envs.experts import carry_by_places
-from clothgym.envs.gripper_task import GripperTask, close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.measures import distance
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.single import ClothEnv
@@ -46,13 +46,6 @@ def _take(own, rules, sheet, move, free):
     for k in range(rules.places.shape[0]):
         if sheet.holder[rules.places[k]] >= 0:
             own.picked[k] = 1
-
-
-@inlined
-def _stop_at_solids(own, rules, k):
-    """The target stops a tip, and the floor what it holds."""
-    stop_at_target(own, rules, k)
-    stop_at_floor(own, rules, k)
 
 
 @inlined
@@ -100,10 +93,8 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         draping.evaluate_cover,
         _observe,
         act=_take,
-        measure=measure_grips,
         account=draping.account_reference,
         fingers=close_or_open,
-        stop=_stop_at_solids,
     )
     acting_steps = 100
     settling_steps = 60

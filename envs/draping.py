@@ -42,8 +42,7 @@ SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
 ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.02
 
 LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
-BOX, POST = SHAPES.index("box"), SHAPES.index("post")
-HAND = 0.005  # distance from the target at which it stops a hand [m]
+BOX = SHAPES.index("box")
 TARGET_SLOT = 1  # the target's place among ``colliders``
 
 # of the target: its place in SHAPES, its size, its highest point [m], how it is turned, and the most that can be covered
@@ -260,39 +259,6 @@ def evaluate_cover(own, rules, sheet, info):
     info.is_success = covered and flat and info.off_center <= ENOUGH_CENTERING and info.rms_speed < ENOUGH_REST
     performance = min(share, 1.0) * info.spread * _centering(info.off_center)
     return performance / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
-
-
-@inlined
-def stop_at_target(own, rules, k):
-    """The target stops a hand ``HAND`` before its surface."""
-    if not rules.solid_hands:
-        return
-    # from the target's axis, in the plane turned with a box
-    dx, dy, z = own.targets[k, 0] - own.top[0], own.targets[k, 1] - own.top[1], own.targets[k, 2]
-    x, y = own.turn[0] * dx + own.turn[1] * dy, own.turn[0] * dy - own.turn[1] * dx
-    out = own.radius + HAND
-    if own.solid == BOX:
-        # out of the nearest face
-        ways = out - abs(x), out - abs(y), own.top[2] + HAND - z
-        least = min(ways[0], min(ways[1], ways[2]))
-        if least > 0:
-            if ways[2] == least:
-                z += least
-            elif ways[0] == least:
-                x += np.copysign(least, x)
-            else:
-                y += np.copysign(least, y)
-    else:
-        # away from the center of a sphere, or from the axis of a post, which ends in a half sphere
-        center = own.top[2] - own.radius
-        height = z - (min(z, center) if own.solid == POST else center)
-        distance = np.sqrt(x * x + y * y + height * height)
-        if distance < out:
-            share = out / max(distance, 1e-9)
-            x, y, z = x * share, y * share, z + height * (share - 1)
-    own.targets[k, 0] = own.top[0] + own.turn[0] * x - own.turn[1] * y
-    own.targets[k, 1] = own.top[1] + own.turn[1] * x + own.turn[0] * y
-    own.targets[k, 2] = z
 
 
 @inlined

@@ -21,7 +21,7 @@ from clothgym.envs.flattening import (
     observe_spread,
     spread_potential,
 )
-from clothgym.envs.gripper_task import close_or_open, stop_at_floor
+from clothgym.envs.gripper_task import close_or_open
 from clothgym.envs.manipulation import CORNERS, PHYSICS, WAYS, observe_ways
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
@@ -87,7 +87,6 @@ class FlattenTask(SpreadingTask):
         measure=measure_coverage,
         account=account_spread,
         fingers=close_or_open,
-        stop=stop_at_floor,
     )
     acting_steps = 300
     settling_steps = 40

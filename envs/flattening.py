@@ -10,7 +10,6 @@ from clothgym._jit import inlined
 from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
 from clothgym.envs.definition import VELOCITY_BOUND, Observation
 from clothgym.envs.episode import Fields
-from clothgym.envs.gripper_task import measure_grips
 from clothgym.envs.manipulation import ManipulationTask, follow, observe_grippers
 from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
 from clothgym.envs.taking import beside_corners
@@ -35,7 +34,6 @@ def improvement(coverage, start):
 @inlined
 def measure_coverage(own, rules, sheet):
     """Grips; how high each gripper has been since it took hold; and the coverage, on the coarser grid but for the start."""
-    measure_grips(own, rules, sheet)
     for k in range(sheet.holds.shape[0]):
         own.raised[k] = max(own.raised[k], sheet.attachments[k, 2]) if sheet.holds[k] > 0 else 0.0
     # a sheet that has failed keeps the last one

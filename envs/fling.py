@@ -24,7 +24,7 @@ from clothgym.envs.flattening import (
 )
 from clothgym.envs.fling_expert import Throw, fling_actions
 from clothgym.envs.fling_starts import held_sheets
-from clothgym.envs.gripper_task import GripperTask, close_or_open, stop_at_floor
+from clothgym.envs.gripper_task import GripperTask, close_or_open
 from clothgym.envs.manipulation import PHYSICS, REACH, follow
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
@@ -82,15 +82,6 @@ def _measure_throws(own, rules, sheet):
 
 
 @inlined
-def _stop_in_reach(own, rules, k):
-    """While its fingers close on its corner a tip stays there; the floor stops what it holds.  (The arena is the box.)"""
-    if own.step < CLOSING:
-        for c in range(3):
-            own.targets[k, c] = own.tips[k, c]
-    stop_at_floor(own, rules, k)
-
-
-@inlined
 def _tell(own, info):
     """Throws, and the coverage after each."""
     info.throws = own.throws
@@ -138,7 +129,6 @@ class FlingTask(SpreadingTask):
     physics = replace(PHYSICS, attachment_speed=SPEED, grippers=(Gripper(speed=2 * SPEED, reach=REACH),) * 2)
     kernels = Kernels(
         spread_potential, _evaluate_fling, _observe_fling, measure=_measure_throws, account=_account_fling, fingers=close_or_open,
-        stop=_stop_in_reach,
     )  # fmt: skip
     acting_steps = 300
     # the expert's, see ``fling_expert``
@@ -224,9 +214,12 @@ class FlingTask(SpreadingTask):
         return self.uneven(x, rng)
 
     def before_step(self, actions: NDArray) -> None:
-        """Fingers that close on the corners at the start, and those that may not close."""
+        """Grippers that stay and close on the corners at the start, and fingers that may not close."""
         block, lane = self._place
-        wanted = self.simulation.orders.openings
+        wanted, targets = self.simulation.orders.openings, self.simulation.orders.targets
+        first = np.flatnonzero(self.episode["step"] <= CLOSING)
+        if first.size:
+            targets[block[first], :, :, lane[first]] = self.episode["targets"][first] = self.episode["tips"][first]
         ordered = wanted[block, :, lane]
         ordered[self.episode["step"] <= CLOSING] = 0
         ordered[self.episode["barred"] == 1] = 1

@@ -15,7 +15,7 @@ from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.gripper_task import close_or_open
 from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
 from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.single import ClothEnv
@@ -134,7 +134,6 @@ def overlap(x, share, folds, triangles, cell):
 @inlined
 def _measure(own, rules, sheet):
     """How far the sheet is from its nearest ideal fold, in sides."""
-    measure_grips(own, rules, sheet)
     error, worst, height = fold_errors(sheet.x, sheet.mesh.share, rules.folds)
     own.error, own.worst, own.height = error / rules.side, worst / rules.side, height / rules.side
 
@@ -217,7 +216,6 @@ class FoldTask(ManipulationTask):
         measure=_measure,
         account=_account,
         fingers=close_or_open,
-        stop=stop_at_floor,
     )
     settling_steps = 60
     observations = (

@@ -15,7 +15,7 @@ from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
 from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
 from clothgym.envs.fold_hard import LARGE_SILK
-from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.gripper_task import close_or_open
 from clothgym.envs.manipulation import CORNERS, REACH, WAYS, ManipulationTask, follow, observe_grippers, observe_ways
 from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.single import ClothEnv
@@ -37,7 +37,6 @@ GOALS = ("achieved_goal", "desired_goal")
 @inlined
 def _measure(own, rules, sheet):
     """How far the corners are from their goals, in sides: on the average and at most."""
-    measure_grips(own, rules, sheet)
     total, worst = 0.0, 0.0
     for k in range(CORNERS):
         away = distance(sheet.x[:, rules.corners[k]], own.goal[k]) / rules.side
@@ -106,7 +105,6 @@ class FoldGoalTask(ManipulationTask):
         measure=_measure,
         account=_account,
         fingers=close_or_open,
-        stop=stop_at_floor,
     )
     acting_steps = 80
     settling_steps = 40

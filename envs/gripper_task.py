@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -11,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import LARGEST, one_of
+from clothgym.checks import one_of
 from clothgym.envs import pick_place
-from clothgym.envs.episode import Fields
 from clothgym.envs.settling import settle
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.task import Task
@@ -31,26 +29,6 @@ def close_or_open(move, wanted, acting):
     return 0.0 if move[3] < CLOSES else wanted
 
 
-@inlined
-def measure_grips(own, rules, sheet):
-    """How far each tip must stay above the floor: what a gripper holds, it holds below."""
-    # fingers on their way may take hold within the next step: the tip stays as high as it is
-    for k in range(own.under.shape[0]):
-        own.under[k] = sheet.attachments[k, 2] if sheet.holds[k] == 0 and 0 < sheet.openings[k] < 1 else 0.0
-    # the lowest particle that each holds
-    for p in range(sheet.holder.shape[0]):
-        k = sheet.holder[p]
-        if k >= 0:
-            own.under[k] = max(own.under[k], sheet.attachments[k, 2] - sheet.x[2, p])
-
-
-@inlined
-def stop_at_floor(own, rules, k):
-    """The floor stops what a gripper holds."""
-    if rules.solid_hands:
-        own.targets[k, 2] = max(own.targets[k, 2], own.under[k])
-
-
 class GripperTask(Task):
     """Base of the tasks that use grippers, which are those of ``physics``; an action is a velocity and what fingers do, for each.
 
@@ -65,8 +43,7 @@ class GripperTask(Task):
     """
 
     actions_per_attachment = 4
-    kernels = IN_NUMPY._replace(fingers=close_or_open, measure=measure_grips, stop=stop_at_floor)
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"under": (0.0, LARGEST)}
+    kernels = IN_NUMPY._replace(fingers=close_or_open)
     picks: ClassVar[int] = 4
     workspace: ClassVar[float] = 1.25
     arguments: ClassVar = {
@@ -128,10 +105,6 @@ class GripperTask(Task):
             return super().most_steps()
         rests = -(-self.settling_steps // pick_place.STEPS) if self.settling == "steps" else 0
         return self.acting_steps // pick_place.STEPS + rests
-
-    def remembers(self) -> Fields:
-        # how far each tip must stay above the floor [m]
-        return [*super().remembers(), ("under", float, len(self.physics.grippers))]
 
     def _drawn(self) -> list[NDArray]:
         return [*super()._drawn(), self.gripper_starts]

@@ -16,8 +16,8 @@ from clothgym.envs.definition import Observation
 from clothgym.envs.draping import holds_nothing, let_go
 from clothgym.envs.experts import as_actions, carry_by_places
 from clothgym.envs.from_floor import REACH, FromFloorTask, grippers_seen, observe_picking, take, taken
-from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
-from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail, stop_at_rail
+from clothgym.envs.gripper_task import close_or_open
+from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.rumpled import rumpled_sheets
 from clothgym.envs.single import ClothEnv
@@ -48,20 +48,6 @@ def _observe_held(own, rules, sheet, seen):
     observe_rail(own, rules, sheet, seen)
     for k in range(sheet.holds.shape[0]):
         seen.holds[k] = sheet.holds[k] > 0
-
-
-@inlined
-def _measure_both(own, rules, sheet):
-    """How the sheet hangs, and how far the tips must stay above the floor."""
-    measure_hang(own, rules, sheet)
-    measure_grips(own, rules, sheet)
-
-
-@inlined
-def _stop_at_solids(own, rules, k):
-    """The rail stops a tip, and the floor what it holds."""
-    stop_at_rail(own, rules, k)
-    stop_at_floor(own, rules, k)
 
 
 @inlined
@@ -107,7 +93,7 @@ class HangTask(HangingTask):
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
         _hanging, hanging.evaluate_hang, _observe_held, act=let_go, measure=measure_hang, done=holds_nothing,
-        account=hanging.account_hang, stop=stop_at_rail,
+        account=hanging.account_hang,
     )  # fmt: skip
     acting_steps = 80
     actions_per_attachment = 4
@@ -146,8 +132,8 @@ class HangHardTask(HangingTask, FromFloorTask):
     )
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=take, measure=_measure_both,
-        account=hanging.account_hang, fingers=close_or_open, stop=_stop_at_solids,
+        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=take, measure=measure_hang,
+        account=hanging.account_hang, fingers=close_or_open,
     )  # fmt: skip
     acting_steps = 130
     radius = 0.035

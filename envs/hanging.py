@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 # in sides: half the rail's length between the axes of its posts; heights of its axis; how far its middle is from the origin
 HALF_LENGTH, HEIGHTS, SPREAD = 0.75, (0.75, 1.0), 0.15
 TURN = np.pi / 4  # [rad]: a rail is turned by at most this
-HAND = 0.005  # distance from the rail at which it stops a hand [m]
 RAIL_SLOT, POSTS = 1, (2, 3)  # places among ``colliders``
 
 LYING = 0.03  # cloth lower than this lies on the floor [m]
@@ -138,32 +137,6 @@ def account_hang(own, rules, sheet, info, terms, running, failure):
         free = free and sheet.holds[k] == 0
     follow(own, info, hang_score(own), free and hangs(own), running, failure)
     return 0.0
-
-
-@inlined
-def stop_at_rail(own, rules, k):
-    """The rail and its posts stop a hand ``HAND`` before their surfaces."""
-    if not rules.solid_hands:
-        return
-    # along the rail, across it, and above its axis
-    dx, dy, h = own.targets[k, 0] - own.rail[0], own.targets[k, 1] - own.rail[1], own.targets[k, 2] - own.rail[2]
-    u, v = own.turn[0] * dx + own.turn[1] * dy, own.turn[0] * dy - own.turn[1] * dx
-    out = rules.radius + HAND
-    for _ in range(2):
-        # away from the nearest point of the rail's axis, then of the nearer post's
-        for post in range(2):
-            near = np.copysign(rules.ends, u) if post else min(max(u, -rules.ends), rules.ends)
-            level = min(h, 0.0) if post else 0.0
-            du, dh = u - near, h - level
-            distance = np.sqrt(du * du + v * v + dh * dh)
-            if distance < out:
-                if distance < 1e-9:
-                    v, distance = -1e-9, 1e-9
-                share = out / distance
-                u, v, h = near + share * du, share * v, level + share * dh
-    own.targets[k, 0] = own.rail[0] + own.turn[0] * u - own.turn[1] * v
-    own.targets[k, 1] = own.rail[1] + own.turn[1] * u + own.turn[0] * v
-    own.targets[k, 2] = own.rail[2] + h
 
 
 @inlined

@@ -23,7 +23,7 @@ from clothgym.envs.from_floor import (
     take,
     taken,
 )
-from clothgym.envs.gripper_task import close_or_open, measure_grips, stop_at_floor
+from clothgym.envs.gripper_task import close_or_open
 from clothgym.envs.hooking import (
     ARM,
     POST_RADIUS,
@@ -34,7 +34,6 @@ from clothgym.envs.hooking import (
     measure_hook,
     observe_hook,
     sheet_with_hole,
-    stop_at_hook,
 )
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.rumpled import rumpled_sheets
@@ -71,20 +70,6 @@ def _observe_held(own, rules, sheet, seen):
     observe_hook(own, rules, sheet, seen)
     for k in range(sheet.holds.shape[0]):
         seen.holds[k] = sheet.holds[k] > 0
-
-
-@inlined
-def _measure_both(own, rules, sheet):
-    """How the sheet hangs, and how far the tips must stay above the floor."""
-    measure_hook(own, rules, sheet)
-    measure_grips(own, rules, sheet)
-
-
-@inlined
-def _stop_at_solids(own, rules, k):
-    """The hook stops a tip, and the floor what it holds."""
-    stop_at_hook(own, rules, k)
-    stop_at_floor(own, rules, k)
 
 
 @inlined
@@ -140,7 +125,7 @@ class HookTask(HookingTask):
     physics = replace(draping.PHYSICS, mesh=SHEET.mesh, anchors=SHEET.corners[2:], substeps=56)
     kernels = Kernels(
         _hooking, hooking.evaluate_hook, _observe_held, act=let_go, measure=measure_hook, done=holds_nothing,
-        account=hooking.account_hook, stop=stop_at_hook,
+        account=hooking.account_hook,
     )  # fmt: skip
     acting_steps = 100
     actions_per_attachment = 4
@@ -180,8 +165,8 @@ class HookHardTask(HookingTask, FromFloorTask):
     )
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _picking_and_hooking, hooking.evaluate_hook, _observe_grippers, act=take, measure=_measure_both,
-        account=hooking.account_hook, fingers=close_or_open, stop=_stop_at_solids,
+        _picking_and_hooking, hooking.evaluate_hook, _observe_grippers, act=take, measure=measure_hook,
+        account=hooking.account_hook, fingers=close_or_open,
     )  # fmt: skip
     acting_steps = 160
     observations = (*hooking.OBSERVATIONS, grippers_seen("the arm's tip"))

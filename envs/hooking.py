@@ -17,7 +17,7 @@ from clothgym.collisions import Capsule, Collider, Plane
 from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.framed import FramedTask
-from clothgym.envs.hanging import HAND, LYING, SPEED_SCALE
+from clothgym.envs.hanging import LYING, SPEED_SCALE
 from clothgym.envs.manipulation import follow
 from clothgym.envs.measures import SPEED2, distance, share_above
 from clothgym.envs.targets import FRICTION, ON_FLOOR
@@ -201,38 +201,6 @@ def account_hook(own, rules, sheet, info, terms, running, failure):
 
 
 @inlined
-def stop_at_hook(own, rules, k):
-    """Arm and post stop a hand ``HAND`` before their surfaces."""
-    if not rules.solid_hands:
-        return
-    target = own.targets[k]
-    # away from the nearest point of the arm's axis, then of the post's; twice, for what one has pushed into the other
-    for step in range(4):
-        if step % 2 == 0:
-            along, size2, out = 0.0, 0.0, rules.arm_radius + HAND
-            for c in range(3):
-                along += (target[c] - own.root[c]) * (own.tip[c] - own.root[c])
-                size2 += (own.tip[c] - own.root[c]) ** 2
-            share = min(max(along / size2, 0.0), 1.0)
-            x, y, z = (
-                target[0] - own.root[0] - share * (own.tip[0] - own.root[0]),
-                target[1] - own.root[1] - share * (own.tip[1] - own.root[1]),
-                target[2] - own.root[2] - share * (own.tip[2] - own.root[2]),
-            )
-        else:
-            out = rules.post_radius + HAND
-            x, y, z = target[0] - own.root[0], target[1] - own.root[1], max(target[2] - own.root[2] - rules.top, 0.0)
-        away = np.sqrt(x * x + y * y + z * z)
-        if away < out:
-            if away < 1e-9:
-                x, y, z, away = own.turn[0] * 1e-9, own.turn[1] * 1e-9, 0.0, 1e-9
-            more = out / away - 1
-            target[0] += more * x
-            target[1] += more * y
-            target[2] += more * z
-
-
-@inlined
 def observe_hook(own, rules, sheet, seen):
     """The hole and the hook, relative to the arm's tip, and the time."""
     for c in range(3):
@@ -301,9 +269,7 @@ class HookingTask(FramedTask):
         areas = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
         own = {"areas": areas / areas.sum(), "rim": self.sheet_cut.rim, "arm": ARM * side}
         own |= {"arm_out": ARM * side * float(np.cos(RISE)), "arm_up": ARM * side * float(np.sin(RISE))}
-        return super().constants() | own | {
-            "arm_radius": ARM_RADIUS * side, "post_radius": POST_RADIUS * side, "top": TOP * side,
-        }  # fmt: skip
+        return super().constants() | own
 
     @classmethod
     def observed_particles(cls, mesh: ClothMesh) -> NDArray:

@@ -37,9 +37,8 @@ COMMON: dict[str, tuple[str, str]] = {
     "substeps": ("$substeps", 'substeps of a control step, or ``"auto"``'),
     "physics": (
         '``"true"``',
-        "whole-sheet contact with solids, strict contact with itself, rigidity, solids that stop hands; "
-        'or ``"fast"``: contact with particles alone, none of the sheet with itself, skip springs in the place of rigidity, hands '
-        "that go through solids",
+        "whole-sheet contact with solids, strict contact with itself, rigidity; "
+        'or ``"fast"``: contact with particles alone, none of the sheet with itself, skip springs in the place of rigidity',
     ),
     "bending": ("``None``", 'that of ``physics``; or ``"springs"``, ``"hinge"``, ``"quadratic"``, see ``clothgym.bending``'),
     "strain_limit": (
@@ -50,7 +49,7 @@ COMMON: dict[str, tuple[str, str]] = {
         'that of ``physics``; or ``False``, ``"fast"``, ``"strict"``, with ``self_contacts`` and ``attachment_lag`` in ``info``',
     ),
     "contact": (
-        "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet, which solids stop',
+        "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet',
     ),
     "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
     "obs_mode": (

@@ -24,7 +24,7 @@ PHYSICS = ("true", "fast")
 Held = tuple[int | tuple[int, ...], ...]  # particles that anchors hold, as ``Simulation`` takes them
 ROWS, SIDES = (5, 49), (0.1, 1.0)  # that can be chosen: finer sheets take minutes to come to rest; in the tasks' arenas [m]
 # the short cuts of most benchmarks
-SHORT_CUTS: dict[str, Any] = {"contact": "particles", "self_collision": False, "bending": "springs", "solid_hands": False}
+SHORT_CUTS: dict[str, Any] = {"contact": "particles", "self_collision": False, "bending": "springs"}
 MEDIAN = Material.preset("median")
 MEDIAN = replace(MEDIAN, air_drag=2 * MEDIAN.density)  # 2 per second, the middle of what was found for filmed cloth
 MEASURED = ("density", "stretch_stiffness", "shear_stiffness", "bend_rigidity")  # what presets take from measurements
@@ -44,7 +44,6 @@ class Physics:
         wind: what the air does, unless the environment's keyword says otherwise.
         contact, self_collision, bending: as ``Simulation`` takes them.  Of a sheet that is not flat at rest hinges resist the
             bending, and a warning says so, unless an environment's keyword names another model.
-        solid_hands: whether solids stop what holds the sheet, in tasks whose kernels see to it.
         fast: what physics="fast" changes beside ``SHORT_CUTS``.
     """
 
@@ -61,7 +60,6 @@ class Physics:
     contact: str = "sheet"
     self_collision: Any = "strict"
     bending: str = "quadratic"
-    solid_hands: bool = True
     fast: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -72,9 +70,9 @@ class Physics:
     def chosen(self, name: str) -> Physics:
         """This, "true"; or "fast", with the short cuts that most benchmarks take.
 
-        True: the whole sheet is in contact with solids and, strictly, with itself, solids stop hands, and the sheet bends with its
-        rigidity.  Fast: solids touch particles alone, the sheet passes through itself and hands through solids, skip springs, which
-        have no rigidity in the flat state, stand for bending, and what the id has in ``fast``.
+        True: the whole sheet is in contact with solids and, strictly, with itself, and the sheet bends with its rigidity.  Fast:
+        solids touch particles alone, the sheet passes through itself, skip springs, which have no rigidity in the flat state, stand
+        for bending, and what the id has in ``fast``.
 
         Raises:
             ValueError: another name.

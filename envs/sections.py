@@ -67,7 +67,7 @@ def physics_of(task_class: type[Task]) -> list[str]:
         _fabric(physics.material),
         *([f"friction {' to '.join(f'{one:g}' for one in (frictions[0], frictions[-1])[: len(frictions)])}"] if solids else []),
         _air(physics),
-        *([stopped] if _has(task_class, "stop") else []),
+        *([stopped] if solids else []),
         f"{round(1 / physics.time_step)} Hz control",
         f"``{physics.integrator}`` with {_substeps(physics)}",
     ]
@@ -75,7 +75,6 @@ def physics_of(task_class: type[Task]) -> list[str]:
         *(["contact of particles alone"] if solids else []),
         "none of the sheet with itself" if solids else "no self-collision",
         "skip springs without rigidity",
-        *(["hands that go through solids"] if _has(task_class, "stop") else []),
         *([_fabric(fast.material)] if fast.material != physics.material else []),
         *([_air(fast)] if fast.air_density != physics.air_density else []),
         *([_substeps(fast)] if fast.substeps != physics.substeps else []),

@@ -40,7 +40,6 @@ account = placeholder(
     "of (own, rules, sheet, info, terms, running, failure), at an episode's start, not running, and after each step: the rest of "
     "info, and the sum of the task's own reward terms",
 )
-stop = placeholder("stop", "of (own, rules, k): moves the place where attachment k is to go, own.targets[k], out of solids")
 fingers = placeholder("fingers", "of (move, wanted, acting): how far a gripper's fingers are to open, from 0 to 1")
 
 
@@ -99,11 +98,6 @@ def _no_fingers(move, wanted, acting):
     return wanted
 
 
-@inlined
-def _nothing_stops(own, rules, k):
-    """Hands go where they like."""
-
-
 class Kernels(NamedTuple):
     """A task's own part of a step, see the module."""
 
@@ -115,7 +109,6 @@ class Kernels(NamedTuple):
     done: Any = _never
     account: Any = _no_more
     fingers: Any = _no_fingers
-    stop: Any = _nothing_stops
 
 
 IN_NUMPY = Kernels(_performance_written, _evaluation_written, _observed_already, done=_done_written)
@@ -214,8 +207,6 @@ def apply_actions(envs, actions, block, lane, rules, episode, air, outcome, targ
                 if acting:
                     there = own.targets[k, c] + rule.reach * (move[c] / slow)
                     own.targets[k, c] = min(max(there, rule.low[c]), rule.high[c])
-            if acting:
-                stop(own, rule, k)
             for c in range(3):
                 targets[b, k, c, l] = own.targets[k, c]
             wanted[b, k, l] = fingers(move, wanted[b, k, l], acting)
@@ -231,12 +222,13 @@ def apply_actions(envs, actions, block, lane, rules, episode, air, outcome, targ
 
 
 def finish_step(
-    first, last, envs, block, lane, begins, x, v, holder, attachments, openings, pulls, mesh, rules, episode, air, outcome, info,
-    terms, seen, more, bound, observation,
+    first, last, envs, block, lane, begins, x, v, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air, outcome,
+    info, terms, seen, more, bound, observation,
 ):  # fmt: skip
     """Score and observe environments ``envs[first:last]`` after a control step; or as their episodes begin, if it ``begins``.
 
-    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, holder, attachments, openings: a simulation's, see ``state.View``.
+    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, holder, attachments, openings, blocked: a simulation's, see
+    ``state.View``.
     pulls: (len(envs), attachments, 3).  more: ``seen`` as numbers.
     """
     # room for one environment's ``Sheet``, used for one after the other
@@ -244,15 +236,15 @@ def finish_step(
     holds = np.empty(attachments.shape[1], np.int64)
     for i in range(first, last):
         finish_one(
-            envs[i], block[i], lane[i], begins, x, v, holder, attachments, openings, pulls[i], mesh, rules, episode, air, outcome,
-            info, terms, seen, more, bound, observation, points, summary, holds,
+            envs[i], block[i], lane[i], begins, x, v, holder, attachments, openings, blocked, pulls[i], mesh, rules, episode, air,
+            outcome, info, terms, seen, more, bound, observation, points, summary, holds,
         )  # fmt: skip
 
 
 @uncounted
 def finish_one(
-    e, b, l, begins, x, v, holder, attachments, openings, pulls, mesh, rules, episode, air, outcome, info, terms, seen, more, bound,
-    observation, points, summary, holds,
+    e, b, l, begins, x, v, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air, outcome, info, terms, seen,
+    more, bound, observation, points, summary, holds,
 ):  # fmt: skip
     """The same for environment ``e`` in block ``b`` and lane ``l``; points, summary, holds: room for its ``Sheet``."""
     own, rule = episode[e], rules[0]
@@ -262,11 +254,13 @@ def finish_one(
     summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
     held = holder[b, :, l], attachments[b, :, :, l], openings[b, :, l], holds
     sheet = Sheet(points[0], points[1], *held, pulls, air[e], summary, mesh)
-    if begins:
-        # an episode's start: attachments stay where they are, and the potential has its first value
-        for k in range(attachments.shape[1]):
+    # attachments stay where they are as an episode starts, and go on from where a solid has stopped them
+    for k in range(attachments.shape[1]):
+        if begins or blocked[b, k, l]:
             for c in range(3):
                 own.targets[k, c] = sheet.attachments[k, c]
+    if begins:
+        # the potential has its first value
         measure(own, rule, sheet)
         own.potential = potential(own, rule, sheet)
         # info is of the sheet as it starts

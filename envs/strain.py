@@ -34,8 +34,6 @@ FABRIC = Material.preset("knit", damping_time=1e-3)
 WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
 
 POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
-POST_TOP = POST_HEIGHT - POST_RADIUS  # of the post as it stands, see ``_post`` [m]
-HAND = 0.005  # distance from the post at which it stops a clip [m]
 FRICTION = 0.3
 CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first way-point [m]
 WAYPOINTS = 3  # beside the post, beyond it, and the goal
@@ -132,18 +130,6 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 
 @inlined
-def _stop_at_post(own, rules, k):
-    """The post stops a clip ``HAND`` before its surface; its top is far above the arena's middle, and flat."""
-    if not rules.solid_hands or own.targets[k, 2] > POST_TOP:
-        return
-    x, y = own.targets[k, 0] - own.post[0], own.targets[k, 1] - own.post[1]
-    away = np.sqrt(x * x + y * y)
-    if away < POST_RADIUS + HAND:
-        share = (POST_RADIUS + HAND) / max(away, 1e-9)
-        own.targets[k, 0], own.targets[k, 1] = own.post[0] + share * x, own.post[1] + share * y
-
-
-@inlined
 def _observe(own, rules, sheet, seen):
     """The ways to the next two way-points, the post, the wind, strain and pulls, the threshold and the time."""
     # ways and pulls of both clips
@@ -180,9 +166,7 @@ class StrainTask(Task):
         wind=Wind(speed=(0.0, 1.0), gust=0.3, gust_time=0.5),
         fast={"substeps": 35},
     )
-    kernels = Kernels(
-        _potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account, stop=_stop_at_post
-    )
+    kernels = Kernels(_potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account)
     acting_steps = 150
     strain_shown = 0.1
     observations = (

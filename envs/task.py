@@ -177,7 +177,7 @@ class Task(TaskDefinition):
         self.rules = record_of(
             low=low, high=high, reach=physics.attachment_speed * physics.time_step, per_side=np.float32(1 / physics.side),
             acting_steps=self.acting_steps, settling_steps=self.settling_steps, sparse=self.reward_mode == "sparse",
-            side=physics.side, solid_hands=physics.solid_hands, **self.constants(),
+            side=physics.side, **self.constants(),
         )  # fmt: skip
         numbers = [f"{name}={value:.6g}" for name, value in sorted(self.constants().items()) if np.ndim(value) == 0]
         digest = hashlib.sha256(" ".join(numbers).encode()).hexdigest()[:16]
@@ -387,9 +387,9 @@ class Task(TaskDefinition):
 
         def work(first: int, last: int) -> None:
             self._finish_step(
-                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.attachments, view.openings, pulls, mesh,
-                self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more, self._bound,
-                self.observation,
+                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.attachments, view.openings, view.blocked,
+                pulls, mesh, self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more,
+                self._bound, self.observation,
             )  # fmt: skip
 
         _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))

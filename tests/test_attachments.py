@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from clothgym import INTEGRATORS, Gripper, Material, Simulation, State, grid
+from clothgym import INTEGRATORS, Gripper, Material, Plane, Simulation, State, grid
 
 NAMES = list(INTEGRATORS)
 CONSISTENT = [name for name in NAMES if INTEGRATORS[name].order is not None]  # pbd's springs do not pull with the fabric's force
@@ -421,3 +421,17 @@ def test_bad_orders_are_named_and_change_nothing(call, name):
     after = s.get_state()
     for field in ("attachment_positions", "attachment_targets", "openings", "wanted_openings"):
         assert np.array_equal(getattr(before, field), getattr(after, field))
+
+
+def test_what_fingers_take_in_a_step_is_kept_out_of_the_floor_in_that_step():
+    """They close in one step, in which the tip is told to go down by 3 cm, and what they take lies 1 cm below it."""
+    quick = Gripper(position=(*REST[12, :2], 0.02), reach=0.02, closing_time=1e-3, speed=10)
+    s = simulation(grippers=[quick], colliders=[Plane(thickness=0.01)])
+    s.reset(positions=REST + (0, 0, 0.01))
+    s.grippers.move([[[*REST[12, :2], -0.01]]], [[0]])
+    s.step()
+    assert np.flatnonzero(s.grippers.holder[0] == 0).tolist() == [12]
+    assert s.positions[0, 12, 2] == pytest.approx(0, abs=1e-5)
+    # and is still: what it pushes against the floor does not creep
+    s.step(10)
+    assert s.positions[0, 12, 2] == pytest.approx(0, abs=1e-5)

@@ -242,7 +242,8 @@ def test_arm_and_post_stop_hands(env_id):
         share = np.clip((hands[0] - root) @ (tip - root) / (0.3 * side) ** 2, 0, 1)
         post = np.linalg.norm([*(hands[1] - root)[:2], max(hands[1, 2] - root[2] - 0.3 * side, 0)])
         nearest = np.minimum(nearest, [np.linalg.norm(hands[0] - root - share * (tip - root)), post])
-    assert 0.02 * side < nearest[0] < 0.02 * side + 0.02 and 0.03 * side < nearest[1] < 0.03 * side + 0.02
+    radii = side * np.array([0.02, 0.03])
+    assert np.all((nearest > radii - 2e-5) & (nearest < radii + 0.02))
 
 
 @pytest.mark.parametrize("env_id", IDS)
