@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from clothgym import limiting
 from clothgym._jit import placeholder, specialize, uncounted, used
 from clothgym.bending import Bending
-from clothgym.collisions.self.step import KERNELS as SELF_CONTACT
+from clothgym.collisions.self.step import kernels_of as self_contact_kernels
 from clothgym.collisions.solids.sheet_contact import kernels_of as contact_kernels
 from clothgym.elements import Elastic
 from clothgym.forces import add_air_forces
@@ -154,7 +154,9 @@ def compiled(
     ``room_for_block``."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     touching = contact_kernels(contact, by_particle)
-    parts = limiting.kernels_of(limits, by_particle) | SELF_CONTACT[collides] | used(advance, forces | touching)
+    parts = (
+        limiting.kernels_of(limits, by_particle) | self_contact_kernels(collides, by_particle) | used(advance, forces | touching)
+    )
     parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **used(substep, forces))
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
     room = specialize(room_for_block, f"room_for_block_{layout}", **used(room_for_block, touching))

@@ -8,10 +8,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import _jit, checks, guards, integrators
+from clothgym import _jit, ahead, checks, guards, integrators
 from clothgym.attachments import Attachments, Gripper, Grippers
 from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
 from clothgym.collisions import Collider, SelfCollision, Solids
+from clothgym.collisions.self.owner import options_of
 from clothgym.collisions.solids.sheet_contact import needed
 from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
 from clothgym.exclusive import Turn, exclusive
@@ -123,6 +124,7 @@ class Simulation(Observed):
         # what it touches: solids, and itself
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self.colliders = self._solids.colliders
+        self._compile(options_of(self_collision) is not None)
         self._contact = SelfCollision(self.layout, mesh, self_collision, self.dtype)
         # what its forces go over, and in float64 for the bounds of substeps
         self._elements = element_arrays(mesh, self.dtype, self.bending.hinged, self.integrator.any_order)
@@ -130,7 +132,6 @@ class Simulation(Observed):
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
         self._weave = weave_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
-        self._compile()
         # a state at rest, with masses and stiffness of the material
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -158,11 +159,21 @@ class Simulation(Observed):
         self.substeps = count("substeps", substeps, "'auto' or ", most=guards.MOST_SUBSTEPS)
         self._warn_if_beyond_bound(np.arange(1))
 
-    def _compile(self) -> None:
-        """The main loop with the kernels of all that there is."""
-        touched = needed(self.contact, self._solids.shapes.kinds)
-        parts = self.bending, self.layout.by_particle, self.strain_limit is not None, self._contact.options is not None, touched
-        self._advance = MainLoop(*compiled(self.integrator.substep, self.integrator.name, *parts))
+    def _compile(self, collides: bool) -> None:
+        """The main loop with the kernels of all that there is; collides: whether the sheet collides with itself."""
+        touched, method, dtype = needed(self.contact, self._solids.shapes.kinds), self.integrator, self.dtype.name
+        parts = self.bending, self.layout.by_particle, self.strain_limit is not None, collides, touched
+        self._advance = MainLoop(*compiled(method.substep, method.name, *parts))
+        # on a cold start another process compiles what is not of self-contact, which takes about as long
+        if collides and method == integrators.INTEGRATORS.get(method.name) and not _jit.is_kept(self._advance.kernel):
+            kinds = self._solids.shapes.kinds
+            ahead.start(
+                {
+                    "grid": bool(is_regular(self.mesh)), "integrator": method.name, "bending": self.bending.name, "dtype": dtype,
+                    "contact": self.contact, "strain_limit": self.strain_limit, "anchors": len(self.anchors) > 0,
+                    "grippers": len(self.grippers) > 0, "solids": bool(kinds.any()) if len(kinds) else None,
+                }
+            )  # fmt: skip
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle holds: all but compiled code and its scratch."""
@@ -170,7 +181,7 @@ class Simulation(Observed):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        self._compile()
+        self._compile(self._contact.options is not None)
 
     # --- time -----------------------------------------------------------------------------------------------------------
 

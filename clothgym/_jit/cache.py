@@ -19,7 +19,7 @@ import importlib.util
 import os
 import stat
 import sys
-from collections.abc import Mapping, Set
+from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,7 @@ class CacheFolder:
         # locks of kernels that this process compiles now, a caller before its callees: bare descriptors.  Guarded by numba's own
         # compiler lock.  Processes cannot wait for each other in a ring, as no kernel calls itself by way of others
         self.held: dict[str, int] = {}
-        self._announced = False
+        self.compiled = 0
         self.writable = True
         self.path = self.core = NOWHERE
         self._key = b""
@@ -173,21 +173,42 @@ class CacheFolder:
         except OSError as error:  # the folder has vanished, or its file system has no locks
             self.give_up(error)
 
+    @contextlib.contextmanager
+    def only_one(self, name: str) -> Iterator[bool]:
+        """Whether no other process is in such a block with that name."""
+        if not self.writable:
+            yield False
+            return
+        file = os.open(self.core / f"{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            yield _try_lock(file)
+        finally:
+            os.close(file)  # which gives the lock back
+
     def release(self, name: str) -> None:
         file = self.held.pop(name, None)
         if file is not None:
             _unlock_file(file)
             os.close(file)
 
-    def announce(self) -> None:
-        if not self._announced:
-            self._announced = True
+    def announce(self, most: int) -> None:
+        """Say that one more kernel is being compiled, of ``most`` at most: in a terminal each time, else once."""
+        self.compiled += 1
+        live = sys.stderr.isatty()
+        if self.compiled == 1:
             where = f", kept in {self.path.parent}" if self.writable else ""
             print(
-                f"clothgym: compiling kernels (once after an install or a change, a minute or two){where}",
+                f"clothgym: compiling kernels, {most} at most (once after an install or a change, about a minute){where}",
                 file=sys.stderr,
                 flush=True,
             )
+        if live:
+            print(f"\rclothgym: compiling {self.compiled} of {max(most, self.compiled)} ", end="", file=sys.stderr, flush=True)
+
+    def end_line(self) -> None:
+        """End the line that a terminal shows while kernels are compiled."""
+        if self.compiled and sys.stderr.isatty():
+            print("\r" + 40 * " " + "\r", end="", file=sys.stderr, flush=True)
 
 
 def _refuse_others(place: Path | int, rights: int, remedy: str) -> None:
@@ -238,6 +259,13 @@ if sys.platform == "win32":
                 msvcrt.locking(file, msvcrt.LK_LOCK, 1)
                 return
 
+    def _try_lock(file: int) -> bool:
+        try:
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
     def _unlock_file(file: int) -> None:
         msvcrt.locking(file, msvcrt.LK_UNLCK, 1)
 else:
@@ -245,6 +273,13 @@ else:
 
     def _lock_file(file: int) -> None:
         fcntl.flock(file, fcntl.LOCK_EX)
+
+    def _try_lock(file: int) -> bool:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return False
+        return True
 
     def _unlock_file(file: int) -> None:
         fcntl.flock(file, fcntl.LOCK_UN)

@@ -48,7 +48,7 @@ def check(tested_only: bool) -> None:
     attrgetter("_create_empty_module")(CPUCodegen)
     attrgetter("initialize")(rtsys)
     dispatcher = numba.njit(_nothing)
-    attrgetter("_compiler._customize_flags", "_cache", "compile", "overloads")(dispatcher)
+    attrgetter("_compiler._customize_flags", "_cache", "compile", "overloads", "_insert", "typeof_pyval")(dispatcher)
     with contextlib.suppress(RuntimeError):  # imported from an archive, where nothing can be cached
         _Cache(cast(FunctionType, _nothing), apart=False)
 
@@ -57,15 +57,72 @@ def _nothing() -> None:
     """What ``check`` tries a cache with; never compiled."""
 
 
-def arrange(dispatcher: Any, function: FunctionType, apart: bool, flags: Mapping[str, bool]) -> None:
-    """Give a new dispatcher the compiler's flags and our cache; see ``policy.kernel``."""
-    dispatcher._compiler._customize_flags = partial(_set_flags, values=flags)
+def arrange(function: FunctionType, apart: bool, flags: Mapping[str, bool], options: Mapping[str, Any]) -> Any:
+    """A dispatcher with the compiler's flags and options and our cache; see ``policy.kernel``.
+
+    numba makes two wrappers of each function, one to be called from Python and one from C.  Few kernels are called from Python, and
+    arguments of dozens of arrays make wrappers that take longer to compile than the kernel.  So kernels have none; the first call
+    from Python compiles one more version with a wrapper, which ``entry`` caches apart.
+    """
+    dispatcher, entry = numba.njit(**options)(function), numba.njit(**options)(function)
     try:
         dispatcher._cache = _Cache(function, apart)
+        entry._cache = _Cache(function, apart=False, suffix=".entry")
     except RuntimeError:  # it has been typed in, and lies in no file: it is compiled in memory, and linked into its callers
-        return
+        dispatcher._compiler._customize_flags = partial(_set_flags, values=flags)
+        return dispatcher
+    for one, called_from_python in ((dispatcher, False), (entry, True)):
+        wrappers = {"no_cpython_wrapper": not called_from_python, "no_cfunc_wrapper": True}
+        one._compiler._customize_flags = partial(_set_flags, values={**flags, **wrappers})
+        one.compile = partial(_compile_locked, one.compile, one._cache.lock_name)
+    entry._cache_hits, entry._cache_misses = dispatcher._cache_hits, dispatcher._cache_misses
     _dispatchers[dispatcher._cache.name] = dispatcher
-    dispatcher.compile = partial(_compile_locked, dispatcher.compile, dispatcher._cache.lock_name)
+    # compiled callers find kernels without wrappers in its table, and Python those with one
+    dispatcher.add_overload = partial(_keep, dispatcher)
+    dispatcher._compile_for_args = partial(_compile_entry, dispatcher, entry)
+    return dispatcher
+
+
+def is_kept(dispatcher: Any) -> bool:
+    """Whether the cache has some version of a kernel that is called from Python."""
+    entry = getattr(dispatcher._compile_for_args, "args", (None, None))[1]
+    return entry is not None and Path(entry._cache._cache_file._index_path).exists()
+
+
+_most = 0  # kernels that this process may have compiled when the present call from Python is through
+
+
+def _reachable(function: Any, found: set[str]) -> set[str]:
+    """Add the names of all kernels that a function may call to ``found``."""
+    for name in function.__code__.co_names:
+        callee = function.__globals__.get(name)
+        inner = getattr(callee, "py_func", None)
+        kernel = f"{inner.__module__}.{inner.__qualname__}" if inner is not None else ""
+        if inner is not None and kernel not in found:
+            found.add(kernel)
+            _reachable(inner, found)
+    return {name for name in found if name in _dispatchers}
+
+
+def _keep(dispatcher: Any, result: Any) -> None:
+    """Note a kernel for its compiled callers."""
+    dispatcher.overloads[tuple(result.signature.args)] = result
+
+
+def _compile_entry(dispatcher: Any, entry: Any, *args: Any) -> Any:
+    """What a call from Python with these arguments is to call, which the next calls with such arguments find at once."""
+    global _most
+    outermost = not _most
+    if outermost:
+        _most = cache_folder().compiled + len(_reachable(dispatcher.py_func, {dispatcher._cache.name}))
+    try:
+        called = entry._compile_for_args(*args)
+    finally:
+        if outermost:
+            _most = 0
+            cache_folder().end_line()
+    dispatcher._insert([entry.typeof_pyval(value)._code for value in args], called, False)
+    return called
 
 
 def _set_flags(flags: Any, values: Mapping[str, bool]) -> Any:
@@ -177,11 +234,11 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
 
     _impl_class = _Impl
 
-    def __init__(self, py_func: FunctionType, apart: bool) -> None:
+    def __init__(self, py_func: FunctionType, apart: bool, suffix: str = "") -> None:
         super().__init__(py_func)
         place, impl = self._cache_path, self._impl
-        self._cache_file = _CheckedFiles(place, impl.filename_base, impl.locator.get_source_stamp())
-        self.name, self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}", name_of(py_func)
+        self._cache_file = _CheckedFiles(place, impl.filename_base + suffix, impl.locator.get_source_stamp())
+        self.name, self.lock_name = f"{py_func.__module__}.{py_func.__qualname__}", name_of(py_func) + suffix
         self.apart = apart
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -192,7 +249,7 @@ class _Cache(caching.FunctionCache):  # type: ignore[misc]
             found = self._load(sig, target_context)
         if found is None:
             target_context.refresh()
-            folder.announce()
+            folder.announce(_most)
         return found
 
     def _load(self, sig: Any, target_context: Any) -> Any:

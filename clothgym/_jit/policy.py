@@ -42,9 +42,7 @@ def _with_internals(function: FunctionType, apart: bool, flags: Flags) -> Any:
     """A dispatcher with its flags, which loads and saves through the locked cache."""
     from clothgym._jit import numba_internals
 
-    dispatcher = numba.njit(**OPTIONS)(function)
-    numba_internals.arrange(dispatcher, function, apart, flags._asdict())
-    return dispatcher
+    return numba_internals.arrange(function, apart, flags._asdict(), OPTIONS)
 
 
 def _plainly(function: FunctionType, apart: bool, flags: Flags) -> Any:
@@ -100,6 +98,15 @@ def _in_python(function: Callable[..., Any], flags: Flags) -> Any:
 
     uncompiled.py_func, uncompiled.flags = function, flags  # type: ignore[attr-defined]
     return uncompiled
+
+
+def is_kept(compiled: Any) -> bool:
+    """Whether the cache has some version of a kernel that is called from Python, as far as can be told."""
+    if _make is _plainly:
+        return True
+    from clothgym._jit import numba_internals
+
+    return numba_internals.is_kept(compiled)
 
 
 def kernel(function: Callable[..., Any], apart: bool = False, flags: Flags = COUNTED) -> Any:

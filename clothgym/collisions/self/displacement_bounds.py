@@ -25,14 +25,14 @@ AHEAD_MOST = 1.0  # largest distance beyond the reach that it looks, as a share 
 
 
 @inlined
-def confine(x, v, w, sheet, block, h):
+def confine(x, v, w, sheet, block, h, find_outside):
     """Keep one block's sheets within their displacement bounds.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  h: the substep [s].
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  h: the substep [s].  find_outside: see
+    ``find_outside_in_lanes``.
     """
     memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
     start, bounds, limits, old = memory.start[block], memory.bounds[block], memory.limits[block], memory.old[block]
-    lanes = x.shape[2]
     # particles that lag behind their attachments catch up
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
@@ -41,10 +41,7 @@ def confine(x, v, w, sheet, block, h):
     outside, any_outside, query_due = memory.outside[block], memory.any_outside[block], memory.query_due[block]
     any_outside[:] = False
     query_due[:] = False
-    if lanes == 1:
-        any_outside[0], query_due[0] = _find_outside_in_lane(x, start, bounds, limits, samples, 0, outside[:, 0])
-    else:
-        _find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due)
+    find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due)
     # what follows costs nothing in the other lanes
     for l in range(memory.used[block]):
         if not any_outside[l]:
@@ -75,7 +72,7 @@ def _copy(row, out):
 
 
 @kernel
-def _find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due):
+def find_outside_in_lanes(x, start, bounds, limits, samples, outside, any_outside, query_due):
     """Find the vertices that have left their bounds since the last query, |x - start - m| > b, beside the common motion m.
 
     m, the mean displacement of the samples, changes no distance.  outside: becomes which vertices, (particles, lanes); any_outside:
@@ -132,6 +129,12 @@ def _find_outside_in_lane(x, start, bounds, limits, samples, l, outside):
         any_outside |= not within_bound
         query_due |= not within_limit
     return any_outside, query_due
+
+
+@inlined
+def find_outside_of_sheet(x, start, bounds, limits, samples, outside, any_outside, query_due):
+    """The same for a block that is one sheet."""
+    any_outside[0], query_due[0] = _find_outside_in_lane(x, start, bounds, limits, samples, 0, outside[:, 0])
 
 
 @kernel

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, disjoint, inlined, kernel, uncounted
+from clothgym._jit import apart, disjoint, inlined, kernel, placeholder, uncounted
 from clothgym.collisions.self.narrow_phase import SLOP
 from clothgym.contact_memory import C_NORMAL, C_THICKNESS, REPORT_TOUCHING
 
@@ -33,6 +33,9 @@ CHOSEN_EVERY = 8  # substeps after which the active contacts, those that may act
 # otherwise grow from substep to substep without end
 FASTEST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness up to which a contact may act soon
+
+
+sweep = placeholder("sweep", "of (x, v, w, sheet, block, l, h, carried): one sweep over the contacts of lane l, for a layout")
 
 
 @uncounted
@@ -62,13 +65,12 @@ def _apply_impulses(x, v, w, pressed, carried, negative_zero):
         v[e] += change
 
 
-@uncounted
 def repel(x, v, w, sheet, block, h, carried):
     """Correct the impulses of one block's sheets, in each lane in which a sweep is due.
 
     x, v, w, carried: as in ``press_again``.  h: the substep [s].
     """
-    memory, number, lanes = sheet.memory, x.shape[1], x.shape[2]
+    memory = sheet.memory
     for l in range(memory.used[block]):
         # lanes without contacts, and those whose contacts have converged, wait
         if memory.contacts[block, l] == 0:
@@ -77,14 +79,18 @@ def repel(x, v, w, sheet, block, h, carried):
         memory.aged[block, l] += 1
         if memory.waited[block, l] < memory.span[block, l]:
             continue
-        if lanes == 1:
-            _sweep_contacts(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
-        else:
-            _sweep_copy(x, v, w, sheet, block, l, h, carried)
+        sweep(x, v, w, sheet, block, l, h, carried)
+
+
+@uncounted
+def sweep_sheet(x, v, w, sheet, block, l, h, carried):
+    """One sweep over the contacts of a block that is one sheet."""
+    number = x.shape[1]
+    _sweep_contacts(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
 
 
 @apart
-def _sweep_copy(x, v, w, sheet, block, l, h, carried):
+def sweep_lane(x, v, w, sheet, block, l, h, carried):
     """The same on a copy of lane l: contacts read each particle many times, and the values of a lane lie far apart."""
     own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
     _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, carried)

@@ -16,6 +16,7 @@ from clothgym.collisions.self.contact_normals import SmoothSheet
 from clothgym.collisions.self.displacement_bounds import FARTHEST
 from clothgym.collisions.self.impulses import TOLERANCE
 from clothgym.collisions.self.narrow_phase import MARGIN, edge_contacts, gap_of_edges, gap_of_vertex, vertex_contacts
+from clothgym.collisions.self.spread import spread_out
 from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
 from clothgym.collisions.self.topology import Pairs, pairs_of
 from clothgym.contact_memory import (
@@ -120,12 +121,13 @@ class SelfCollision:
         self._reported = np.zeros(layout.blocks * layout.lanes, bool)
         if self.options is None:
             return
-        if (found := first_intersection(mesh.triangles, mesh.rest_positions)) is not None:
+        pairs = pairs_of(mesh)
+        # a sheet that is flat and convex at rest, see ``spread``, cannot intersect itself there
+        if not len(pairs.to_rest) and (found := first_intersection(mesh.triangles, mesh.rest_positions)) is not None:
             raise ValueError(
                 f"self_collision: at rest this sheet intersects itself, for instance triangles {found[1]} and {found[2]}: give a "
                 "mesh whose rest shape does not"
             )
-        pairs = pairs_of(mesh)
         reach = reach_of(mesh, pairs, self.options.thickness, dtype)
         if self.options.mode == "strict" and reach.far_thickness < THINNEST:
             raise ValueError(
@@ -162,11 +164,14 @@ class SelfCollision:
         """
         if not self.strict or len(positions) == 0:
             return
-        found = first_intersection(self.sheet.pairs.triangles, np.asarray(positions, self.dtype))
+        # most starts are spread out, which rules intersections out without the exact check
+        x, pairs = np.asarray(positions, self.dtype).reshape(-1, *positions.shape[-2:]), self.sheet.pairs
+        near = np.flatnonzero(~spread_out(np.ascontiguousarray(x, np.float64), pairs.triangles, pairs.to_rest))
+        found = first_intersection(pairs.triangles, x[near]) if len(near) else None
         if found is not None:
-            which, one, two = found
+            which, one, two = envs[near[found[0]]], *found[1:]
             raise ValueError(
-                f"positions: in environment {envs[which]} triangles {one} and {two} intersect: self_collision='strict' keeps apart "
+                f"positions: in environment {which} triangles {one} and {two} intersect: self_collision='strict' keeps apart "
                 "what is apart, and does not untangle; start from another sheet (clothgym.starts.make makes some), or take "
                 "self_collision='fast'"
             )
@@ -267,6 +272,29 @@ def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
     return np.sqrt(shortest)
 
 
+@kernel
+def least_far(p, pairs, reach, particles, coefficients, members, planes, report):
+    """Shortest distance of primitives that do not hang together, or ``reach`` where none is within it [m].
+
+    particles, coefficients, members, planes: without rows, so that nothing is kept; report: scratch.
+    """
+    count, zero, none = p.shape[0], 0.0, np.int64(0)
+    extra, room, limits = np.zeros(count), np.full(count, reach), np.full(count, reach)
+    held, flat = np.zeros(count, np.bool_), np.zeros(pairs.edges.shape[0], np.bool_)
+    leaves, _, corners = far_pairs(p, pairs, reach, extra, np.zeros((3, pairs.triangles.shape[0])))
+    sides = far_sides(p, pairs, leaves, np.zeros(leaves.shape[0], np.bool_), flat, reach, extra)
+    smooth = SmoothSheet(p, np.zeros(p.shape), np.zeros(count, np.uint8), flat)
+    vertex_contacts(
+        p, corners, pairs, smooth, reach, extra, zero, zero, zero, zero, zero, zero, held, room, limits,
+        np.zeros((leaves.shape[0], 4)), none, particles, coefficients, none, members, planes, report,
+    )  # fmt: skip
+    edge_contacts(
+        p, sides, pairs, smooth, reach, extra, zero, zero, zero, zero, zero, zero, held, room, limits, none, particles,
+        coefficients, none, members, planes, report,
+    )  # fmt: skip
+    return room.min()
+
+
 def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.dtype) -> Reach:
     """Distances of the query for a cloth thickness [m], or for the usual one; dtype: of the simulation, whose kernels do for it.
 
@@ -275,18 +303,8 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     """
     p = mesh.rest_positions.astype(np.float64)
     near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.vertex_triangles))
-    # what does not hang together: nothing is looked for beyond two such distances
-    reach, room, faces = 2 * near, np.full(mesh.num_particles, 2 * near), np.zeros((3, len(pairs.triangles)))
-    extra = np.zeros(mesh.num_particles)
-    leaves, _, corners = far_pairs(p, pairs, reach, extra, faces)
-    sides = far_sides(p, pairs, leaves, np.zeros(len(leaves), bool), np.zeros(len(pairs.edges), bool), reach, extra)
-    coefficients = reach, extra, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(mesh.num_particles, bool), room, room.copy()
-    no_contacts = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype)
-    none = *no_contacts, 0, np.empty((0, G_SIZE), np.int32), np.empty((0, 4)), np.empty(REPORT_SIZE)
-    smooth = SmoothSheet(p, np.zeros(p.shape), np.zeros(len(p), np.uint8), np.zeros(len(pairs.edges), bool))
-    vertex_contacts(p, corners, pairs, smooth, *coefficients, np.empty((len(leaves), 4)), 0, *none)
-    edge_contacts(p, sides, pairs, smooth, *coefficients, 0, *none)
-    apart = float(room.min())
+    nothing = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype), np.empty((0, G_SIZE), np.int32), np.empty((0, 4))
+    apart = float(least_far(p, pairs, 2 * near, *nothing, np.empty(REPORT_SIZE)))
     # of single triangles nothing is near, and of one alone nothing else
     shortest = np.sqrt(1 / pairs.rest_edges.max())
     usual = USUAL * min(near, apart, shortest) if near == np.inf else USUAL * near

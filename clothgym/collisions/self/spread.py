@@ -15,10 +15,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart
+from clothgym._jit import apart, kernel
 from clothgym.mesh import ClothMesh
 
 CONVEX = 1e-6  # share of the convex hull's area by which a sheet's may differ
+SPREAD = 1e-6  # lambda from which rounding makes no sheet look spread out that is not
 
 
 def to_rest(mesh: ClothMesh) -> NDArray[np.float64]:
@@ -82,3 +83,12 @@ def least_stretch(p, triangles, inverses):
     for t in range(count):
         least = min(least, smallest[t])
     return max(least, 0.0)
+
+
+@kernel
+def spread_out(x, triangles, inverses):
+    """Whether each sheet is spread out, and so free of intersections, (num_envs,); x: positions [m], (num_envs, particles, 3)."""
+    out = np.zeros(x.shape[0], np.bool_)
+    for e in range(x.shape[0]):
+        out[e] = least_stretch(x[e], triangles, inverses) > SPREAD
+    return out

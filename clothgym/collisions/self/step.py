@@ -26,12 +26,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, kernel, uncounted
+from clothgym._jit import inlined, kernel, placeholder, specialize, uncounted
 from clothgym.collisions.self.broad_phase import Reach
-from clothgym.collisions.self.displacement_bounds import confine, note_uncertain
-from clothgym.collisions.self.impulses import press_again, repel
+from clothgym.collisions.self.displacement_bounds import confine, find_outside_in_lanes, find_outside_of_sheet, note_uncertain
+from clothgym.collisions.self.impulses import press_again, repel, sweep_lane, sweep_sheet
 from clothgym.collisions.self.topology import Pairs
 from clothgym.contact_memory import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
+
+# of a layout
+correct = placeholder("correct", "``impulses.repel``")
+find_outside = placeholder("find_outside", "of (x, start, bounds, limits, samples, outside, any_outside, query_due)")
 
 PUSH = 0.5  # largest speed at which what is too close is pushed apart [m/s]
 
@@ -132,12 +136,11 @@ def press(x, v, w, sheet, block, step, h, carried):
         press_again(x, v, w, memory.pressed[block], carried)
 
 
-@uncounted
 def keep_apart(x, v, w, sheet, block, h, carried):
     """Stages 2 and 3, after the solids: impulses, then bounds.  Arguments as in ``press``."""
     if _any_contact(sheet.memory, block):
-        repel(x, v, w, sheet, block, h, carried)
-    confine(x, v, w, sheet, block, h)
+        correct(x, v, w, sheet, block, h, carried)
+    confine(x, v, w, sheet, block, h, find_outside)
 
 
 @inlined
@@ -159,8 +162,13 @@ def keep_nothing_apart(x, v, w, sheet, block, h, carried):
     """Stages 2 and 3 of a simulation without self-collision."""
 
 
-# what the main loop calls by these names, without self-collision and with it
-KERNELS = {
-    False: {"press": press_nothing, "keep_apart": keep_nothing_apart},
-    True: {"press": press, "keep_apart": keep_apart},
-}
+def kernels_of(collides: bool, by_particle: bool) -> dict[str, Any]:
+    """What the main loop calls by these names, with self-collision or without, where a block is one sheet or has many lanes."""
+    if not collides:
+        return {"press": press_nothing, "keep_apart": keep_nothing_apart}
+    layout = "particles" if by_particle else "lanes"
+    parts = {
+        "correct": specialize(uncounted(repel), f"repel_{layout}", sweep=sweep_sheet if by_particle else sweep_lane),
+        "find_outside": find_outside_of_sheet if by_particle else find_outside_in_lanes,
+    }
+    return {"press": press, "keep_apart": specialize(uncounted(keep_apart), f"keep_apart_{layout}", apart=True, **parts)}
