@@ -66,8 +66,6 @@ BY_VALUE = {
     "export patch --out gone/a.gif": "there is no folder 'gone'",
     "compare --out gone/results": "there is no folder 'gone'",
     "bench --json gone/bench.json": "there is no folder 'gone'",
-    "bench --quick --table": "not allowed with",
-    "bench --select springs": "add --table",
 }
 BY_NAME = {
     "view flagg": "no scene or environment 'flagg'; did you mean 'flag'?",
@@ -81,7 +79,6 @@ BY_NAME = {
     "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",
     "export ClothReach-v0 --out a.gif --set fabric=silc": "did you mean 'silk'?",
     "export ClothReach-v0 --out a.gif --policy .": "lacks config.json",
-    "bench --table --select nonsense": "no group 'nonsense' (there are: springs",
     "compare --scene stif_sheet": "did you mean 'stiff_sheet'?",
     "compare --integrators verlett": "no integrator 'verlett'; did you mean 'verlet'?",
 }
