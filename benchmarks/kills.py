@@ -137,7 +137,7 @@ def _preloaded() -> Any:
     import torch.utils.tensorboard
 
     torch.set_num_threads(1)  # the threads of OpenMP are lost in a fork, and waited for
-    learning.evaluate.run_episodes("ClothReach-v0", learning.policies.expert, [0], progress=False)
+    learning.scoring.run_episodes("ClothReach-v0", learning.policies.expert, [0], progress=False)
     return learning
 
 

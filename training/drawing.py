@@ -6,11 +6,11 @@ import io
 from pathlib import Path
 from typing import Any
 
-import evaluate
 import gymnasium as gym
 import matplotlib
 import numpy as np
 import policies
+import scoring
 
 from clothgym import files
 from clothgym.render import write_video
@@ -55,7 +55,7 @@ def film(
     env_kwargs: dict[str, Any],
     episodes: int = 4,
     stride: int = 1,
-    seed: int = evaluate.HELD_OUT,
+    seed: int = scoring.HELD_OUT,
 ) -> None:
     """Some episodes, by default held-out ones, side by side with white between, each one's end standing still; every so many frames
     of them."""
