@@ -61,6 +61,7 @@ def test_a_run_leaves_its_story(trained):
     assert (folder / "run" / "policy.gif").read_bytes()[:3] == b"GIF"
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_and_never_overwritten(trained):
     folder, options = trained
     again = run("train.py", "--env", "ClothReach-v0", "--run", folder / "run", *options, cwd=folder)
@@ -75,6 +76,7 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
     assert lines[-1]["training_seconds"] > lines[0]["training_seconds"]
 
 
+@pytest.mark.slow
 def test_the_learned_policy_is_evaluated_beside_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
@@ -245,6 +247,7 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
             runs.learned(broken, "ClothReach-v0")
 
 
+@pytest.mark.slow
 def test_a_resumed_run_says_what_it_drops(broken, trained):
     """A broken line and one from after the checkpoint, and a checkpoint that is gone."""
     _, options = trained
