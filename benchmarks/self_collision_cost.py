@@ -16,7 +16,6 @@ unless said:
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -28,8 +27,8 @@ from typing import Any
 import matplotlib
 import mujoco
 import numpy as np
+from cases import Case, Row, fill, parsed, table
 from numpy.typing import NDArray
-from self_collision import Case, Row, fill, table
 from tqdm import tqdm
 
 from clothgym import ClothMesh, Material, Plane, Simulation, grid
@@ -318,10 +317,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--select", nargs="*", default=[], help="only cases whose names hold all these words")
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
-    args = parser.parse_args()
+    args = parsed(__doc__)
     results = fill(RESULT, cases(), args.select, args.fresh, ABOUT | {"mujoco version": version("mujoco")})
     for name in cases():
         if results.get(name):
