@@ -492,26 +492,3 @@ def test_forged_files(tmp_path_factory, kind, data):
                     np.lib.format.write_array(member, np.asarray(array))
         version = {"state": clothgym.state.VERSION, "task state": 1, "recording": 1}[kind]
         read(kind, files.marked(buffer.getvalue(), kind, version), folder)
-
-
-# --- what a campaign has found ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("call", "said"),
-    [
-        (lambda: clothgym.grid(rows="9", cols=2, width=1, height=1), "rows='9'"),
-        (lambda: clothgym.disc(1e5, 2**63), "rings="),
-        (lambda: clothgym.load_mesh("x" * 10**6), "there is no such file"),
-        (lambda: clothgym.Material(density="0.2"), "density='0.2'"),
-        (lambda: clothgym.Sphere(radius=np.ma.masked), "Sphere radius"),
-        (lambda: clothgym.Simulation(clothgym.grid(3, 3, 1, 1), time_step=1e9), "shorter time_step"),
-        (lambda: clothgym.Simulation(clothgym.grid(3, 3, 1, 1)).largest_substep(3), "env=3"),
-        (lambda: gym.make_vec("ClothReach-v0", num_envs=10**9), "num_envs=1000000000"),
-        (lambda: gym.make_vec("ClothReach-v0", num_envs=2).reset(seed=[[1], [2, 3]]), r"seed=\[1\]"),
-        (lambda: victim("ClothReach-v0").step([[1], [2, 3]]), "action="),
-    ],
-)
-def test_the_message_names_the_argument(call, said):
-    with pytest.raises(ValueError, match=said):
-        call()

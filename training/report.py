@@ -22,7 +22,7 @@ from typing import Annotated
 import numpy as np
 import suite
 import tyro
-from curves import CURVES, draw_curves
+from drawing import CURVES, draw_curves
 from endings import refused
 from results import RESULTS, ROOT, Result, add, groups, is_present, learned, note_digests, note_policies, read_digests
 
