@@ -339,7 +339,7 @@ def folded():
     return maneuver.simulation, maneuver.simulation.get_state()
 
 
-@examples(200)
+@examples(120)
 @given(name=VICTIMS | st.just("folded"), data=st.data())
 def test_states(name, data):
     if name == "folded":
