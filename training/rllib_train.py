@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import time
 from dataclasses import dataclass
@@ -121,17 +122,6 @@ def build(args: Args, given: dict[str, Any], env_kwargs: dict[str, Any], done: i
     return made.debugging(seed=args.seed + done, log_level="ERROR").build_algo()
 
 
-def export(args: Args, algo: Any, path: Path, env_kwargs: dict[str, Any]) -> None:
-    """Write the policy as clothgym.policies reads it."""
-    network = algo.learner_group.get_state()["learner"]["rl_module"]["default_policy"]
-    hidden = [name for name in network if name.startswith("encoder.actor_encoder.") and name.endswith(".weight")]
-    names = [name.removesuffix(".weight") for name in (*hidden, "pi.net.mlp.0.weight")]
-    layers = [(network[f"{name}.weight"].T, network[f"{name}.bias"]) for name in names]
-    about = {"env": args.env, "env_kwargs": env_kwargs, "seed": args.seed, "learner": ALGO, "timesteps": args.timesteps}
-    Policy(layers, "tanh", about=about).save(path)
-    print(f"written: python training/evaluate.py --env {args.env} --policy {path} scores it")
-
-
 def main(args: Args) -> None:
     args.env = checked_id(args.env)
     given = policies.hyperparameters_of(args.hyperparams, args.env)
@@ -153,17 +143,24 @@ def main(args: Args) -> None:
         algo.restore_from_path(kept[-1].resolve())
     while done < args.timesteps:
         sampled = algo.train().get("env_runners", {})
-        done += int(sampled.get("num_env_steps_sampled", 0))  # none, if all runners are lost
+        steps = int(sampled.get("num_env_steps_sampled", 0))  # none, if all runners are lost
+        done += steps
         line = {"timesteps": done, "seconds": time.perf_counter() - begun}
         line |= {"runners": algo.env_runner_group.num_healthy_remote_workers(), "return": sampled.get("episode_return_mean")}
         print(line, flush=True)
         with open(folder / "progress.jsonl", "a") as file:
             file.write(json.dumps(line, default=float) + "\n")
-        algo.save_to_path((folder / "part").resolve())
-        (folder / "part").rename(folder / f"checkpoint_{done:012d}")
+        if steps:
+            algo.save_to_path((folder / "part").resolve())
+            (folder / "part").rename(folder / f"checkpoint_{done:012d}")
         for old in sorted(folder.glob("checkpoint_*"))[:-1]:
             shutil.rmtree(old)
-    export(args, algo, folder / "policy.npz", env_kwargs)
+    network = algo.learner_group.get_state()["learner"]["rl_module"]["default_policy"]
+    hidden = [name.removesuffix(".weight") for name in network if re.fullmatch(r"encoder.actor_encoder.*weight", name)]
+    layers = [(network[f"{name}.weight"].T, network[f"{name}.bias"]) for name in (*hidden, "pi.net.mlp.0")]
+    about = {"env": args.env, "env_kwargs": env_kwargs, "seed": args.seed, "learner": ALGO, "timesteps": args.timesteps}
+    Policy(layers, "tanh", about=about).save(folder / "policy.npz")
+    print(f"python training/evaluate.py --env {args.env} --policy {folder}/policy.npz  scores what was learned")
 
 
 if __name__ == "__main__":
