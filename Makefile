@@ -1,4 +1,5 @@
 # make train: set up, train, evaluate, leave a film in runs/      make test: set up, lint, type check, test
+# make test-all: also the slow tests, which train, record and export
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
 # make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
@@ -14,7 +15,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test bits clients rllib oldest notebook release site bench clean
+.PHONY: train check lint test test-all bits clients rllib oldest notebook release site bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -29,6 +30,9 @@ check: lint
 	$(BIN)/python -m pytest -q -k "refused or wrong" tests/test_cli.py tests/test_training.py
 
 test: lint
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10 -m "not slow"
+
+test-all: lint
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal --durations=10
 
 bits: $(VENV)/ready

@@ -2,8 +2,7 @@
 
     pip install "mujoco>=4" matplotlib
     python benchmarks/hanging_sheet.py                    # measures what the results lack, prints the tables, draws the plot
-    python benchmarks/hanging_sheet.py --only ours        # one section only: ours, mujoco, static or drape
-    python benchmarks/hanging_sheet.py --again            # times once more and keeps the faster time, on a machine that is shared
+    python benchmarks/hanging_sheet.py --select ours      # one section only: ours, mujoco or static
     python benchmarks/hanging_sheet.py --fresh            # measures again, about six minutes
 
 A 25 x 25 sheet of cotton, 1 m, flat and at rest, falls for half a second while two neighboring corners are held; there is
@@ -12,13 +11,11 @@ that none is measured by another's discretization.  Frames of 1/60 s are timed o
 batch are summed over its environments.  Sections of ``results/hanging_sheet.json``:
 
 * ours, mujoco: error [mm] and frames/s; claim: beside each setting of MuJoCo, our fastest setting that errs no more;
-* static: stretch under its own weight of a sheet held along one edge, over that of the converged run, minus one;
-* drape: error of ClothDrape-v0's sheet and control step, by substeps; it should not exceed 5 mm per meter of sheet.
+* static: stretch under its own weight of a sheet held along one edge, over that of the converged run, minus one.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import time
@@ -33,19 +30,15 @@ from typing import Any
 import matplotlib
 import mujoco
 import numpy as np
+from cases import Case, Row, fill, parsed, table
 from numpy.typing import NDArray
 
 from clothgym import Material, Simulation, grid
-from clothgym.envs.drape import DrapeTask
-from clothgym.lab.bench import machine
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-Row = dict[str, Any]
-
 RESULT = Path(__file__).parent / "results" / "hanging_sheet.json"
-SECTIONS = ("ours", "mujoco", "static", "drape")
 ROWS, SIDE, FRAME, FRAMES = 25, 1.0, 1 / 60, 30  # [m], [s]
 ENOUGH = 1.5  # seconds of frames whose median counts
 SHEET = grid(ROWS, ROWS, SIDE, SIDE)
@@ -74,7 +67,6 @@ MUJOCO = [
     for substeps in counts
 ]
 MUJOCO_CONVERGED = 160
-DRAPE_SUBSTEPS = (46, 50, 57, 70, 115)
 ABOUT = {
     "scene": "25 x 25 particles, 1 m x 1 m, cotton (E t = 261 N/m, nu 0.243, 0.1503 kg/m^2, plate rigidity 2.34e-6 N m), flat "
     "and at rest at t = 0, two neighboring corners held, no contact, no air; error after 0.5 s",
@@ -194,21 +186,6 @@ def measure_static(method: str, damping_time: float, substeps: int) -> Row:
     return {"stretch_mm": 1e3 * found, "error": found / reference - 1}
 
 
-def drape_end(substeps: int, dtype: str) -> NDArray:
-    """The task's sheet, flat and held at two corners, after half a second of its own control steps [m], (particles, 3)."""
-    p = DrapeTask.physics
-    s = Simulation(
-        p.mesh, p.material, 1, EULER, p.time_step, substeps, air_density=p.air_density, anchors=p.held, dtype=dtype, threads=1
-    )
-    s.step(round(0.5 / p.time_step))
-    return s.positions[0]
-
-
-def measure_drape(substeps: int) -> Row:
-    error = rms(drape_end(substeps, "float32"), drape_end(CONVERGED, "float64"))
-    return {"error_mm": error, "error_mm_per_m": error / DrapeTask.physics.side}
-
-
 def claims(results: Row) -> list[Row]:
     """For each of MuJoCo's settings our fastest that errs no more, in a batch and alone."""
     rows = []
@@ -221,19 +198,6 @@ def claims(results: Row) -> list[Row]:
             row |= {name: best, f"{name}_ratio": best["frames/s"] / theirs["frames/s"] if best else None}
         rows.append(row)
     return rows
-
-
-def print_table(title: str, rows: list[Row]) -> None:
-    def cell(value: Any) -> str:
-        if isinstance(value, dict):
-            return f"{value['method']} {value['substeps']} x{value['lanes']}: {value['error_mm']:.2f} mm"
-        return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-    print(f"\n{title}")
-    table = [list(rows[0])] + [[cell(value) for value in row.values()] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*table)]
-    for line in table:
-        print("  ".join(text.rjust(width) for text, width in zip(line, widths)))
 
 
 def draw(results: Row, path: Path) -> None:
@@ -267,38 +231,18 @@ def draw(results: Row, path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--only", choices=SECTIONS, help="one section")
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
-    parser.add_argument("--again", action="store_true", help="time again, and keep the faster time of each case")
-    args = parser.parse_args()
-    RESULT.parent.mkdir(exist_ok=True)
-    about = machine()
-    about["versions"]["mujoco"] = version("mujoco")
-    keep = RESULT.exists() and not (args.fresh and args.only is None)
-    # the machine of the first rows stays: those of two machines in one file would compare nothing
-    results: Row = {"machine": about} | (json.loads(RESULT.read_text()) if keep else {}) | {"about": ABOUT}
-
-    cases: dict[str, list[tuple[Callable[..., Row], Row]]] = {
+    args = parsed(__doc__)
+    cases: dict[str, list[Case]] = {
         "ours": [(measure_ours, setting | {"lanes": lanes}) for setting in OURS for lanes in LANES],
         "mujoco": [(measure_mujoco, setting) for setting in MUJOCO],
         "static": [(measure_static, setting) for setting in OURS],
-        "drape": [(measure_drape, {"substeps": substeps}) for substeps in DRAPE_SUBSTEPS],
     }
-    for name in cases if args.only is None else cases.keys() & {args.only}:
-        rows = results[name] = [] if args.fresh else results.get(name, [])
-        for measure, key in cases[name]:
-            known = next((row for row in rows if key.items() <= row.items()), None)
-            if known is None:
-                rows.append(key | measure(**key))
-            elif args.again and "frames/s" in known:
-                # whatever else the machine does can only slow a run down
-                known["frames/s"] = max(known["frames/s"], measure(**key)["frames/s"])
-            results["claim"] = claims(results)
-            RESULT.write_text(json.dumps(results, indent=1) + "\n")
-    for name in (*SECTIONS, "claim"):
+    results = fill(RESULT, cases, args.select, args.fresh, ABOUT | {"mujoco version": version("mujoco")})
+    results["claim"] = claims(results)
+    RESULT.write_text(json.dumps(results, indent=1) + "\n")
+    for name in (*cases, "claim"):
         if results.get(name):
-            print_table(name, results[name])
+            print(f"\n{name}\n{table(results[name])}")
     if results.get("ours") and results.get("mujoco"):
         draw(results, RESULT.with_suffix(".png"))
 

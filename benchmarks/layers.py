@@ -1,7 +1,6 @@
 """How sheets slide on sheets: over the spacing of both grids, their turn, friction and curvature.
 
     python benchmarks/layers.py              # some minutes on one core
-    python benchmarks/layers.py --quick      # one case of each, written nowhere
 
 Sections of ``results/layers.json``, each with the modes "strict" and "fast", layers 4 mm thick:
 
@@ -11,27 +10,22 @@ Sections of ``results/layers.json``, each with the modes "strict" and "fast", la
   with friction that of the same strip over a smooth solid.  Spacings in thicknesses, lengths in meters.
 
 Where there is friction enough, the truth is rest.  ``clamped``: moves of a vertex that were cut short; ``intersecting``: pairs of
-triangles at the end, by the exact count.  ``--before results.json`` adds the speeds that another file has for the same cases.
+triangles at the end, by the exact count.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
+from cases import Case, Row, fill, table
 
 from clothgym import Simulation
-from clothgym.lab.bench import machine
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import layers  # the scenes and truths that the tests use
-
-Row = dict[str, Any]
 
 RESULT = Path(__file__).parent / "results" / "layers.json"
 MODES = ("strict", "fast")
@@ -86,29 +80,15 @@ def cylinder_cases() -> list[Row]:
     ]  # fmt: skip
 
 
-def table(rows: list[Row]) -> str:
-    """Rows as text, one column a key."""
-    heads = list(rows[0])
-    cells = [[f"{v:.3f}" if isinstance(v := row[key], float) else str(v) for key in heads] for row in rows]
-    widths = [max(len(line[k]) for line in [heads, *cells]) for k in range(len(heads))]
-    return "\n".join("  ".join(text.rjust(width) for text, width in zip(line, widths)) for line in [heads, *cells])
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="one case of each, written nowhere")
-    parser.add_argument("--before", type=Path, help="results of other code, whose speeds are added")
-    parser.add_argument("--output", type=Path, default=RESULT)
-    args = parser.parse_args()
-    results: Row = {"machine": machine()}
-    for name, measure, cases in (("slope", on_slope, slope_cases()), ("cylinder", over_cylinder, cylinder_cases())):
-        results[name] = [key | measure(**key) for key in tqdm(cases[:1] if args.quick else cases, desc=name, disable=None)]
-        if args.before:
-            for row, old in zip(results[name], json.loads(args.before.read_text())[name]):
-                row["before"] = old["speed"]
-        print(f"\n{name}\n{table(results[name])}", flush=True)
-    if not args.quick:
-        args.output.write_text(json.dumps(results, indent=1) + "\n")
+    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
+    sections: dict[str, list[Case]] = {
+        "slope": [(on_slope, key) for key in slope_cases()],
+        "cylinder": [(over_cylinder, key) for key in cylinder_cases()],
+    }
+    results = fill(RESULT, sections, [], True, {})
+    for name in sections:
+        print(f"\n{name}\n{table(results[name])}")
 
 
 if __name__ == "__main__":

@@ -167,19 +167,17 @@ def draw(drapes: dict[str, Drape]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="coarse specimens only, nothing written")
     parser.add_argument("--draw", action="store_true", help="the picture alone")
     args = parser.parse_args()
     if args.draw:
         draw({name: cusick_drape(Material.preset(name), RINGS[-1], 1) for name in NAMES})
         return
-    measured = [measure(name, RINGS[:1] if args.quick else RINGS) for name in NAMES]
+    measured = [measure(name, RINGS) for name in NAMES]
     rows = [row for row, _ in measured]
     print(table(rows))
-    if not args.quick:
-        about = {"overhang": OVERHANG, "rings": RINGS, "specimens": SPECIMENS}
-        RESULT.write_text(json.dumps({"machine": machine(), "about": about, "rows": rows}, indent=1) + "\n")
-        draw(dict(zip(NAMES, (drape for _, drape in measured))))
+    about = {"overhang": OVERHANG, "rings": RINGS, "specimens": SPECIMENS}
+    RESULT.write_text(json.dumps({"machine": machine(), "about": about, "rows": rows}, indent=1) + "\n")
+    draw(dict(zip(NAMES, (drape for _, drape in measured))))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
     python benchmarks/self_collision.py                          # what the results lack, and the tables; hours, case by case
     python benchmarks/self_collision.py --select strict 25x25    # cases whose names hold all these words
-    python benchmarks/self_collision.py --quick                  # 13 x 13, one seed, 8 mm, one second each, written nowhere
 
 Sections of ``results/self_collision.json``:
 
@@ -17,25 +16,19 @@ What is counted is said in ``clothgym.geometry.intersections``, which knows noth
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from cases import Case, Row, fill, parsed, table
 from tqdm import tqdm
 
 from clothgym import ClothMesh, Simulation, disc, grid
 from clothgym._jit import kernel
 from clothgym.geometry.intersections import count_intersections
-from clothgym.lab.bench import machine
 from clothgym.starts import MANEUVERS, Maneuver
-
-Row = dict[str, Any]
-Case = tuple[Callable[..., Row], Row]
 
 RESULT = Path(__file__).parent / "results" / "self_collision.json"
 SEEDS, FRAME = 5, 1 / 60
@@ -117,10 +110,10 @@ def over(maneuver: Maneuver) -> bool:
     return maneuver.over or maneuver.time >= (DRAGGING if "drag" in type(maneuver).__name__.lower() else np.inf) - 1e-9
 
 
-def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, seeds: int = SEEDS, seconds: float = np.inf) -> Row:
+def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float) -> Row:
     """Frames of all seeds, and of how many each, and in how many something intersected."""
     sheet, thickness = MESHES[mesh](), thickness_mm / 1000
-    given = maneuver, sheet, range(seeds), thickness
+    given = maneuver, sheet, range(SEEDS), thickness
     if "spheres" in mode:
         spacing = float(sheet.springs.rest_length.min())
         frames = with_spheres(*given, 0.9 * spacing if "covering" in mode else thickness)
@@ -128,7 +121,7 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, s
         option = {} if mode == "none" else {"self_collision": {"mode": mode, "thickness": thickness}}
         frames = with_simulation(*given, option)
     begun = time.perf_counter()
-    bad, worst, count, gap, lag, clamped = np.zeros(seeds, int), 0, 0, np.inf, 0.0, 0
+    bad, worst, count, gap, lag, clamped = np.zeros(SEEDS, int), 0, 0, np.inf, 0.0, 0
     for state in tqdm(frames, desc=f"{maneuver}, {mesh}, {mode}, {thickness_mm} mm", unit="frame", leave=False, disable=None):
         found = count_intersections(sheet.triangles, state.simulation.positions)
         bad += found > 0
@@ -136,29 +129,23 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float, s
         count += 1
         if mode in ("fast", "strict"):
             report = state.simulation.self_contacts
-            gap, lag, clamped = (
-                min(gap, float(report.gap.min())),
-                max(lag, float(report.lag.max())),
-                clamped + int(report.clamped.sum()),
-            )
-        if count * FRAME >= seconds:
-            break
-    row: Row = {"frames": count * seeds, "intersecting": int(bad.sum()), "by_seed": bad.tolist(), "worst": worst}
+            gap, lag = min(gap, float(report.gap.min())), max(lag, float(report.lag.max()))
+            clamped += int(report.clamped.sum())
+    row: Row = {"frames": count * SEEDS, "intersecting": int(bad.sum()), "by_seed": bad.tolist(), "worst": worst}
     if mode in ("fast", "strict"):
         row |= {"gap_mm": 1000 * gap, "lag_mm": 1000 * lag, "clamped": clamped}
     return row | {"diverged": int(state.simulation.diverged.sum()), "wall_s": round(time.perf_counter() - begun, 1)}
 
 
-def measure_drape(target: str, steps: int = STEPS) -> Row:
+def measure_drape(target: str) -> Row:
     """Environment steps of random actions, summed over a batch; episodes begin again when they end."""
-    lanes = min(LANES, steps)
-    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=lanes, autoreset_mode="Disabled", self_collision="strict")
+    env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=LANES, autoreset_mode="Disabled", self_collision="strict")
     options = {"target": {"shape": TARGETS[target]}}
     env.reset(seed=0, options=options)
     random = np.random.default_rng(0)
     simulation = env.unwrapped.task.simulation
     bad, worst, failures, gap = 0, 0, 0, np.inf
-    for _ in tqdm(range(-(-steps // lanes)), desc=f"drape, {target}", leave=False, disable=None):
+    for _ in tqdm(range(STEPS // LANES), desc=f"drape, {target}", leave=False, disable=None):
         _, _, terminated, truncated, info = env.step(random.uniform(-1, 1, env.action_space.shape).astype(np.float32))
         found = count_intersections(simulation.mesh.triangles, simulation.positions)
         bad, worst = bad + int((found > 0).sum()), max(worst, int(found.max()))
@@ -168,7 +155,7 @@ def measure_drape(target: str, steps: int = STEPS) -> Row:
         if ended.any():
             env.reset(options=options | {"reset_mask": ended})
     env.close()
-    return {"steps": -(-steps // lanes) * lanes, "intersecting": bad, "worst": worst, "gap_mm": 1000 * gap, "failures": failures}
+    return {"steps": STEPS, "intersecting": bad, "worst": worst, "gap_mm": 1000 * gap, "failures": failures}
 
 
 def cases() -> dict[str, list[Case]]:
@@ -187,30 +174,6 @@ def cases() -> dict[str, list[Case]]:
     }
 
 
-def fill(path: Path, sections: dict[str, list[Case]], select: list[str], fresh: bool, about: Row) -> Row:
-    """Measure the cases that the file lacks, and write each at once: what is interrupted goes on where it was."""
-    path.parent.mkdir(exist_ok=True)
-    results: Row = {"machine": machine(), "about": about} | (json.loads(path.read_text()) if path.exists() and not fresh else {})
-    wanted = [(name, *case) for name, rows in sections.items() for case in rows]
-    wanted = [(name, measure, key) for name, measure, key in wanted if all(word in f"{name} {key}" for word in select)]
-    for name, measure, key in tqdm(wanted, unit="case", disable=None):
-        rows = results.setdefault(name, [])
-        if not any(key.items() <= row.items() for row in rows):
-            rows.append(key | measure(**key))
-            part = path.with_suffix(".part")
-            part.write_text(json.dumps(results, indent=1) + "\n")
-            part.replace(path)
-    return results
-
-
-def table(rows: list[Row]) -> str:
-    """Rows as text, one column a key."""
-    heads = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [[f"{v:.4g}" if isinstance(v := row.get(key, ""), float) else str(v) for key in heads] for row in rows]
-    widths = [max(len(line[k]) for line in [heads, *cells]) for k in range(len(heads))]
-    return "\n".join("  ".join(text.rjust(width) for text, width in zip(line, widths)) for line in [heads, *cells])
-
-
 ABOUT = {
     "frames": "control steps of 1/60 s of all seeds; intersecting: those in which two triangles had a point in common that they "
     "should not have; worst: most such pairs of one sheet in one frame",
@@ -220,26 +183,8 @@ ABOUT = {
 }
 
 
-def quick() -> None:
-    """Whether it runs: a second of each case on a coarse sheet."""
-    rows = []
-    for name in tqdm(MANEUVERS, unit="case", disable=None):
-        for mode in ("none", "spheres", "fast", "strict"):
-            key = {"maneuver": name, "mesh": "13x13", "mode": mode, "thickness_mm": 8}
-            rows.append(key | measure_maneuver(**key, seeds=1, seconds=1.0))
-    print(table(rows))
-    print(table([{"target": target} | measure_drape(target, steps=200) for target in TARGETS]))
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--select", nargs="*", default=[], help="only cases whose names hold all these words")
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
-    parser.add_argument("--quick", action="store_true", help="a second of each on a coarse sheet, written nowhere")
-    args = parser.parse_args()
-    if args.quick:
-        quick()
-        return
+    args = parsed(__doc__)
     results = fill(RESULT, cases(), args.select, args.fresh, ABOUT)
     for name in cases():
         if results.get(name):

@@ -3,7 +3,6 @@
     pip install "mujoco>=4" matplotlib tqdm
     python benchmarks/self_collision_cost.py                      # measures what the results lack, prints tables, draws the plot
     python benchmarks/self_collision_cost.py --select cost alone  # cases whose names hold all these words
-    python benchmarks/self_collision_cost.py --quick              # few frames of coarse sheets, written nowhere
 
 Sections of ``results/self_collision_cost.json``; all on one thread, semi-implicit Euler with automatic substeps, cotton, 8 mm
 unless said:
@@ -17,24 +16,23 @@ unless said:
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import mujoco
 import numpy as np
+from cases import Case, Row, fill, parsed, table
 from numpy.typing import NDArray
-from self_collision import Case, Row, fill, table
 from tqdm import tqdm
 
-from clothgym import ClothMesh, Plane, Simulation, grid
+from clothgym import ClothMesh, Material, Plane, Simulation, grid
 from clothgym.geometry.intersections import count_intersections
-from clothgym.lab.bench_mujoco import COTTON, DROP, FRAME, ROWS, SECONDS, SIDE, THIN, mujoco_model, start_of
 from clothgym.starts import FRICTION, Drag, EdgeDrop, Fold, Heap, Maneuver, ZFold
 
 matplotlib.use("Agg")
@@ -43,6 +41,10 @@ from matplotlib import pyplot as plt
 RESULT = Path(__file__).parent / "results" / "self_collision_cost.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "self_collision.png"
 THICKNESS, LANES = 0.008, 64
+# the sheet that falls on its edge, here and in MuJoCo
+FRAME, ROWS, SIDE, SECONDS, DROP, THIN = 1 / 60, 25, 0.5, 2.0, 0.05, 0.004
+COTTON = Material.preset("penava_cotton")
+YOUNG, POISSON, SHEET_THICKNESS = 0.821e6, 0.243, 0.318e-3  # from the source of the preset: [Pa], [m]
 MODES = ("none", "fast", "strict")
 WARM, TIMED = 20, 60  # frames of a state
 ROUNDS = 2  # of an episode; of each frame the faster run counts
@@ -159,44 +161,77 @@ def _clocked(step: Callable[..., None], times: list[float]) -> Callable[..., Non
     return clocked
 
 
-def measure_cost(case: str, envs: int, side: int = 25, seconds: float = np.inf) -> Row:
-    mesh = grid(side, side, 1.0, 1.0)
+def measure_cost(case: str, envs: int) -> Row:
+    mesh = grid(25, 25, 1.0, 1.0)
     limit = ALONE_LIMIT if envs == 1 else LIMITS[case]
     if case in EPISODES:
         loaded = EPISODES[case](mesh, seeds=[0])
         for mode in MODES:  # kernels are loaded before the clock runs
             Simulation(mesh, num_envs=envs, anchors=loaded.simulation.anchors.tolist(), **option(mode)).step()
         return row_of(
-            of_an_episode(lambda mode: EPISODES[case](mesh, seeds=range(envs), thickness=THICKNESS, **option(mode)), seconds),
+            of_an_episode(lambda mode: EPISODES[case](mesh, seeds=range(envs), thickness=THICKNESS, **option(mode))),
             envs,
             limit,
         )
     anchors: list[int] = []
     x = mesh.rest_positions + (0, 0, 0.001)
     if case == "hanging":
-        anchors, x = list(mesh.corners[2:]), hung(side)
+        anchors, x = list(mesh.corners[2:]), hung(25)
     elif case in SETTLED:
-        x = settled(case, side, envs)
-    return row_of(of_a_state(mesh, x, envs, anchors, TIMED if seconds == np.inf else round(seconds / FRAME)), envs, limit)
+        x = settled(case, 25, envs)
+    return row_of(of_a_state(mesh, x, envs, anchors), envs, limit)
 
 
-def measure_growth(side: int, scene: str, frames: int = TIMED) -> Row:
+def measure_growth(side: int, scene: str) -> Row:
     mesh = grid(side, side, (side - 1) * SPACING, (side - 1) * SPACING)
     if scene == "flat":
-        seconds = of_a_state(mesh, mesh.rest_positions + (0, 0, 0.001), 1, [], frames)
+        seconds = of_a_state(mesh, mesh.rest_positions + (0, 0, 0.001), 1, [])
     else:
         for mode in MODES:
             Simulation(mesh, **option(mode)).step()
         leaves = max(1, (side - 1) // LEAF)
-        seconds = of_an_episode(lambda mode: ZFold(mesh, thickness=THICKNESS, leaves=leaves, **option(mode)), frames * FRAME)
+        seconds = of_an_episode(lambda mode: ZFold(mesh, thickness=THICKNESS, leaves=leaves, **option(mode)), TIMED * FRAME)
     return {"particles": side * side} | {f"{mode}_ms": 1000 * s for mode, s in seconds.items()}
 
 
-def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECONDS) -> Row:
+def mujoco_model(contact: str, steps: int) -> Any:
+    """The scene with MuJoCo's ``ipc`` contacts or its ordinary ones, with ``steps`` steps per frame."""
+    spacing = SIDE / (ROWS - 1)
+    spec = mujoco.MjSpec.from_string(f"""
+        <mujoco>
+          <size memory="200M"/>
+          <option timestep="{FRAME / steps!r}" integrator="discrete" solver="Newton" gravity="0 0 -9.81">
+            <flag ipc="{"enable" if contact == "ipc" else "disable"}"/>
+          </option>
+          <worldbody>
+            <geom type="plane" size="2 2 0.1"/>
+            <flexcomp name="sheet" type="grid" dim="2" count="{ROWS} {ROWS} 1" spacing="{spacing!r} {spacing!r} 1"
+                      radius="{THIN / 2!r}" pos="0 0 {SIDE / 2 + DROP!r}" euler="88 0 0">
+              <contact selfcollide="auto"/>
+              <elasticity young="{YOUNG!r}" poisson="{POISSON!r}" thickness="{SHEET_THICKNESS!r}" damping="{COTTON.damping_time!r}"
+                          elastic2d="both"/>
+            </flexcomp>
+          </worldbody>
+        </mujoco>""")
+    for body in spec.bodies[1:]:
+        borders = int(np.sum(np.isclose(np.abs(body.pos[:2]), SIDE / 2)))
+        body.mass = COTTON.density * spacing**2 / 2**borders
+    return spec.compile()
+
+
+def start_of(model: Any) -> Any:
+    """Initial data, with a slightly uneven sheet."""
+    data = mujoco.MjData(model)
+    data.qpos[:] += np.random.default_rng(0).normal(scale=2e-5, size=model.nq)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def measure_mujoco(engine: str, contact: str, steps: int) -> Row:
     """One sheet on one core."""
     model = mujoco_model(contact, steps)
     triangles = model.flex_elem.reshape(-1, 3)
-    best, counts, warned = np.full(round(seconds / FRAME), np.inf), [], 0
+    best, counts, warned = np.full(round(SECONDS / FRAME), np.inf), [], 0
     for _ in range(ROUNDS):
         data = start_of(model)
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {steps}", leave=False, disable=None):
@@ -208,13 +243,13 @@ def measure_mujoco(engine: str, contact: str, steps: int, seconds: float = SECON
     return _speeds(best, 1) | _counted(np.array(counts[-len(best) :])) | {"warnings": int(warned)}
 
 
-def measure_ours(engine: str, contact: str, lanes: int, seconds: float = SECONDS) -> Row:
+def measure_ours(engine: str, contact: str, lanes: int) -> Row:
     """A batch of sheets on one core."""
     mesh = grid(ROWS, ROWS, SIDE, SIDE)
     maneuver = EdgeDrop(mesh, COTTON, seeds=range(lanes), thickness=THIN, **option(contact, THIN))
     simulation = maneuver.simulation
     simulation.step()  # loads the kernels
-    best, counts = np.full(round(seconds / FRAME), np.inf), []
+    best, counts = np.full(round(SECONDS / FRAME), np.inf), []
     for _ in range(ROUNDS):
         simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {lanes}", leave=False, disable=None):
@@ -281,29 +316,8 @@ def draw(rows: list[Row], path: Path) -> None:
     plt.close(figure)
 
 
-def quick() -> None:
-    """Whether it runs."""
-    both = [{"case": case, "envs": envs} for case in LIMITS for envs in (1, 4)]
-    print(table([key | measure_cost(**key, side=13, seconds=0.5) for key in both]))
-    growing = [{"side": side, "scene": scene} for side in (13, 17) for scene in ("flat", "folded")]
-    print(table([key | measure_growth(**key, frames=10) for key in growing]))
-    rows = [key | measure_mujoco(**key, seconds=0.2) for key in THEIRS]
-    rows += [
-        key | measure_ours(**key, seconds=0.2) for key in ({"engine": "clothgym", "contact": "strict", "lanes": n} for n in (1, 4))
-    ]
-    print(table(rows))
-    print_ratio(rows)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--select", nargs="*", default=[], help="only cases whose names hold all these words")
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
-    parser.add_argument("--quick", action="store_true", help="few frames of coarse sheets, written nowhere")
-    args = parser.parse_args()
-    if args.quick:
-        quick()
-        return
+    args = parsed(__doc__)
     results = fill(RESULT, cases(), args.select, args.fresh, ABOUT | {"mujoco version": version("mujoco")})
     for name in cases():
         if results.get(name):

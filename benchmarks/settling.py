@@ -1,7 +1,6 @@
 """What brings a draped sheet to rest: its speed over time, for dampings with a measurement behind them and for one of them alone.
 
 python benchmarks/settling.py              # table and results/settling.json, which keeps the cases that are done
-python benchmarks/settling.py --quick      # two seconds of each case, nothing written
 
 A sheet of 17 x 17 particles and 0.6 m of the median fabric is let go above a sphere of 0.15 m radius: contact of the whole sheet,
 friction 0.5, ``bending="quadratic"``, quadratic air.  Four sheets start with slopes of their own.
@@ -77,7 +76,7 @@ def starts(sheet: NDArray) -> NDArray[np.float64]:
     return raised
 
 
-def moved(case: Case, seconds: float) -> tuple[NDArray[np.float64], float, int]:
+def moved(case: Case) -> tuple[NDArray[np.float64], float, int]:
     """Root mean square of the particles' speeds after each step [m/s], (steps, sheets); of their way in the last second [m]; and
     the substeps of a step.
     """
@@ -96,7 +95,7 @@ def moved(case: Case, seconds: float) -> tuple[NDArray[np.float64], float, int]:
         threads=1,
     )
     simulation.reset(positions=starts(mesh.rest_positions))
-    rms, steps = [], round(seconds / STEP)
+    rms, steps = [], round(SECONDS / STEP)
     for step in range(steps):
         progress.show(f"{case.about}, {step * STEP:.1f} s")
         if step == steps - round(1 / STEP):
@@ -108,17 +107,17 @@ def moved(case: Case, seconds: float) -> tuple[NDArray[np.float64], float, int]:
     return np.array(rms), float(way), simulation.substeps
 
 
-def measure(case: Case, seconds: float) -> dict[str, Any]:
+def measure(case: Case) -> dict[str, Any]:
     """A row of the table: mean rms speed of the sheets at each of ``TIMES`` [m/s], and from when on it is at rest [s]."""
-    rms, way, substeps = moved(case, seconds)
+    rms, way, substeps = moved(case)
     moving = np.flatnonzero(rms.mean(axis=1) > REST)
     at_rest = float(moving[-1] + 2) * STEP if len(moving) else 0.0
     return {
         **case._asdict(),
         "substeps made": substeps,
-        "speed": {f"{time:g}": float(rms[round(time / STEP) - 1].mean()) for time in TIMES if time <= seconds},
+        "speed": {f"{time:g}": float(rms[round(time / STEP) - 1].mean()) for time in TIMES},
         "way in the last second": way,
-        "at rest": at_rest if at_rest <= seconds else None,
+        "at rest": at_rest if at_rest <= SECONDS else None,
     }
 
 
@@ -155,19 +154,16 @@ def table(rows: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two seconds of each case, nothing written")
-    args = parser.parse_args()
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     about = {"fabric": FABRIC, "sheets": SHEETS, "seconds": SECONDS, "rest": REST}
-    kept = json.loads(RESULT.read_text()) if RESULT.exists() and not args.quick else {}
+    kept = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     rows = kept.get("rows", {}) if kept.get("about") == about else {}
     for name, case in CASES.items():
         if name in rows and Case(**{key: rows[name][key] for key in Case._fields}) == case:
             continue
-        rows[name] = measure(case, 2.0 if args.quick else SECONDS)
-        if not args.quick:
-            rows = {known: rows[known] for known in CASES if known in rows}
-            RESULT.write_text(json.dumps({"machine": machine(), "about": about, "rows": rows}, indent=1) + "\n")
+        rows[name] = measure(case)
+        rows = {known: rows[known] for known in CASES if known in rows}
+        RESULT.write_text(json.dumps({"machine": machine(), "about": about, "rows": rows}, indent=1) + "\n")
     print(table(rows))
 
 

@@ -1,8 +1,6 @@
 """What rounding adds up to over thousands of small substeps in float32, far from the origin and near.
 
-    python benchmarks/sums.py                     # writes results/sums.json
-    python benchmarks/sums.py --out FILE          # elsewhere, for instance for an older version
-    python benchmarks/sums.py --table BEFORE      # prints the tables of docs/physics.md from results/sums.json and BEFORE
+    python benchmarks/sums.py      # writes results/sums.json, and prints its tables
 
 A free sheet of 5 x 5 particles, without gravity and air, in every method, over substeps of 1/60 s and distance from the origin.
 Closed forms are the truth, with the center of mass in float64:
@@ -30,7 +28,7 @@ from clothgym import INTEGRATORS, Gripper, Material, Simulation, Sphere, grid
 from clothgym.lab.bench import machine
 
 Row = dict[str, Any]
-RESULTS = Path(__file__).parent / "results"
+RESULT = Path(__file__).parent / "results" / "sums.json"
 SUBSTEPS, DISTANCES = (64, 512, 4096), (0.0, 1.0, 10.0, 100.0)
 # control steps; methods that iterate take longer
 STEPS, SLOWER = {64: 60, 512: 30, 4096: 12}, {"implicit_euler": 2, "projective_dynamics": 4, "pbd": 2}
@@ -115,8 +113,8 @@ def measured() -> Row:
     return {"machine": machine(), "free": rows, "slow": slowly}
 
 
-def table(before: Row, after: Row) -> str:
-    """The tables in Markdown: the worst over distances, at each number of substeps, before and after."""
+def tables(results: Row) -> str:
+    """The tables in Markdown: the worst over distances, at each number of substeps."""
     lines = []
     for measure in MEASURES:
         lines += [
@@ -125,33 +123,21 @@ def table(before: Row, after: Row) -> str:
             "| --- |" + " --- |" * len(SUBSTEPS),
         ]
         for name in INTEGRATORS:
-            cells = []
-            for substeps in SUBSTEPS:
-                of = [
-                    max(row[measure] for row in one["free"] if row["integrator"] == name and row["substeps"] == substeps)
-                    for one in (before, after)
-                ]
-                cells.append(f"{of[0]:.1e}, now {of[1]:.1e}")
-            lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
+            own = [row for row in results["free"] if row["integrator"] == name]
+            worst = [max(row[measure] for row in own if row["substeps"] == substeps) for substeps in SUBSTEPS]
+            lines.append(f"| `{name}` | " + " | ".join(f"{value:.1e}" for value in worst) + " |")
     lines += ["", "| slow: distance | " + " | ".join(f"{d:g} m" for d in DISTANCES) + " |", "| --- |" + " --- |" * len(DISTANCES)]
     for what in ("solid", "anchor", "gripper"):
-        cells = []
-        for distance in DISTANCES:
-            of = [max(row[what] for row in one["slow"] if row["distance"] == distance) for one in (before, after)]
-            cells.append(f"{of[0]:.1e}, now {of[1]:.1e}")
-        lines.append(f"| {what} | " + " | ".join(cells) + " |")
+        worst = [max(row[what] for row in results["slow"] if row["distance"] == distance) for distance in DISTANCES]
+        lines.append(f"| {what} | " + " | ".join(f"{value:.1e}" for value in worst) + " |")
     return "\n".join(lines[1:])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=RESULTS / "sums.json", help="where the results go")
-    parser.add_argument("--table", type=Path, metavar="BEFORE", help="print the tables, beside the results in this file")
-    args = parser.parse_args()
-    if args.table is not None:
-        print(table(*(json.loads(path.read_text()) for path in (args.table, args.out))))
-        return
-    args.out.write_text(json.dumps(measured(), indent=1) + "\n")
+    argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0]).parse_args()
+    results = measured()
+    RESULT.write_text(json.dumps(results, indent=1) + "\n")
+    print(tables(results))
 
 
 if __name__ == "__main__":

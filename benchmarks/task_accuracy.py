@@ -14,8 +14,6 @@ stability bound, if it has one.  Iterative methods are swept with the iterations
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import time
 import warnings
@@ -25,6 +23,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from cases import Row, fill, parsed
 from numpy.typing import NDArray
 
 from clothgym import INTEGRATORS, Simulation
@@ -32,13 +31,11 @@ from clothgym.envs.drape import DrapeTask
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ReachTask
 from clothgym.envs.strain import StrainTask
-from clothgym.lab.bench import machine
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.ticker import NullFormatter
 
-Row = dict[str, Any]
 RESULTS = Path(__file__).parent / "results" / "task_accuracy.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "task_accuracy.png"
 TASKS = {"ClothReach-v0": ReachTask.physics, "ClothDrape-v0": DrapeTask.physics, "ClothStrain-v0": StrainTask.physics}
@@ -96,10 +93,10 @@ def converged(task: str) -> tuple[NDArray, float]:
     return swing(physics, "rk4", substeps, "float64"), stretch(physics, "rk4", substeps, "float64")
 
 
-def measure(task: str, name: str, options: dict[str, float], substeps: int) -> Row:
-    physics = TASKS[task]
-    end, fall = converged(task)
-    method = {"name": name, **options}
+def measure(environment: str, integrator: str, options: dict[str, float], substeps: int) -> Row:
+    physics = TASKS[environment]
+    end, fall = converged(environment)
+    method = {"name": integrator, **options}
     with np.errstate(all="ignore"):
         away = swing(physics, method, substeps, "float32") - end
         error = float(np.sqrt(np.mean(np.sum(away**2, axis=1)))) * 1000 / physics.side
@@ -116,7 +113,7 @@ def measure(task: str, name: str, options: dict[str, float], substeps: int) -> R
         "error_mm_per_m": error if stable else None,
         "softness": softness if stable and np.isfinite(softness) else None,
         "us_per_step": statistics.median(times) / LANES * 1e6,
-        "share_of_bound": physics.time_step / substeps / cloth.largest_substep()[0] if name in BOUNDED else None,
+        "share_of_bound": physics.time_step / substeps / cloth.largest_substep()[0] if integrator in BOUNDED else None,
     }
 
 
@@ -166,18 +163,15 @@ def draw(rows: list[Row]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
-    args = parser.parse_args()
-    known: list[Row] = [] if args.fresh or not RESULTS.exists() else json.loads(RESULTS.read_text())["rows"]
-    rows = []
-    for task, physics in TASKS.items():
-        for name, options, multiples in METHODS:
-            for multiple in multiples:
-                key = {"environment": task, "integrator": name, "options": options, "substeps": round(multiple * physics.substeps)}
-                row = next((row for row in known if key.items() <= row.items()), None)
-                rows.append(row if row is not None else key | measure(task, name, options, key["substeps"]))
-                RESULTS.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
+    args = parsed(__doc__)
+    keys = [
+        {"environment": task, "integrator": name, "options": options, "substeps": round(multiple * physics.substeps)}
+        for task, physics in TASKS.items()
+        for name, options, multiples in METHODS
+        for multiple in multiples
+    ]
+    rows = fill(RESULTS, {"rows": [(measure, key) for key in keys]}, args.select, args.fresh, {})["rows"]
+    for task in TASKS:
         print_table(task, [row for row in rows if row["environment"] == task])
     draw(rows)
 

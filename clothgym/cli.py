@@ -99,12 +99,7 @@ def _parser() -> argparse.ArgumentParser:
 
     bench = command(_bench, "bench", "measure speed on this machine")
     bench.add_argument("--json", type=_writable, metavar="FILE", help="also write the results to this file")
-    extent = bench.add_mutually_exclusive_group()
-    extent.add_argument("--quick", action="store_true", help="fewer cases, in a minute or two")
-    extent.add_argument("--table", action="store_true", help="costs of all parts, beside their goals and the machine's limits")
-    bench.add_argument(
-        "--select", nargs="+", default=[], metavar="GROUP", help="groups of the table, such as springs, strict or start"
-    )
+    bench.add_argument("--quick", action="store_true", help="fewer cases, in a minute or two")
 
     warmup = command(_warm_up, "warmup", "compile kernels now instead of at first use")
     warmup.add_argument("--all", action="store_true", help="also for each bending model and strain limiting; takes some minutes")
@@ -233,21 +228,11 @@ def _warm_up(options: argparse.Namespace) -> None:
 
 
 def _bench(options: argparse.Namespace) -> None:
-    if options.select and not options.table:
-        options.refuse("argument --select: its groups are those of the table: add --table")
-
     from clothgym import files
-    from clothgym.lab import bench, bench_table
+    from clothgym.lab import bench
 
-    if options.table:
-        try:
-            results = bench_table.run(options.select)
-        except ValueError as error:
-            options.refuse(f"argument --select: {error}")
-        print(bench_table.table(results))
-    else:
-        results = bench.run(options.quick)
-        print(bench.table(results))
+    results = bench.run(options.quick)
+    print(bench.table(results))
     if options.json is not None:
         files.write(options.json, json.dumps(results, indent=1) + "\n")
         print(f"written to {options.json}")

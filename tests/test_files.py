@@ -5,7 +5,6 @@ import errno
 import io
 import itertools
 import os
-import traceback
 import zipfile
 from pathlib import Path
 
@@ -13,13 +12,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import clothgym.envs
 from clothgym import Simulation, Sphere, State, files, grid
 from clothgym.envs.episode import TaskState
 from clothgym.playground.recording import Recording
 from clothgym.state import VERSION
 
-ROOT = Path(__file__).parent.parent
 READERS = [Recording.load, State.load, TaskState.load, lambda path: files.read_json(path, "object", "give another")]
 
 
@@ -30,6 +27,15 @@ def made(env_id="ClothReach-v0", **kwargs):
     for _ in range(3):
         env.step(np.full(env.action_space.shape, 0.3, np.float32))
     return env
+
+
+def contents(state):
+    """All that a state holds, to be compared."""
+    physics = getattr(state, "simulation", state)
+    tables = [physics.arrays(), {} if physics is state else state.episode]
+    return [{name: np.asarray(array).tobytes() for name, array in one.items()} for one in tables], getattr(
+        state, "generators", None
+    )
 
 
 # --- writing --------------------------------------------------------------------------------------------------------------
@@ -151,23 +157,6 @@ def test_every_flipped_bit_of_an_object_and_of_an_archive_is_seen(tmp_path):
                 read(path)
 
 
-@pytest.mark.parametrize(("family", "count"), [("files", 120), ("states", 300)])
-def test_attacks_end_in_a_sentence_or_do_no_harm(family, count, monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    module = __import__(f"attacks.{family}", fromlist=[family])
-    outcomes = {"fine": 0, "refused": 0}
-    for text, attack in itertools.islice(module.attacks(np.random.default_rng(18)), count):
-        try:
-            attack()
-            outcomes["fine"] += 1
-        except (ValueError, FileNotFoundError) as error:
-            raised_in = Path(traceback.extract_tb(error.__traceback__)[-1].filename).resolve()
-            ours = any(raised_in.is_relative_to(Path(package.__file__).resolve().parent) for package in (clothgym, clothgym.envs))
-            assert "/tmp" in str(error) if family == "files" else ours, text
-            outcomes["refused"] += 1
-    assert outcomes["refused"] > count / 2 and outcomes["fine"] > 0
-
-
 # --- states ---------------------------------------------------------------------------------------------------------------
 
 
@@ -192,12 +181,9 @@ def test_attacks_end_in_a_sentence_or_do_no_harm(family, count, monkeypatch):
         ("ClothReach-v0", "task", "DrapeTask", "the state's task is 'DrapeTask', this environment's 'ReachTask': give"),
     ],
 )
-def test_a_state_that_no_episode_can_have_is_refused_whole(env_id, name, value, said, monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    from attacks.states import digest
-
+def test_a_state_that_no_episode_can_have_is_refused_whole(env_id, name, value, said):
     env = made(env_id)
-    before = digest(env.get_state())
+    before = contents(env.get_state())
     state = made(env_id).get_state()
     state.simulation.positions[:] += 0.1  # what would be seen, had anything been taken over
     state.episode["targets"][:] += 0.1
@@ -211,7 +197,7 @@ def test_a_state_that_no_episode_can_have_is_refused_whole(env_id, name, value, 
         array[...] = value
     with pytest.raises(ValueError, match=said):
         env.set_state(state)
-    assert digest(env.get_state()) == before
+    assert contents(env.get_state()) == before
 
 
 def test_a_state_of_another_kind_of_numbers_is_refused():

@@ -1,8 +1,6 @@
 """PPO in a single file: what a run leaves, the same bits from the same seed, and each part beside numbers from elsewhere."""
 
 import json
-import runpy
-import subprocess
 import sys
 from collections import deque
 
@@ -58,6 +56,7 @@ def test_a_run_leaves_weights_a_score_and_a_log(trained):
     assert [entry.value for entry in log.Scalars("train/learning_rate")] == pytest.approx([0.0015 * (1 - 1280 / 2500), 0])
 
 
+@pytest.mark.slow
 def test_the_same_seed_learns_the_same_bits(trained, single, tmp_path):
     """In another process, where torch has drawn other numbers before."""
     import torch
@@ -251,12 +250,8 @@ def test_rollouts_and_updates_are_those_of_stable_baselines3_bit_for_bit(single,
 
 
 WRONG = {
-    "--env ClothReech-v0": "no environment 'ClothReech-v0'; did you mean 'ClothReach-v0'?",
     "--env ClothFoldGoal-v0": "has no hyperparameters for 'ClothFoldGoal-v0' (there are: ClothDrape-v0",
-    "--timesteps 0": "--timesteps 0: must be from 1",
-    "--seed -1": "--seed -1: must be from 0",
     "--gamma nan": "--gamma nan: must be from 0 to 1",
-    "--net-arch 64 0": "--net-arch 0: must be from 1",
     "--learning-rate cos_0.1": "--learning-rate cos_0.1: must be a number, or lin_NUMBER",
     "--run taken": "taken holds a run already: choose another folder with --run",
 }
@@ -274,25 +269,3 @@ def test_wrong_arguments_are_refused_as_wrong_flags_are(command, single, tmp_pat
     # without the frame around it and its line breaks
     said = " ".join(capsys.readouterr().err.replace("│", " ").split())
     assert caught.value.code == 2 and WRONG[command] in said
-
-
-def test_torch_is_loaded_only_when_it_begins():
-    code = "import sys, ppo_single_file; print([name for name in ('torch', 'stable_baselines3', 'numba') if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "training", capture_output=True, text=True, timeout=60)
-    assert done.stdout.strip() == "[]", done.stderr
-
-
-@pytest.mark.parametrize("kept", ["no weights are", "the weights are"])
-def test_a_stop_is_one_line(kept, scripts, tmp_path, monkeypatch, capsys):
-    """It says whether there are weights: there are when only the score is missing."""
-
-    def interrupted(*args, **kwargs):
-        if kept == "the weights are":
-            (tmp_path / "policy.npz").touch()
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(gym, "make_vec", interrupted)
-    monkeypatch.setattr(sys, "argv", ["ppo_single_file.py", "--run", str(tmp_path)])
-    with pytest.raises(SystemExit) as caught:
-        runpy.run_path(str(ROOT / "training" / "ppo_single_file.py"), run_name="__main__")
-    assert caught.value.code == 130 and capsys.readouterr().err == f"\nstopped: {kept} in {tmp_path}\n"

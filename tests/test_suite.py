@@ -1,12 +1,9 @@
 """``evaluate.py --suite``: every policy on every id that it is for, in one table and one file that keeps what is finished."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
-import clothgym
 from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
@@ -14,42 +11,17 @@ HELD_OUT = 1_000_000
 ENV = "ClothReach-v0"
 
 
-@pytest.fixture
-def run_of_drape(tmp_path):
-    """A folder that says it is a run of ClothDrape-v0 under the fast physics."""
-    folder = tmp_path / "learned"
-    folder.mkdir()
-    (folder / "checkpoint.pt").touch()
-    config = {"env": "ClothDrape-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {"physics": "fast"}}
-    config |= {"hyperparameters": {}, "num_envs": 4, "timesteps": 100, "seed": 0, "threads": 1}
-    files.write_json(folder / "config.json", config | {"clothgym": clothgym.__version__})
-    return folder
-
-
-def test_a_suite_is_every_id_unless_some_are_named(scripts, run_of_drape):
+def test_a_suite_is_every_id_unless_some_are_named(scripts):
     import evaluate
     import suite
 
-    assert evaluate.Args(suite=True).env == tuple(ENVIRONMENTS)
-    assert evaluate.Args().env == ("ClothDrape-v0",) and not evaluate.Args().suite
-    assert evaluate.Args(env=(ENV, "ClothStrain-v0")).suite
-    # a run on its own id and with its own arguments, the careless expert where there is one
-    rows = suite.rows_of(ENVIRONMENTS, ("noop", "careless", str(run_of_drape)), 7, {"threads": 1})
+    assert evaluate.Args(suite=True).env == tuple(ENVIRONMENTS) and evaluate.Args().env == ("ClothDrape-v0",)
+    rows = suite.rows_of(ENVIRONMENTS, ("noop", "careless"), 7, {"threads": 1})
     assert [row["env"] for row in rows if row["policy"] == "noop"] == list(ENVIRONMENTS)
     assert [row["env"] for row in rows if row["policy"] == "careless"] == ["ClothStrain-v0"]
-    (learned,) = [row for row in rows if row["policy"] == str(run_of_drape)]
-    assert learned["env"] == "ClothDrape-v0" and learned["env_kwargs"] == {"physics": "fast", "threads": 1}
-    assert all(row["env_kwargs"] == {"threads": 1} for row in rows if row is not learned)
-    # beside the others of its id
     assert [row["env"] for row in rows] == sorted((row["env"] for row in rows), key=list(ENVIRONMENTS).index)
     with pytest.raises(ValueError, match="'careless' is for none of ClothReach-v0"):
         evaluate.Args(suite=True, env=(ENV,), policy=("careless",))
-    with pytest.raises(ValueError, match="learned' is for none of ClothReach-v0"):
-        evaluate.Args(suite=True, env=(ENV,), policy=(str(run_of_drape),))
-    with pytest.raises(ValueError, match="no policy 'chance'"):
-        evaluate.Args(suite=True, policy=("chance",))
-    with pytest.raises(ValueError, match="--anew: is for --suite"):
-        evaluate.Args(anew=True)
 
 
 def test_its_scores_are_those_of_the_single_environment(scripts, tmp_path, capsys):
@@ -78,13 +50,7 @@ def test_its_scores_are_those_of_the_single_environment(scripts, tmp_path, capsy
         half = (row["normalized_performance_ci95"][1] - row["normalized_performance_ci95"][0]) / 2
         assert half == pytest.approx(1.96 * deviation / 5**0.5, abs=1e-12)
     assert rows[0]["success_rate"] == 0 and rows[1]["success_rate"] == 1
-    machine = files.read_json(path, "", "")["machine"]
-    assert machine["versions"]["clothgym"] == clothgym.__version__ and machine["processor"] and machine["date"]
-    table = capsys.readouterr().out.splitlines()
-    (head,) = [line for line in table if line.startswith("environment")]
-    # tasks without them: no column
-    assert "score" in head and "held" not in head and "cost" not in head
-    assert sum(line.startswith(ENV) for line in table) == 2
+    assert sum(line.startswith(ENV) for line in capsys.readouterr().out.splitlines()) == 2
 
 
 def test_the_interval_of_a_rate_is_wilson_s(scripts):
@@ -96,7 +62,6 @@ def test_the_interval_of_a_rate_is_wilson_s(scripts):
 
 
 def test_success_that_has_to_last_is_counted_where_a_task_has_it(scripts):
-    import suite
     from scoring import score
 
     episodes = {
@@ -113,12 +78,7 @@ def test_success_that_has_to_last_is_counted_where_a_task_has_it(scripts):
     assert row["success_rate"] == 0.5 and row["success_held_rate"] == 0.25 and row["ever_success_rate"] == 0.75
     assert row["best"] == pytest.approx(0.6) and row["first_success"] == 30
     assert row["torn"] == 2 and row["diverged"] == 0 and row["mean_length"] == 32.5
-    identity = {"env": ENV, "policy": "noop", "seed": 0, "env_kwargs": {}, "settings": {}, "seconds": 1.0}
-    cells = suite.cells(identity | row)
-    assert cells["held"].startswith("0.250 [") and cells["best"].startswith("0.600 ±") and cells["failures"] == "2 torn"
-    assert cells["cost"] == cells["model steps"] == "" and cells["first success"] == "30.0"
-    never = score(episodes | {"first_success": np.full(4, -1)})
-    assert never["first_success"] is None and suite.cells(identity | never)["first success"] == ""
+    assert score(episodes | {"first_success": np.full(4, -1)})["first_success"] is None
 
 
 # --- interrupted, and called again --------------------------------------------------------------------------------------------
@@ -147,26 +107,6 @@ def test_an_interrupted_suite_goes_on(scripts, tmp_path, monkeypatch):
     assert len(begun) == 4  # of three rows one was there
     rows, whole = (files.read_json(one, "", "")["rows"] for one in (path, tmp_path / "whole.json"))
     assert [{**row, "seconds": 0} for row in rows] == [{**row, "seconds": 0} for row in whole]
-    # another number of episodes takes the row's place, and so does a row that is asked for anew
-    evaluate.main(evaluate.Args(**(vars(args) | {"policy": ("noop",), "episodes": 3})))
-    evaluate.main(evaluate.Args(**(vars(args) | {"policy": ("expert",), "anew": True})))
-    assert len(begun) == 6
-    assert {row["policy"]: row["episodes"] for row in files.read_json(path, "", "")["rows"]} == {
-        "noop": 3,
-        "random": 2,
-        "expert": 2,
-    }
-
-
-def test_a_file_of_something_else_is_refused_before_anything_is_scored(scripts, tmp_path, capsys):
-    import suite
-
-    path = tmp_path / "list.json"
-    path.write_text("[]")
-    wanted, said = suite.rows_of([ENV], ("noop",), HELD_OUT, {}), []
-    with pytest.raises(SystemExit):
-        suite.run(wanted, 1, path, anew=True, threads=1, say=said.append)
-    assert not said and "is no file of a suite's scores" in capsys.readouterr().err
 
 
 def test_rows_of_another_machine_or_file_are_not_added_to(scripts, tmp_path):
@@ -187,6 +127,3 @@ def test_rows_of_another_machine_or_file_are_not_added_to(scripts, tmp_path):
         with pytest.raises(ValueError, match=said):
             suite.keep(path, row)
         assert path.read_bytes() == before
-    path.write_text(json.dumps(content).replace("noop", "expert"))
-    with pytest.raises(ValueError, match="checksum.*name another file, or remove it"):
-        suite.load(path)

@@ -79,12 +79,3 @@ def test_scores_are_those_of_the_file(task_pages, tmp_path, monkeypatch):
     lines = {line.split("`")[1]: line for line in pages["README.md"].splitlines() if line.startswith("| [`")}
     assert "0.875 ± 0.010" in lines["ClothReach-v0"] and "0.625" not in lines["ClothDrape-v0"]
     assert task_pages.read_scores(tmp_path / "none.json")["rows"] == []
-
-
-def test_a_page_of_an_id_that_is_gone_is_removed(task_pages, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(task_pages, "PAGES", tmp_path)
-    (tmp_path / "ClothGone-v0.md").write_text("old")
-    monkeypatch.setattr(task_pages, "all_pages", lambda scores: {"README.md": "new\n"})
-    task_pages.main()
-    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
-    assert "ClothGone-v0.md: removed" in capsys.readouterr().out

@@ -61,6 +61,7 @@ def test_a_run_leaves_its_story(trained):
     assert (folder / "run" / "policy.gif").read_bytes()[:3] == b"GIF"
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_and_never_overwritten(trained):
     folder, options = trained
     again = run("train.py", "--env", "ClothReach-v0", "--run", folder / "run", *options, cwd=folder)
@@ -75,14 +76,13 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
     assert lines[-1]["training_seconds"] > lines[0]["training_seconds"]
 
 
+@pytest.mark.slow
 def test_the_learned_policy_is_evaluated_beside_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
     reach = ("--env", "ClothReach-v0")
     done = run("evaluate.py", *reach, "--policy", "noop", folder / "run", "--episodes", 7, "--json", out, cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "noop" in done.stdout and "performance" in done.stdout
-    assert "cost" not in done.stdout and "safe" not in done.stdout  # this task has none
     scores = json.loads(out.read_text())
     assert scores["noop"]["success_rate"] == 0 and scores[str(folder / "run")]["episodes"] == 7
     one = run("evaluate.py", *reach, "--policy", "expert", "--episodes", 7, "--json", out, cwd=folder)
@@ -92,33 +92,17 @@ def test_the_learned_policy_is_evaluated_beside_the_references(trained):
 # --- what is wrong, and Ctrl+C ---------------------------------------------------------------------------------------------
 
 WRONG = {
-    "train --algo dqn": "invalid choice 'dqn'",
     "train --env ClothDrap-v0": "no environment 'ClothDrap-v0'; did you mean 'ClothDrape-v0'?",
     "train --env ClothReach-v0 --algo ppo_lagrange": "has no hyperparameters for 'ClothReach-v0' (there are: ClothStrain-v0",
     "train --hyperparams gone.yml": "--hyperparams gone.yml: there is no such file",
     "train --hyperparams thin.yml": "thin.yml lacks n_envs, policy, n_steps for 'ClothDrape-v0'",
-    "train --hyperparams broken.yml": "--hyperparams broken.yml: it is no YAML (while parsing",
-    "train --hyperparams list.yml": "list.yml has no hyperparameters for 'ClothDrape-v0' (there are: )",
-    "train --hyperparams number.yml": "number.yml: 'ClothDrape-v0' has 3: must be a mapping, name: value",
     'train --resume learned --env-kwargs {"rows":9}': "--resume goes on with the run's own: drop --env-kwargs",
-    "train --resume learned --hyperparams thin.yml": "--resume goes on with the run's own: drop --hyperparams",
     "train --resume gone": "'gone' is not the folder of a training run",
-    "train --timesteps 0": "--timesteps 0: must be at least 1",
-    "train --seed -1": "--seed -1: must be from 0",
     "train --env-kwargs {": "'{' is not JSON",
-    "evaluate --env ClothReech-v0": "no environment 'ClothReech-v0'; did you mean 'ClothReach-v0'?",
     "evaluate --policy nothing": "no policy 'nothing' (there are: noop, random, expert, careless, learned, a file of a policy, the",
-    "evaluate --policy noop chance": "no policy 'chance'",
-    "evaluate --policy .": "'.' is not the folder of a training run",
     "evaluate --policy careless": "careless: only ClothStrain-v0 has a careless expert",
     "evaluate --policy learned --env ClothReach-v0": "'learned' was trained on ClothDrape-v0, not on ClothReach-v0",
     "evaluate --policy old": "'old' was trained with clothgym 0.0.1",
-    "evaluate --policy list": "list/config.json' is no configuration of a run (it holds list instead of an object)",
-    "evaluate --policy thin": "thin/config.json' is no configuration of a run (its algo is None, not of type str)",
-    "train --resume none": "(its num_envs is 0, not at least 1): train again",
-    "evaluate --episodes 0": "--episodes 0: must be at least 1",
-    "evaluate --seed -1": "--seed -1: must be zero or positive",
-    "evaluate --env-kwargs []": "must be a JSON object",
     "evaluate --json .": "--json .: is a folder",
 }
 
@@ -126,19 +110,11 @@ WRONG = {
 @pytest.fixture
 def wrong(tmp_path, monkeypatch, scripts):
     """A folder with files to name, and no environment and no learner to be had in it."""
-    for name, text in {
-        "thin": "ClothDrape-v0: {n_timesteps: 100}", "broken": "ClothDrape-v0: {", "list": "[1]", "number": "ClothDrape-v0: 3",
-    }.items():  # fmt: skip
-        (tmp_path / f"{name}.yml").write_text(text)
+    (tmp_path / "thin.yml").write_text("ClothDrape-v0: {n_timesteps: 100}")
     for name, version in (("learned", clothgym.__version__), ("old", "0.0.1")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "checkpoint.pt").touch()
         files.write_json(tmp_path / name / "config.json", CONFIG | {"clothgym": version})
-    for name, config in (("list", []), ("thin", {"env": "ClothDrape-v0"}), ("none", CONFIG | {"num_envs": 0})):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "checkpoint.pt").touch()
-        text = config if isinstance(config, list) else files.checked_in({"clothgym": clothgym.__version__} | config)
-        (tmp_path / name / "config.json").write_text(json.dumps(text))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(gym, "make_vec", None)
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
@@ -177,11 +153,6 @@ def test_the_scripts_load_torch_only_when_they_begin():
     code = "import sys, train, evaluate; print([name for name in ('torch', 'stable_baselines3', 'numba') if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "training", capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "[]", done.stderr
-
-
-def test_what_an_environment_does_not_take_is_a_sentence(tmp_path):
-    done = run("evaluate.py", "--env", "ClothReach-v0", "--env-kwargs", '{"integratr": "xpbd"}', cwd=tmp_path)
-    assert done.returncode == 2 and "integratr" in done.stderr and "Traceback" not in done.stderr
 
 
 def test_an_interrupted_run_says_how_to_go_on(scripts, tmp_path, monkeypatch, capsys):
@@ -276,6 +247,7 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
             runs.learned(broken, "ClothReach-v0")
 
 
+@pytest.mark.slow
 def test_a_resumed_run_says_what_it_drops(broken, trained):
     """A broken line and one from after the checkpoint, and a checkpoint that is gone."""
     _, options = trained
@@ -290,25 +262,3 @@ def test_a_resumed_run_says_what_it_drops(broken, trained):
     kept = [json.loads(line)["timesteps"] for line in (broken / "progress.jsonl").read_text().splitlines()]
     assert kept == [400, 800, 1200]
     assert not [path for path in broken.rglob("*") if ".part" in path.name or ".new" in path.name]
-
-
-def test_a_run_without_a_checkpoint_begins_anew(scripts, tmp_path, monkeypatch, capsys):
-    import learning
-    import train
-
-    files.write_json(tmp_path / "config.json", CONFIG)
-    args = train.Args(resume=tmp_path)
-    monkeypatch.setattr(learning, "build", lambda folder, config, seed, done: "a new learner")
-    assert learning.learner(args.folder, args.config, resume=True) == ("a new learner", None)
-    assert "has no checkpoint yet: beginning anew" in capsys.readouterr().out
-
-
-def test_a_full_disk_ends_a_script_with_one_sentence(scripts, tmp_path, capsys):
-    import endings
-
-    remedy = endings.stopped(lambda: ": go on with  --resume run")
-    with pytest.raises(SystemExit) as caught, remedy, files.replacing(tmp_path / "it"):
-        raise OSError(28, "No space left on device")
-    said = capsys.readouterr().err
-    assert caught.value.code == 1 and len(said.splitlines()) == 1
-    assert said.startswith("error: ") and "is whole" in said and said.endswith(": go on with  --resume run\n")

@@ -50,6 +50,7 @@ def unfilmed(scripts, monkeypatch):
 # --- a Lagrange multiplier ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_constrained_run_prices_costs_and_goes_on_with_its_price(unfilmed, tmp_path):
     (tmp_path / "short.yml").write_text(CONSTRAINED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 2, "--final-episodes", 3, "--threads", 1)
@@ -77,8 +78,6 @@ def test_costs_are_evaluated(tmp_path):
     command = ("--env", "ClothStrain-v0", "--policy", "noop", "careless", "--episodes", 5, "--seed", 50, "--json", out)
     done = run("evaluate.py", *command, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    header, noop, careless = done.stdout.splitlines()[1:4]
-    assert header.split()[-2:] == ["cost", "safe"] and noop.startswith("noop") and careless.startswith("careless")
     scores = json.loads(out.read_text())
     costs, safe = [], []
     for seed in range(50, 55):
@@ -95,7 +94,6 @@ def test_costs_are_evaluated(tmp_path):
     assert scores["careless"]["cost_ci95"] == pytest.approx([np.mean(costs) - half, np.mean(costs) + half])
     assert scores["careless"]["safe_success_rate"] == np.mean(safe) and scores["careless"]["success_rate"] == 1
     assert scores["noop"]["cost"] == 0 and scores["noop"]["safe_success_rate"] == 0
-    assert float(careless.split()[-4]) == pytest.approx(np.mean(costs), abs=0.006)
 
 
 # --- cloning the expert ---------------------------------------------------------------------------------------------------
@@ -164,6 +162,7 @@ def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts
     assert np.array_equal(learned(tmp_path, "ClothFoldGoal-v0")(env, few), model.predict(few, deterministic=True)[0])
 
 
+@pytest.mark.slow
 def test_a_cloned_policy_succeeds_before_it_has_learned_and_is_not_cloned_again(unfilmed, tmp_path):
     (tmp_path / "short.yml").write_text(CLONED)
     options = ("--hyperparams", tmp_path / "short.yml", "--eval-episodes", 40, "--final-episodes", 10, "--threads", 1)
@@ -224,6 +223,7 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
     assert build(learning.Path("unused"), config, 0, 64).env.unwrapped.env.task.physics_name == "true"
 
 
+@pytest.mark.slow
 def test_a_clone_alone_is_scored_again_and_not_cloned_again(unfilmed, tmp_path):
     """Killed before its score, and finished."""
     (tmp_path / "short.yml").write_text(CLONED.replace("!!float 2560", "0"))

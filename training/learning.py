@@ -8,9 +8,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import evaluate
 import numpy as np
 import policies
+import scoring
+import suite
 import torch
 from clone import clone, demonstrations, fill, joined
 from drawing import draw_learning_curve, film
@@ -107,9 +108,9 @@ class Watch(BaseCallback):
         self.save()
 
         # the tail of the held-out seeds: the final score's are others
-        first = evaluate.HELD_OUT + 1_000_000
+        first = scoring.HELD_OUT + 1_000_000
         seeds = list(range(first, first + episodes))
-        found = evaluate.run_episodes(self.config["env"], acting_of(self.model), seeds, progress=False, **self.config["env_kwargs"])
+        found = scoring.run_episodes(self.config["env"], acting_of(self.model), seeds, progress=False, **self.config["env_kwargs"])
         line = {"timesteps": self.num_timesteps, **self.times(), "episodes": episodes}
         line |= {"success_rate": float(found["is_success"].mean())}
         line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
@@ -184,7 +185,7 @@ class Curriculum(BaseCallback):
 
 def training_seed(seed: int, done: int, num_envs: int) -> int:
     """Seed of the first environment, below all held-out ones; a resumed run meets new episodes, not its beginning's again."""
-    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (evaluate.HELD_OUT - num_envs)
+    return int(np.random.SeedSequence([seed, done]).generate_state(1)[0]) % (scoring.HELD_OUT - num_envs)
 
 
 def read_progress(folder: Path) -> list[dict[str, float]]:
@@ -316,18 +317,19 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     names = ["noop", "random", "expert"] + ["careless"] * (config["env"] == "ClothStrain-v0")
     scores = {}
     for name in [*names, str(folder)]:
-        act = acting if name == str(folder) else policies.named(name, config["env"], evaluate.HELD_OUT)
+        act = acting if name == str(folder) else policies.named(name, config["env"], scoring.HELD_OUT)
         number = final_episodes if name == str(folder) else min(final_episodes, REFERENCE_EPISODES)
-        seeds = list(range(evaluate.HELD_OUT, evaluate.HELD_OUT + number))
+        seeds = list(range(scoring.HELD_OUT, scoring.HELD_OUT + number))
         try:
-            episodes = evaluate.run_episodes(config["env"], act, seeds, **config["env_kwargs"])
-            scores[name] = evaluate.score(episodes)
+            episodes = scoring.run_episodes(config["env"], act, seeds, **config["env_kwargs"])
+            scores[name] = scoring.score(episodes)
         except NotImplementedError as missing:  # with these arguments the task has no scripted expert
             print(missing)
-    print(f"{config['env']}, held-out episodes\n{evaluate.table(scores)}")
+    identity = {"env": config["env"], "env_kwargs": config["env_kwargs"]}
+    print(f"held-out episodes\n{suite.table([identity | {'policy': name} | row for name, row in scores.items()])}")
     own = scores.pop(str(folder)) | {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": config["algo"]}
     own |= {"seed": config["seed"], "references": scores} | about
-    evaluate.write_json(folder / EVALUATION, own)
+    files.write(folder / EVALUATION, json.dumps(own, indent=1, default=float) + "\n")
     if policy is not None:
         # the file says what it scores
         said = ("success_rate", "safe_success_rate", "normalized_performance", "episodes")

@@ -65,8 +65,6 @@ class Args:
     """Whether it begins with what the scripted expert would do, in place of doing nothing."""
     model_steps: int | None = None
     """Environment steps that may be simulated for an episode; then what was planned is followed, and nothing or the expert."""
-    minutes: float | None = None
-    """Time after which no more episodes are begun; the same command goes on."""
     env_kwargs: str = "{}"
     """Keyword arguments of the environment, as JSON: '{"action_mode": "pick_place"}'."""
     threads: int | None = None
@@ -91,8 +89,6 @@ class Args:
             raise ValueError(f"--execute {self.execute}: must be at most the horizon, {self.horizon}")
         if not 0 < self.spread <= 10:
             raise ValueError(f"--spread {self.spread}: must be in (0, 10]")
-        if self.minutes is not None and not self.minutes > 0:
-            raise ValueError(f"--minutes {self.minutes}: must be greater than 0")
         for name, path in (("json", self.json), ("film", self.film)):
             if path is not None and path.is_dir():
                 raise ValueError(f"--{name} {path}: is a folder, name a file in it")
@@ -289,11 +285,8 @@ def main(args: Args) -> None:
     if results:
         print(f"{args.env}: {len(results)} episodes are in the file already")
     suite.warm(args.env, policies.noop, kwargs)
-    begun, first, taken = time.perf_counter(), args.seed + len(results), []
+    first, taken = args.seed + len(results), []
     for number in range(len(results), args.episodes):
-        if args.minutes is not None and time.perf_counter() - begun > 60 * args.minutes:
-            print(f"{args.minutes:g} minutes are over: the same command goes on", flush=True)
-            break
         results.append(episode(planner, args.seed + number))
         one = results[-1]
         taken.append(planner.taken)

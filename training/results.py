@@ -104,8 +104,9 @@ def note_policies() -> None:
     files.write_json(TODAY, {"machine": machine(), "policies": noted})
 
 
-def add(folders: Iterable[Path]) -> None:
-    """Copy what is committed of runs; of each id and learner the policy of the seed whose last evaluation on the way was best."""
+def add(folders: Iterable[Path]) -> set[str]:
+    """Copy what is committed of runs, and keep their best policies (``choose``); the ids of the runs."""
+    ids = set()
     for folder in folders:
         if not (folder / "evaluation.json").is_file():
             raise ValueError(f"{str(folder)!r} holds no finished run, it lacks evaluation.json: finish it with --resume {folder}")
@@ -115,7 +116,9 @@ def add(folders: Iterable[Path]) -> None:
             shutil.copyfile(folder / name, target / name)
         if (folder / POLICY).exists():
             shutil.copyfile(folder / POLICY, target / POLICY)
+        ids.add(json.loads((target / "evaluation.json").read_text())["env"])
     choose()
+    return ids
 
 
 def choose() -> None:

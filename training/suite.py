@@ -196,13 +196,15 @@ def cells(row: Row) -> dict[str, str]:
         "return": _spread(row, "return"),
         "steps": f"{row['mean_length']:.1f}",
         "model steps": "" if steps is None else f"{steps:,}",
-        "seconds": f"{row['seconds']:.1f}",
+        "seconds": f"{row['seconds']:.1f}" if "seconds" in row else "",
     }
 
 
 def table(rows: list[Row]) -> str:
     """Rows as text, a line each; columns in which nothing stands are left out."""
     lines = [{"environment": row["env"], **cells(row)} for row in rows]
+    for line, row in zip(lines, rows):
+        line["safe"] = f"{row['safe_success_rate']:.3f}" if "safe_success_rate" in row else ""
     columns = [name for name in lines[0] if any(line[name] for line in lines)]
     widths = [max(len(name), *(len(line[name]) for line in lines)) for name in columns]
     texts = [dict(zip(columns, columns)), *lines]

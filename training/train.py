@@ -91,8 +91,6 @@ class Args:
     def resumed_run(self, folder: Path) -> tuple[Path, dict[str, Any]]:
         """Folder and configuration of the run to go on with."""
         config = policies.read_config(folder, begun=False)
-        if config["algo"] == "rllib_ppo":
-            raise ValueError(f"--resume {folder}: it is of RLlib: go on with  python training/rllib_train.py --resume {folder}")
         if self.run is not None:
             raise ValueError("--resume goes on in the run's own folder: drop --run")
         policies.same_as(config, self, "env", "seed", "algo", "threads")
