@@ -269,13 +269,14 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from clothgym.playground.server import Gallery, free_port, policies_of, serve
+    from clothgym.playground.gallery import Gallery, policies_of
+    from clothgym.playground.server import check_address, serve
 
     actor = next((name for name in options.policy if name in ACTORS), "expert")
     try:
         if options.what:
             Gallery().checked(options.what)
-        free_port(options.host, options.port)
+        check_address(options.host, options.port)
         start, policies = policies_of(options.policy, options.what)
         playground = serve(start, options.host, options.port, options.replay, policies, actor)
     except (ValueError, OSError, ImportError, RuntimeError) as error:

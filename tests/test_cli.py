@@ -13,7 +13,7 @@ from clothgym import INTEGRATORS, Simulation, progress
 from clothgym.cli import main
 from clothgym.lab import bench
 from clothgym.playground.episode import POLICIES
-from clothgym.playground.server import Gallery
+from clothgym.playground.gallery import Gallery
 from clothgym.playground.stage import SceneStage
 from clothgym.registration import ACTORS, ENVIRONMENTS
 

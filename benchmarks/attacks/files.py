@@ -30,7 +30,7 @@ from clothgym.envs.episode import TaskState
 from clothgym.playground.recording import Recording
 from clothgym.playground.stage import SceneStage
 
-ARCHIVES = {"state": 1, "task state": 1, "recording": 1}  # their versions
+ARCHIVES = {"state": 1, "task state": 1, "recording": 2}  # their versions
 OBJECTS = ("configuration",)
 KINDS = (*ARCHIVES, *OBJECTS, *(["checkpoint", "policy"] if importlib.util.find_spec("torch") else []))
 SPECIAL = ("/dev/zero", "/dev/null", "/dev/random", "/proc/self/mem", "folder", "pipe", "empty", "link to itself")
@@ -170,7 +170,7 @@ def _recorded(path: Path) -> Any:
     """All frames, of a recording that can be shown."""
     recording = Recording.load(path)
     assert all(np.isfinite(frame.positions).all() and frame.solids is not None for frame in recording.frames)
-    frames = [(frame.time, frame.positions.tobytes(), frame.touching.tobytes(), len(frame.solids)) for frame in recording.frames]
+    frames = [(frame.time, frame.positions.tobytes(), len(frame.solids)) for frame in recording.frames]
     return recording.title, recording.time_step, recording.camera, list(recording.labels), frames
 
 
