@@ -19,7 +19,7 @@ from clothgym.playground.exporting import SAVED, saved
 from clothgym.playground.gallery import Gallery
 from clothgym.playground.scenes import number_within
 from clothgym.playground.show import MODES, Show
-from clothgym.playground.stage import REBUILDS, SceneStage
+from clothgym.playground.stage import SceneStage
 from clothgym.render import Camera
 
 ROOM = 1.15  # distance of the page's eye relative to that of a picture, since the panel makes the view narrower
@@ -28,6 +28,7 @@ LARGEST_SEED = 2**31 - 1
 FRAME_BUDGET = 0.5  # of orders, and of computing, for one frame [s]
 MOST_ORDERS = 10_000  # that wait; a drag gives twenty a second, and compiling takes a minute
 READ_EVERY = 0.2  # between two updates of numbers [s]
+COMPILED = ("integrator", "bending", "strain_limit", "self_collision")  # settings that change the compiled loop
 FIRST = "patch"  # the scene that a preset opens where none is open
 
 
@@ -195,7 +196,7 @@ class Page:
         if not isinstance(stage, SceneStage):
             return
         changes = {name: value for name, value in changes.items() if getattr(stage.settings, name) != value}
-        if any(name in REBUILDS for name in changes):
+        if any(name in COMPILED for name in changes):
             self._wait("Rebuilding.")
         if changes:
             self._do(lambda: stage.change(**changes))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import integrators
 from clothgym.checks import indices, vector
 from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.guards import BURST, refusal
-from clothgym.parameters import PROPERTIES, of_material
+from clothgym.guards import BURST
 from clothgym.playground import hands
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.scenes import FRAME, TITLES, Settings, begin, drive, scene_named
@@ -26,9 +25,7 @@ EDGE_OF_VIEW = 9.0  # of each coordinate [m]
 SHREDS = 0.12  # largest displacement at which a sheet that has blown up is drawn [m]: its real position is out of sight
 EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
 REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
-# settings that change the compiled loop or a method's plan: they need a new simulation of the same sheet
-REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
-# parts of a state that go on in a simulation of the same sheet with another method
+# parts of a state that go on in a new simulation of the same sheet
 CARRIED = (
     "holder", "attachment_positions", "attachment_targets", "openings", "wanted_openings", "colliders", "collider_homes", "steps",
     "diverged",
@@ -233,48 +230,17 @@ class SceneStage(Stage):
     # --- settings -------------------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> None:
-        """Change settings; where the simulation allows it, while it runs.
+        """Change settings: all but the wind in a new simulation, which goes on with the positions and velocities of the old one.
 
         Raises:
             ValueError: an unknown name or an invalid value; nothing is changed.
         """
-        before, after = self.settings, self.settings.changed(**changes)
-        pairs = zip(PROPERTIES, of_material(before.material), of_material(after.material))
-        properties = {name for name, old, new in pairs if old != new}
-        method, notes = integrators.get(after.integrator), {k: v for k, v in self.notes.items() if k == "burst"}
-        ignored = sorted(properties & method.ignored)
-        rebuilt = any(getattr(after, name) != getattr(before, name) for name in REBUILDS)
-        if rebuilt or ignored or (after.self_collision != "off" and after.friction != before.friction):
+        after = self.settings.changed(**changes)
+        if replace(after, wind=0.0, gust=0.0) != replace(self.settings, wind=0.0, gust=0.0):
             self._carry_over(after)
-        else:
-            self._set_in_place(properties, after, notes)
-        if ignored:
-            notes["ignored"] = refusal(method, ignored[0]).capitalize() + "."
-        self.settings, self.notes = after, notes
-
-    def _set_in_place(self, properties: set[str], after: Settings, notes: dict[str, str]) -> None:
-        """Change the running simulation; a note says if its substeps stay since there is no bound."""
-        s, before = self.simulation, self.settings
-        changed: dict[str, Any] = {name: getattr(after.material, name) for name in properties}
-        if after.gravity != before.gravity:
-            changed["gravity"] = (0, 0, -after.gravity)
-        if changed:
-            s.set_parameters(warn=False, **changed)
-        if after.friction != before.friction:
-            state = s.get_state()
-            state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction
-            s.set_state(state)
-        if after.substeps != "auto":
-            s.substeps = after.substeps
-            return
-        largest, why = s.largest_substep()
-        if largest > 0:
-            s.substeps = s.integrator.automatic_substeps(s.time_step, largest)
-        else:
-            notes["substeps"] = f"{s.integrator.name} has no bound here, {why}: it goes on with {s.substeps} substeps."
+        self.settings = after
 
     def _carry_over(self, after: Settings) -> None:
-        """Go on in a new simulation, with the positions, velocities and attachments of the old one."""
         old, new = self.simulation.get_state(), self._simulated(after)
         if np.isfinite(old.positions).all() and np.isfinite(old.velocities).all():
             new.reset(positions=old.positions, velocities=old.velocities)
@@ -283,7 +249,6 @@ class SceneStage(Stage):
                 setattr(state, name, getattr(old, name))
             state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction
             new.set_state(state)
-            new.set_wind(old.wind)
         goals = self.hand.goals
         self.simulation, self.hand = new, hands.Hand(new)
         self.hand.goals = goals
