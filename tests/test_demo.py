@@ -57,11 +57,13 @@ def decoded(tab, name):
     return np.array(made[2]).reshape(made[0], made[1], 3)
 
 
+@pytest.mark.slow
 def test_the_page_decodes_the_positions_that_were_recorded(opened):
     tab, _ = opened
     assert np.abs(decoded(tab, "walk") - walk().positions).max() <= 0.5 * record.QUANTUM + 1e-6
 
 
+@pytest.mark.slow
 def test_the_page_shows_what_the_committed_policy_does(opened):
     # played again here, without the script that recorded it
     tab, _ = opened
@@ -85,6 +87,7 @@ def test_the_page_shows_what_the_committed_policy_does(opened):
     assert f"Success · score {info['normalized_performance']:.2f}" in tab.inner_text("#verdict")
 
 
+@pytest.mark.slow
 def test_every_episode_is_drawn_without_a_word_to_the_console(opened):
     tab, said = opened
     for name in record.EPISODES:
@@ -101,6 +104,7 @@ def test_every_episode_is_drawn_without_a_word_to_the_console(opened):
     assert said == []
 
 
+@pytest.mark.slow
 def test_a_link_names_an_episode_and_one_that_is_missing_is_said(opened):
     tab, said = opened
     tab.evaluate("location.hash = 'fold'")
