@@ -86,7 +86,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("--policy", type=_actor, default="expert", help="policy: expert (default), noop, random, or a run's folder")
     export.add_argument(
-        "--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help="settings, such as gravity=3 fabric=silk wind=4"
+        "--set",
+        nargs="+",
+        type=_setting,
+        default=[],
+        metavar="NAME=VALUE",
+        help="settings of a scene, such as gravity=3 fabric=silk wind=4",
     )
 
     compare = command(_compare, "compare", "one scene, several integrators: errors, costs and pictures")

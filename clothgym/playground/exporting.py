@@ -29,7 +29,20 @@ from clothgym.render.heat import largest_at_particles
 from clothgym.render.meshes import KINDS, without_frames
 from clothgym.simulation import GRAVITY
 
-COLORS = ("fabric", "strain")
+SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
+NEEDED = {".png": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
+# what a visitor can save
+SAVED = {
+    "png": "picture (PNG)",
+    "gif": "film (GIF)",
+    "mp4": "film (MP4)",
+    "obj": "meshes (OBJ, zipped)",
+    "glb": "moving mesh (glTF)",
+    "npz": "recording (NPZ)",
+    "demo": "demonstration (NPZ)",
+}
+LONGEST = 300  # frames of a film or of meshes that a visitor saves, the last of the recording
+Say = Callable[[int, int], None]
 
 
 def painter(
@@ -39,7 +52,7 @@ def painter(
 
     camera: in place of the recording's own.
     """
-    one_of("color", color, *COLORS)
+    one_of("color", color, "fabric", "strain")
     mesh, seen = recording.mesh, camera or recording.camera
     renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], seen, size, size, antialias, grid_shape=mesh.shape)
 
@@ -85,22 +98,6 @@ def lasting(solids: Sequence[Sequence[Drawn]]) -> list[list[Drawn]]:
     counts = [Counter(solid.at_origin for solid in things) for things in solids]
     kept = {shape for shape, number in counts[0].items() if all(other[shape] == number for other in counts)}
     return [[solid for solid in things if solid.at_origin in kept] for things in solids]
-
-
-SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
-NEEDED = {".png": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
-# what a visitor can save
-SAVED = {
-    "png": "picture (PNG)",
-    "gif": "film (GIF)",
-    "mp4": "film (MP4)",
-    "obj": "meshes (OBJ, zipped)",
-    "glb": "moving mesh (glTF)",
-    "npz": "recording (NPZ)",
-    "demo": "demonstration (NPZ)",
-}
-LONGEST = 300  # frames of a film or of meshes that a visitor saves, the last of the recording
-Say = Callable[[int, int], None]
 
 
 # --- what is shown --------------------------------------------------------------------------------------------------------

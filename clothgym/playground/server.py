@@ -11,6 +11,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from clothgym.playground.show import furnish
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
+TELL = partial(print, flush=True)  # at once, also into a pipe
 EASE = 0.002  # shortest pause between two frames, for the server's other threads [s]
 
 
@@ -146,14 +148,9 @@ def check_address(host: str, port: int) -> None:
         raise ValueError(f"host={host!r}: cannot listen there ({error})") from error
 
 
-def say(line: str) -> None:
-    """Print at once, also into a pipe."""
-    print(line, flush=True)
-
-
 def serve(
     start: str, host: str = LOOPBACK, port: int = PORT, replay: Path | None = None,
-    policies: Mapping[str, Mapping[str, Policy]] | None = None, actor: str = "expert", tell: Callable[[str], None] = say,
+    policies: Mapping[str, Mapping[str, Policy]] | None = None, actor: str = "expert", tell: Callable[[str], None] = TELL,
 ) -> Playground:  # fmt: skip
     """Begin to serve, after a first look at what is shown first, which compiles what it needs.
 
