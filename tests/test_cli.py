@@ -79,7 +79,7 @@ BY_NAME = {
     "export patch --out a.gif --fps 100": "patch has 30 frames a second",
     "export ClothReach-v0 --out a.gif --fps 100": "ClothReach-v0 has 15 frames a second",
     "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",
-    "export ClothReach-v0 --out a.gif --set fabric=silc": "did you mean 'silk'?",
+    "export patch --out a.gif --set fabric=silc": "did you mean 'silk'?",
     "export ClothReach-v0 --out a.gif --policy .": "lacks config.json",
     "bench --table --select nonsense": "no group 'nonsense' (there are: springs",
     "compare --scene stif_sheet": "did you mean 'stiff_sheet'?",

@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +22,8 @@ from clothgym.forces import structural_strain
 from clothgym.playground.episode import EpisodeStage, Race
 from clothgym.playground.gallery import Gallery, policies_of
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.scenes import SCENES, scene_named
-from clothgym.playground.stage import SceneStage, Stage
+from clothgym.playground.scenes import FRAME, SCENES, scene_named
+from clothgym.playground.stage import STEPS, SceneStage, Stage
 from clothgym.registration import ACTORS, actor_named
 from clothgym.render import Camera, Drawn, MeshSequence, Renderer, write_animation, write_picture, write_video
 from clothgym.render.heat import largest_at_particles
@@ -164,6 +165,15 @@ def stride_for(title: str, time_step: float, fps: float | None) -> int:
     return max(1, int(1.01 * own / fps))
 
 
+def time_step_of(name: str) -> float:
+    """Of the frames of a scene or an environment [s], which may be given another one when it is made."""
+    if name in SCENES:
+        return STEPS * FRAME
+    entry: Any = gym.spec(name.rpartition(":")[2]).entry_point
+    environment: Any = gym.envs.registration.load_env_creator(entry) if isinstance(entry, str) else entry
+    return environment.task_class.physics.time_step
+
+
 # --- files ----------------------------------------------------------------------------------------------------------------
 
 
@@ -212,6 +222,8 @@ def export(
         raise ImportError(f"out={str(out)!r}: a {path.suffix} needs {NEEDED[path.suffix]}: pip install 'clothgym[video]'")
     if seconds is not None:
         positive("seconds", seconds)
+    # a rate that there is not is said before anything is made
+    stride_for(name, time_step_of(Gallery().checked(name)), fps)
     stage = stage_named(name, seed, policy, settings)
     rate = 1 / (stage.recording.time_step * stride_for(name, stage.recording.time_step, fps))
     if path.suffix == ".png" and seconds is not None:
