@@ -88,7 +88,7 @@ def measure(playground: Playground, browser: Any, scene: str, visitors: int, sec
         frames.append(min(tab.evaluate("window.drawn") - first for tab, first in zip(tabs, drawn)) / passed)
         stage = come[0].page.stage
         assert isinstance(stage, SceneStage)
-        costs.append(1e3 * stage.sheets[0].cost)
+        costs.append(1e3 * stage.cost)
     shape = stage.scene.mesh.shape or (0, 0)
     for tab in tabs:
         tab.close()

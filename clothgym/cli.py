@@ -86,7 +86,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     export.add_argument("--policy", type=_actor, default="expert", help="policy: expert (default), noop, random, or a run's folder")
     export.add_argument(
-        "--set", nargs="+", type=_setting, default=[], metavar="NAME=VALUE", help="settings, such as gravity=3 fabric=silk wind=4"
+        "--set",
+        nargs="+",
+        type=_setting,
+        default=[],
+        metavar="NAME=VALUE",
+        help="settings of a scene, such as gravity=3 fabric=silk wind=4",
     )
 
     compare = command(_compare, "compare", "one scene, several integrators: errors, costs and pictures")
@@ -254,13 +259,14 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from clothgym.playground.server import Gallery, free_port, policies_of, serve
+    from clothgym.playground.gallery import Gallery, policies_of
+    from clothgym.playground.server import check_address, serve
 
     actor = next((name for name in options.policy if name in ACTORS), "expert")
     try:
         if options.what:
             Gallery().checked(options.what)
-        free_port(options.host, options.port)
+        check_address(options.host, options.port)
         start, policies = policies_of(options.policy, options.what)
         playground = serve(start, options.host, options.port, options.replay, policies, actor)
     except (ValueError, OSError, ImportError, RuntimeError) as error:

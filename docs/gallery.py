@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym.playground.exporting import moments, stage_named
-from clothgym.playground.pictures import painter
+from clothgym.playground.exporting import moments, painter, stage_named
 from clothgym.playground.recording import Frame
 from clothgym.render import write_video
 

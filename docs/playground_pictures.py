@@ -42,7 +42,7 @@ def main() -> None:
             warning.first.dispatch_event("click")
         shots = []
         page.order("change", {"gravity": 9.81})
-        wait(tab, lambda: page.stage.settings.gravity > 9 and page.stage.frame.time > 3)
+        wait(tab, lambda: page.stage.frame.positions[0, :, 2].min() < 0.3)
         page.order("press", "play / pause")
         shots.append(shot(tab))
         page.order("press", "play / pause")

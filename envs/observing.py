@@ -177,24 +177,21 @@ class Observer:
 
         task, pictures = self.task, self.pictures
         assert pictures is not None
-        solids, shapes = self._things(envs)
+        things = self._things(envs)
         flat = pictures.reshape(task.num_envs, -1)
-        colors, numbers = (flat, _NO_NUMBERS) if pictures.dtype == np.uint8 else (_NO_COLORS, flat)
-        block, lane = task.simulation.layout.at(envs)
-        origin, per_side = np.ascontiguousarray(task.episode["origin"]), float(task.rules["per_side"][0])
+        out = (flat, _NO_NUMBERS) if pictures.dtype == np.uint8 else (_NO_COLORS, flat)
+        places = task.simulation.layout.at(envs)
+        measure = np.ascontiguousarray(task.episode["origin"]), float(task.rules["per_side"][0]), self._bound
         x = task.simulation.view.x
 
         def work(first: int, last: int) -> None:
-            draw_pictures(
-                first, last, self._kind, envs, block, lane, x, self._surfaces, shapes, solids, self.sight.numbers, self.sight.near,
-                self.sight.color, origin, per_side, self._bound, colors, numbers,
-            )  # fmt: skip
+            draw_pictures(first, last, self._kind, envs, places, x, self._surfaces, things, self.sight, measure, out)
 
         _jit.run_spans(work, len(envs), min(task.threads, max(1, len(envs) // PICTURES_A_THREAD)))
         self.stale[envs] = False
 
     def _things(self, envs: NDArray) -> tuple[NDArray, NDArray]:
-        """Solids and markers of environments, and their shapes, see ``quick_solids``; a height map is of cloth and solids alone."""
+        """Shapes and rows of solids and markers of environments, see ``quick_solids``; a height map has no markers."""
         from clothgym.render import quick_solids
 
         task = self.task
@@ -206,7 +203,7 @@ class Observer:
         if self.mode in ("rgb", "depth", "rgbd"):
             parts.append(marks(task, envs))
             shapes.append(np.ones(parts[1].shape[1], np.int64))
-        return np.concatenate(parts, axis=1), np.concatenate(shapes)
+        return np.concatenate(shapes), np.concatenate(parts, axis=1)
 
     def _solids(self, envs: NDArray) -> NDArray:
         """The simulation's own solids, where they are now, without the thickness that contact keeps."""

@@ -13,7 +13,7 @@ from clothgym import INTEGRATORS, Simulation, progress
 from clothgym.cli import main
 from clothgym.lab import bench
 from clothgym.playground.episode import POLICIES
-from clothgym.playground.server import Gallery
+from clothgym.playground.gallery import Gallery
 from clothgym.playground.stage import SceneStage
 from clothgym.registration import ACTORS, ENVIRONMENTS
 
@@ -63,6 +63,8 @@ BY_NAME = {
     "export patch --out a.fbx": "must end in",
     "export patch --out a.gif --fps 100": "patch has 30 frames a second",
     "export patch --out a.gif --set gravty=1": "no setting 'gravty'; did you mean 'gravity'?",
+    "export patch --out a.gif --set fabric=silc": "did you mean 'silk'?",
+    "export ClothReach-v0 --out a.gif --policy .": "lacks config.json",
     "compare --scene stif_sheet": "did you mean 'stiff_sheet'?",
     "compare --integrators verlett": "no integrator 'verlett'; did you mean 'verlet'?",
 }

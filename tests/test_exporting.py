@@ -9,10 +9,8 @@ from test_export import read, shown
 from clothgym.cli import main
 from clothgym.collisions import Sphere
 from clothgym.playground import exporting
-from clothgym.playground.exporting import moments, stage_named
-from clothgym.playground.pictures import lasting, painter, strain_shares
-from clothgym.playground.scenes import scene_named
-from clothgym.playground.world import FRAME, drive
+from clothgym.playground.exporting import lasting, moments, painter, stage_named, strain_shares
+from clothgym.playground.scenes import FRAME, drive, scene_named
 from clothgym.render import Drawn
 
 SHORT = ["--seconds", "0.2"]  # six frames
@@ -127,6 +125,12 @@ def test_wrong_options_are_refused_before_a_stage_is_made(tmp_path, monkeypatch,
     monkeypatch.setattr(exporting, "SceneStage", None)
     with pytest.raises(ValueError, match=message):
         exporting.export("patch", tmp_path / "a.gif", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_settings_of_an_environment_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="are of scenes; ClothReach-v0 has its own"):
+        exporting.export("ClothReach-v0", tmp_path / "a.gif", settings={"gravity": 1.0})
     assert not list(tmp_path.iterdir())
 
 

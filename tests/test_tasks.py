@@ -17,7 +17,7 @@ import clothgym.envs
 from clothgym import Gripper, Material, Plane, grid
 from clothgym.cli import main
 from clothgym.envs import ClothEnv, ClothVectorEnv, GripperTask, Physics, Task
-from clothgym.playground.server import Gallery
+from clothgym.playground.gallery import Gallery
 from clothgym.registration import ENVIRONMENTS, checked_id
 from clothgym.state import Layout
 

@@ -17,20 +17,18 @@ import secrets
 import socket
 import sys
 import traceback
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, parse_qsl, quote, unquote, urlencode, urlsplit
 
 from clothgym.checks import shown
-from clothgym.playground.dress import dressed
 
 MOST_VISITS = 16
 PAGES = ("/", "/index.html")
 LONGEST, ASKED_FOR = 2000, 60  # letters of a query that are read, and how long a page has to ask for its websocket [s]
 ASKED: ContextVar[str] = ContextVar("asked", default="")  # the query of the page whose websocket is served in this context
-NOWHERE = "clothgym.invalid"  # a name that no server has
 # the rest of a request for a page, and of one for a websocket
 PAGE = "Connection: close\r\n"
 WEBSOCKET = (
@@ -38,6 +36,7 @@ WEBSOCKET = (
 )
 MALFORMED = http.HTTPStatus.BAD_REQUEST, "This request is malformed."
 FRAMES = "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks on this machine may embed the page
+EVERYWHERE = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}  # how this machine reaches a server at all its addresses
 
 
 class Access:
@@ -46,7 +45,7 @@ class Access:
     Args:
         host: address that the server listens at.
         port: its port.
-        full: whether there is no room for one more visitor, beside so many open websockets.
+        full: whether there is no room for one more visitor, given so many open websockets.
 
     Attributes:
         token: that a request must bring; "" on loopback, where only this machine's programs can send one.
@@ -84,7 +83,7 @@ class Access:
             return http.HTTPStatus.SERVICE_UNAVAILABLE, f"The playground is full, with {MOST_VISITS} visitors. Try again later."
         return None
 
-    def guarded(self, process: Callable[[Any, Any], Any] | None) -> Callable[[Any, Any], Any]:
+    def guarded(self, process: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
         """A websocket server's ``process_request`` that refuses first, and then does as before."""
 
         def process_request(connection: Any, request: Any) -> Any:
@@ -94,9 +93,8 @@ class Access:
                 refused = MALFORMED
             if refused is not None:
                 return connection.respond(refused[0], refused[1] + "\n")
-            response = process(connection, request) if process is not None else None
+            response = process(connection, request)
             if response is not None:
-                dressed(response)
                 response.headers["Content-Security-Policy"] = FRAMES
                 response.headers["Referrer-Policy"] = "no-referrer"
                 if self.token:
@@ -119,9 +117,13 @@ class Access:
 
             async def telling(connection: Any) -> None:
                 ASKED.set(unquote("".join(in_cookies(connection.request.headers, f"{self._cookie}-asked"))[:LONGEST]))
-                await handler(connection)
+                try:
+                    await handler(connection)
+                except Exception as error:
+                    tell_of_a_message(error)
+                    await connection.close(1003, "a message that cannot be read")
 
-            return plain(in_sentences(telling), *args, process_request=self.guarded(process_request), **kwargs)
+            return plain(telling, *args, process_request=self.guarded(process_request), **kwargs)
 
         server.serve = serve  # type: ignore[assignment,misc]
         try:
@@ -131,12 +133,12 @@ class Access:
 
     def stands(self) -> bool:
         """Whether the server refuses a page and a websocket that it must refuse; asked of the server itself."""
-        return self._refuses(PAGE) and self._refuses(WEBSOCKET)
+        return all(map(self._refuses, (PAGE, WEBSOCKET)))
 
     def _refuses(self, lines: str) -> bool:
         try:
-            with socket.create_connection((_near(self.host), self.port), timeout=10) as probe:
-                probe.sendall(f"GET / HTTP/1.1\r\nHost: {NOWHERE}\r\n{lines}\r\n".encode())
+            with socket.create_connection((EVERYWHERE.get(self.host, self.host), self.port), timeout=10) as probe:
+                probe.sendall(f"GET / HTTP/1.1\r\nHost: clothgym.invalid\r\n{lines}\r\n".encode())
                 return probe.recv(64).startswith(b"HTTP/1.1 403")
         except OSError:  # no answer is no refusal
             return False
@@ -150,8 +152,7 @@ class Access:
         return {f"{name}:{self.port}" for name in names} | (names if self.port == 80 else set())
 
     def _has_token(self, path: str, headers: Any) -> bool:
-        offered = parse_qs(urlsplit(path).query).get("token", [])
-        offered += in_cookies(headers, self._cookie)
+        offered = parse_qs(urlsplit(path).query).get("token", []) + in_cookies(headers, self._cookie)
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in offered)
 
     def _asked(self, path: str) -> str:
@@ -167,19 +168,6 @@ def in_cookies(headers: Any, wanted: str) -> list[str]:
     return [value for name, _, value in pairs if name == wanted]
 
 
-def in_sentences(handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-    """A websocket server's handler that ends a connection with a sentence where a message cannot be read."""
-
-    async def handle(connection: Any) -> None:
-        try:
-            await handler(connection)
-        except Exception as error:
-            tell_of_a_message(error)
-            await connection.close(1003, "a message that cannot be read")
-
-    return handle
-
-
 def tell_of_a_message(error: BaseException | None) -> None:
     """Say in the terminal that a message made no sense: a browser can send anything, and viser would print a traceback."""
     frames = traceback.extract_tb(error.__traceback__) if error is not None else ()
@@ -189,29 +177,21 @@ def tell_of_a_message(error: BaseException | None) -> None:
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach that address."""
-    if host == "localhost":
-        return True
-    try:
+    with contextlib.suppress(ValueError):
         return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+    return host == "localhost"
 
 
 def reachable(host: str) -> str:
     """An address under which others reach a server that listens at ``host``: this machine's own for all of its addresses."""
-    if host not in ("", "0.0.0.0", "::"):
+    if host not in EVERYWHERE:
         return host
     family, beyond = (socket.AF_INET6, "2001:db8::1") if host == "::" else (socket.AF_INET, "192.0.2.1")
     # nothing is sent: a datagram socket that is connected knows the address that it would send from
     with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
         probe.connect((beyond, 9))
         return str(probe.getsockname()[0])
-    return "::1" if host == "::" else "127.0.0.1"
-
-
-def _near(host: str) -> str:
-    """Where this machine reaches a server that listens at ``host``."""
-    return {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return EVERYWHERE[host]
 
 
 def _named(host: str) -> str:

@@ -1,34 +1,26 @@
-"""Stages that are not scenes: an environment with a policy, and a recording that is shown again."""
+"""Stages that are not scenes: an environment with a policy, a race against one, and a recording that is shown again."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import indices, known, vector
-from clothgym.collisions.solids.shapes import R_FRICTION
-from clothgym.envs.episode import within_ball
-from clothgym.material import PRESETS
-from clothgym.playground.judgement import judgement
-from clothgym.playground.recording import Frame, Recording, read, stiffness, touching
-from clothgym.playground.sheets import Attachment, Stability, set_in_place, stability, visible, within_view
-from clothgym.playground.stage import Stage
-from clothgym.playground.world import SLIDERS, Settings
+from clothgym.checks import known, vector
+from clothgym.envs.episode import FAILURES, within_ball
+from clothgym.playground.recording import Frame, Recording
+from clothgym.playground.stage import Stage, measured, visible, within_view
 from clothgym.registration import checked_id
+from clothgym.render import Camera
 from clothgym.render.solids import drawn
 from clothgym.simulation import Simulation
-from clothgym.wind import Wind
 
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observation) -> action
-BOXED = ("integrator", "bending", "strain_limit", "self_collision", "wind", "gust")  # settings that need a new environment
-
-
-KEPT_NOTES = ("evaluation", "run", "air")  # notes that a change of settings does not affect
 
 
 def expert(env: Any, observation: NDArray) -> NDArray:
@@ -49,6 +41,24 @@ def random(env: Any, observation: NDArray) -> NDArray:
 POLICIES: dict[str, Policy] = {"expert": expert, "noop": noop, "random": random}
 
 
+@dataclass(frozen=True)
+class Learnt:
+    """A policy in the environment that it was trained in.
+
+    Attributes:
+        act: actions of a batch, from the environment and the observations.
+        env_kwargs: with which the environment was made.
+    """
+
+    act: Callable[[Any, Any], NDArray]
+    env_kwargs: Mapping[str, Any]
+
+    def __call__(self, env: Any, observation: Any) -> NDArray:
+        if isinstance(observation, Mapping):  # of a goal task
+            return self.act(env, {name: part[None] for name, part in observation.items()})[0]
+        return self.act(env, observation[None])[0]
+
+
 class EpisodeStage(Stage):
     """An environment, and who acts in it.
 
@@ -59,6 +69,7 @@ class EpisodeStage(Stage):
         name: under which it was asked for, the id if it is empty.
 
     Attributes:
+        env_kwargs: with which the environment was made at first.
         info: of the last step.
         played: what the environment observed, was told and gave in each step of the episode.
 
@@ -66,34 +77,30 @@ class EpisodeStage(Stage):
         ValueError: no such environment or policy.
     """
 
+    env: Any
+    env_kwargs: Mapping[str, Any] | None = None
+
     def __init__(
         self, env_id: str, policies: Mapping[str, Policy] | None = None, policy: str = "expert", seed: int = 0, name: str = ""
     ) -> None:
         super().__init__()
         self.env_id, self.seed = checked_id(env_id), seed
         self.name = name or self.env_id
-        self.info: Mapping[str, Any] = {}
-        self.played: list[tuple[Any, NDArray, float]] = []
         self.policies = {**POLICIES, **(policies or {})}
-        self._given: dict[str, Any] | None = None
         self.choose(policy)
-        if self._given is None:
+        if self.env_kwargs is None:
             self._begin({})
 
-    def _begin(self, given: Mapping[str, Any]) -> None:
+    def _begin(self, env_kwargs: Mapping[str, Any]) -> None:
         """Open the environment with these options."""
-        self._options = dict(given)
-        self.env = self._made()
-        self._given = dict(given)
+        self.env_kwargs = dict(env_kwargs)
+        self.env = gym.make(self.env_id, **env_kwargs).unwrapped
         task = self.env.task
+        self.drops = task.actions_per_attachment > 3
         self.about = f"{(type(self.env).__doc__ or '').strip().splitlines()[0]}"
         s = task.simulation
-        self._own = self.settings = settings_of(s, task.wind)
-        self.recording = Recording(self.env_id, s.mesh, task.step_seconds, task.camera(), (s.integrator.name,), task.strain_shown)
+        self.recording = Recording(self.env_id, s.mesh, task.step_seconds, task.camera(), ("sheet",), task.strain_shown)
         self.reset()
-
-    def _made(self) -> Any:
-        return gym.make(self.env_id, **self._options).unwrapped
 
     @property
     def simulation(self) -> Simulation:
@@ -103,16 +110,6 @@ class EpisodeStage(Stage):
     def over(self) -> bool:
         return self._over
 
-    @property
-    def env_kwargs(self) -> Mapping[str, Any]:
-        """With which the environment was made at first."""
-        return self._given or {}
-
-    @property
-    def unchanged(self) -> bool:
-        """Whether the settings are the environment's own."""
-        return self.settings == self._own
-
     def choose(self, policy: str) -> None:
         """Use another policy from now on; if it was trained with other options, in a new environment with these.
 
@@ -121,7 +118,7 @@ class EpisodeStage(Stage):
         """
         known("policy", policy, self.policies)
         trained = getattr(self.policies[policy], "env_kwargs", None)
-        if trained is not None and trained != self._given:
+        if trained is not None and trained != self.env_kwargs:
             self._begin(trained)
             options = ", ".join(f"{name}={value!r}" for name, value in trained.items()) or "the environment's own options"
             self.notes["run"] = f"As {policy} was trained, with {options}."
@@ -131,178 +128,110 @@ class EpisodeStage(Stage):
         self.seed = self.seed if seed is None else int(seed)
         self._observation, _ = self.env.reset(seed=self.seed)
         self.env.action_space.seed(self.seed)
-        # an episode starts with the task's own parameters
-        set_in_place(self.simulation, self._own, self.settings)
-        self._dragged: dict[int, NDArray] = {}
-        self._grabbed: dict[int, NDArray] = {}  # ways from the visitor's pointer to the attachments that follow it [m]
-        self.played, self.info = [], {}
-        self._closed = np.full(
-            len(self.attachments()), self.env.task.actions_per_attachment > 3 and not len(self.simulation.grippers)
-        )
-        self._over, self._time, self._cost, self.total = False, 0.0, 0.0, 0.0
+        self._dragged: dict[int, NDArray] = {}  # where the visitor's pointer draws attachments [m]
+        self._grabbed: dict[int, NDArray] = {}  # ways from that pointer to the attachments [m]
+        self._over = self._dropped = False
+        self._time, self._cost, self._total = 0.0, 0.0, 0.0
+        self.played: list[tuple[Any, NDArray, float]] = []
+        self.info: Mapping[str, Any] = {}
         self.notes.pop("evaluation", None)
-        wind = self.env.task.wind
-        if wind is not None and wind.speed[0] != wind.speed[1]:
-            self.notes["air"] = "Each episode draws its wind, at most what the sliders show, from any side."
-        else:
-            self.notes.pop("air", None)
-        self.recording.frames[:] = [self._look({})]
+        self.recording.frames[:] = [self._look()]
 
     def advance(self) -> Frame:
         if self._over:
             return self.frame
-        action = np.asarray(self.policies[self.policy](self.env, self._observation), np.float32)
-        if self._dragged:
-            action = self._steered(action)
-        begun = time.perf_counter()
-        before = self._observation
-        self._observation, reward, terminated, truncated, info = self.env.step(action)
-        self.played.append((before, action, float(reward)))
-        self.info = info
+        action = self._steered(np.asarray(self.policies[self.policy](self.env, self._observation), np.float32))
+        begun, before = time.perf_counter(), self._observation
+        self._observation, reward, terminated, truncated, self.info = self.env.step(action)
         self._cost = time.perf_counter() - begun
+        self.played.append((before, action, float(reward)))
         self._time += self.env.task.step_seconds
-        self.total += reward
+        self._total += reward
         self._over = terminated or truncated
         if self._over:
-            self.notes["evaluation"] = judgement(info, self.total)
-        terms = {key.removeprefix("reward/"): value for key, value in info.items() if key.startswith("reward/")}
-        return self._keep(self._look(terms))
+            self.notes["evaluation"] = judgement(self.info, self._total)
+        return self._keep(self._look())
 
-    def _look(self, terms: Mapping[str, float]) -> Frame:
+    def _look(self) -> Frame:
         s, task = self.simulation, self.env.task
         return Frame(
             time=self._time,
             positions=visible(s.positions),
-            stiffness=stiffness(s)[None],
-            touching=touching(s)[None],
             solids=tuple(map(drawn, [*task.solids(0), *task.markers(0)])),
-            readings={
-                name: np.array([value])
-                for name, value in read(s, self._cost, float(s.penetration()[0]) if s.colliders else 0.0).items()
-            },
-            terms={name: float(value) for name, value in terms.items()},
+            readings=measured(s, self._cost),
+            terms={name.removeprefix("reward/"): float(self.info[name]) for name in self.info if name.startswith("reward/")},
         )
 
-    # --- settings -------------------------------------------------------------------------------------------------------
+    # --- the visitor's hand -----------------------------------------------------------------------------------------------
 
-    def change(self, **changes: Any) -> None:
-        before = self.settings
-        if changes.get("integrator", before.integrator) != before.integrator:
-            changes = {"substeps": "auto"} | changes  # the task's number is for its own method
-        after = before.changed(**changes)
-        self.notes = {k: v for k, v in self.notes.items() if k in KEPT_NOTES}
-        if any(getattr(after, name) != getattr(before, name) for name in BOXED):
-            self._rebuild(after)
-        unbounded = set_in_place(self.simulation, before, after)
-        if unbounded:
-            self.notes["substeps"] = unbounded
-        self.settings = after
-        self.recording.labels = (self.simulation.integrator.name,)
-
-    def _rebuild(self, after: Settings) -> None:
-        """Make a new environment, and continue the episode if its state fits; else restart it."""
-        old, options, state = self.env, self._options, self.env.get_state()
-        self._options = (self._given or {}) | {
-            "integrator": after.integrator,
-            "bending": after.bending,
-            "strain_limit": after.strain_limit,
-            "self_collision": after.self_collision != "off" and after.self_collision,
-        }
-        if (after.wind, after.gust) != (self._own.wind, self._own.gust):
-            self._options["wind"] = {"speed": [after.wind, after.wind], "direction": [0.0, 0.0], "gust": after.gust}
-        try:
-            self.env = self._made()
-            self.env.reset(seed=self.seed)
-        except ValueError:
-            self.env, self._options = old, options
-            raise
-        blows = (after.wind, after.gust) != (self.settings.wind, self.settings.gust)  # an episode's wind is drawn as it begins
-        if blows or not self._goes_on(state):
-            self.reset()
-            self.notes["restart"] = "This cannot change within an episode: it has started again."
-
-    def _goes_on(self, state: Any) -> bool:
-        """Continue from a state; returns whether it fits."""
-        try:
-            self.env.set_state(state)
-        except ValueError:
-            return False
-        return True
-
-    def stabilities(self) -> list[Stability]:
-        return [stability(self.simulation)]
-
-    # --- attachments ----------------------------------------------------------------------------------------------------
-
-    def attachments(self) -> list[Attachment]:
+    @property
+    def holding(self) -> NDArray[np.bool_]:
+        """Which attachments hold the sheet, anchors first, (attachments,)."""
         s = self.simulation
-        anchors, grippers = len(s.anchors), len(s.grippers)
-        holds = [*s.attached[0], *(s.grippers.held[0] > 0 if grippers else [])]
-        names = [f"clip {k + 1}" for k in range(anchors)] + [f"gripper {k + 1}" for k in range(grippers)]
-        return [
-            Attachment(name, x, bool(h), k >= anchors or bool(h))
-            for k, (name, x, h) in enumerate(zip(names, s.attachment_positions[0], holds))
-        ]
+        return np.concatenate([s.attached[0], s.grippers.held[0] > 0 if len(s.grippers) else []]).astype(bool)
 
-    def drag(self, attachment: int, place: ArrayLike | None) -> None:
-        indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")
-        if place is None:
-            self._dragged.pop(attachment, None)
-        else:
-            self._dragged[attachment] = within_view(vector("place", place))
+    @property
+    def places(self) -> NDArray:
+        """Where the attachments are [m], (attachments, 3)."""
+        return self.simulation.attachment_positions[0]
 
     def grab(self, place: ArrayLike) -> None:
-        """Take the attachment that is nearest to where the visitor holds the sheet."""
+        """Take the attachment that is nearest to where the visitor holds the sheet: any gripper, or an anchor that holds it."""
         where = within_view(vector("place", place))
-        attachments = self.attachments()
-        able = [k for k, attachment in enumerate(attachments) if attachment.draggable]
-        if able:
-            nearest = min(able, key=lambda k: float(((attachments[k].position - where) ** 2).sum()))
-            self.grab_these([nearest], where)
+        able = np.flatnonzero(self.holding | (np.arange(len(self.places)) >= len(self.simulation.anchors)))
+        if len(able):
+            self.grab_these([int(able[((self.places[able] - where) ** 2).sum(axis=1).argmin()])], where)
 
     def grab_these(self, which: Sequence[int], where: NDArray) -> None:
         """Let these attachments follow the visitor's pointer, which is at a position [m], (3,)."""
-        self._grabbed = {k: self.attachments()[k].position - where for k in which}
+        self._grabbed = {k: self.places[k] - where for k in which}
 
     def pull(self, place: ArrayLike) -> None:
         for attachment, away in self._grabbed.items():
-            self.drag(attachment, vector("place", place) + away)
+            self._dragged[attachment] = within_view(vector("place", place) + away)
 
     def let_go(self) -> None:
-        for attachment in self._grabbed:
-            self.drag(attachment, None)
-        self._grabbed = {}
+        """The pointer lets go: the policy acts again, and the sheet is still held."""
+        self._grabbed, self._dragged = {}, {}
 
-    def hold(self, attachment: int, holds: bool) -> None:
-        indices("attachment", [attachment], self.env.task.num_attachments, "the attachments of this task")
-        self._closed[attachment] = holds
-        self._dragged.setdefault(attachment, self.simulation.attachment_positions[0, attachment])
+    def drop(self) -> None:
+        self._dropped = True
+
+    def held(self) -> NDArray[np.float32]:
+        return visible(self.places[self.holding])
 
     def _steered(self, action: NDArray) -> NDArray:
         """The action with dragged attachments moving to the visitor's positions, as fast as the task allows."""
+        if not (self._dragged or self._dropped):
+            return action
         task = self.env.task
         moves = action.reshape(task.num_attachments, task.actions_per_attachment).copy()
         for attachment, place in self._dragged.items():
             away = place - task.episode["targets"][0, attachment]
             moves[attachment, :3] = within_ball(away / (task.physics.attachment_speed * task.physics.time_step))
-            if task.actions_per_attachment > 3:
-                moves[attachment, 3] = -1.0 if self._closed[attachment] else 1.0
+        if self._dropped:
+            moves[:, 3:] = 1.0
         return moves.ravel().astype(np.float32)
+
+
+def judgement(info: Mapping[str, Any], total: float) -> str:
+    """A sentence on the last step's ``info`` and the return."""
+    if info["failure"]:
+        return f"The episode failed: {FAILURES[info['failure']].replace('_', ' ')}. Return {total:.2f}."
+    success = "a success" if info["is_success"] else "no success"
+    return f"Evaluated: {success}, performance {info['normalized_performance']:.2f}, return {total:.2f}."
 
 
 class Replay(Stage):
     """A recording that is shown again: all frames are there, and nothing can be changed."""
 
-    def __init__(self, recording: Recording, name: str = "replay") -> None:
+    over = True
+
+    def __init__(self, recording: Recording, name: str = "recording") -> None:
         super().__init__()
-        self.name, self.seed = name, 0
+        self.name, self.seed, self.recording = name, 0, recording
         count = len(recording.frames)
         self.about = f"A recording of {recording.title}: {count} frames, {count * recording.time_step:.1f} s."
-        self.settings, self.recording = Settings(), recording
-
-    @property
-    def over(self) -> bool:
-        return True
 
     def advance(self) -> Frame:
         return self.frame
@@ -310,23 +239,116 @@ class Replay(Stage):
     def reset(self, seed: int | None = None) -> None:
         """Nothing to do: a recording does not change."""
 
-    def change(self, **changes: Any) -> None:
-        raise ValueError("a recording cannot be changed: choose a scene or an environment")
+
+# --- a race -----------------------------------------------------------------------------------------------------------
 
 
-def settings_of(simulation: Simulation, wind: Wind | None = None) -> Settings:
-    """The settings of a task's simulation; for a wind that each episode draws, the largest speed."""
-    material, state = simulation.material, simulation.get_state()
-    return Settings(
-        gravity=round(-float(state.gravity[0, 2]), 6),
-        wind=0.0 if wind is None else float(wind.speed[1]),
-        gust=0.0 if wind is None else float(wind.gust),
-        fabric=next((name for name, preset in PRESETS.items() if preset.source == material.source), Settings.fabric),
-        **{name: getattr(material, name) for name in SLIDERS},
-        friction=round(float(state.colliders[0, 0, R_FRICTION]), 6) if simulation.colliders else 0.4,
-        integrator=simulation.integrator.name,
-        bending=simulation.bending.name,
-        strain_limit=simulation.strain_limit,
-        self_collision=simulation.self_collision or "off",
-        substeps=simulation.substeps,
+RACE, TASK = "race", "ClothDrape-v0"
+TITLE = f"Race a policy at {TASK}"
+YOU = "you"
+SLOWLY = 2.0  # times slower than time itself: the task gives a hand two seconds
+APART = 0.95  # between the lanes [m]
+OFFSETS = np.array([(0.5 * APART, 0, 0), (-0.5 * APART, 0, 0)], np.float32)  # of the visitor's sheet and of the policy's
+CAMERA = Camera(eye=(2.35, -1.55, 1.4), target=(0.05, -0.2, 0.26), vertical_fov=33.0)  # the way is to the right
+
+
+def still(env: Any, observations: Any) -> NDArray:
+    """Keep attachments where they are: the visitor moves them."""
+    return np.zeros((1, *env.action_space.shape), np.float32)
+
+
+class Race(Stage):
+    """Two environments with the same seed, the visitor's in front.
+
+    Time passes while the visitor drags their sheet, and when they have let go of it: ``drop``.  A pointer moves in the plane of
+    the screen, so the visitor says how far and how high; sideways the lane leads the sheet to the middle of the target.
+
+    Args:
+        policies: what is raced against, by name; the first one at first.
+
+    Raises:
+        ValueError: there is no policy.
+    """
+
+    drops = True
+    about = (
+        "**You** in front, the learned policy behind: lay your sheet over the target. Drag it: time passes slowly while "
+        "you do. **Let go** when it hangs right."
     )
+
+    def __init__(self, policies: Mapping[str, Policy], seed: int = 0) -> None:
+        super().__init__()
+        if not policies:
+            raise ValueError(f"{TASK} has no learned policy here to race against")
+        self.name, self.seed, self.policies = RACE, seed, dict(policies)
+        self.choose(next(iter(policies)))
+
+    def choose(self, policy: str) -> None:
+        """Race against another policy, from the start."""
+        self.theirs = EpisodeStage(TASK, self.policies, policy, self.seed)
+        self.mine = EpisodeStage(TASK, {YOU: Learnt(still, self.theirs.env_kwargs or {})}, YOU, self.seed)
+        self.policy, of = policy, self.mine.recording
+        self.recording = Recording(TITLE, of.mesh, SLOWLY * of.time_step, CAMERA, (YOU, policy), of.strained)
+        self.reset()
+
+    def reset(self, seed: int | None = None) -> None:
+        self.seed = self.seed if seed is None else int(seed)
+        self._pulled = self._dropped = False
+        self.notes.clear()
+        for stage in (self.mine, self.theirs):
+            stage.reset(self.seed)
+        self.recording.frames[:] = [self._look()]
+
+    @property
+    def over(self) -> bool:
+        return self.mine.over and self.theirs.over
+
+    def advance(self) -> Frame:
+        if self.over or not (self._pulled or self._dropped):
+            return self.frame
+        for stage in (self.mine, self.theirs):
+            stage.advance()
+        if self.over:
+            mine, theirs = (float(stage.info["normalized_performance"]) for stage in (self.mine, self.theirs))
+            first = "You win" if mine > theirs else "A draw" if mine == theirs else "The policy wins"
+            self.notes["evaluation"] = f"**{first}: {mine:.2f} to {theirs:.2f}.** Yours: {self.mine.notes['evaluation']}"
+        return self._keep(self._look())
+
+    def grab(self, place: ArrayLike) -> None:
+        self._pulled = True
+        self._from = within_view(vector("place", place)) - OFFSETS[0]
+        self.mine.grab_these(np.flatnonzero(self.mine.holding).tolist(), self._from)
+        self._way = self.mine.env.task.episode["top"][0] - self.mine.places.mean(axis=0)
+
+    def pull(self, place: ArrayLike) -> None:
+        if self._pulled:
+            where = within_view(vector("place", place)) - OFFSETS[0]
+            share = np.clip((where[1] - self._from[1]) / max(self._way[1], 0.01), 0.0, 1.0)
+            where[0] = self._from[0] + share * self._way[0]
+            self.mine.pull(where)
+
+    def let_go(self) -> None:
+        """The visitor's pointer lets go: the sheet is still held where it is."""
+        self._pulled = False
+        self.mine.let_go()
+
+    def drop(self) -> None:
+        """Open what holds the visitor's sheet: it falls, and is judged."""
+        self._dropped = True
+        self.mine.drop()
+
+    def held(self) -> NDArray[np.float32]:
+        return np.concatenate([stage.held() + offset for stage, offset in zip((self.mine, self.theirs), OFFSETS)])
+
+    def _look(self) -> Frame:
+        mine, theirs = self.mine.frame, self.theirs.frame
+        return replace(
+            mine,
+            positions=np.concatenate([mine.positions + OFFSETS[0], theirs.positions + OFFSETS[1]]),
+            solids=tuple(
+                solid.at(np.add(solid.collider.center, offset))
+                for frame, offset in zip((mine, theirs), OFFSETS)
+                for solid in frame.solids
+            ),
+            readings={name: np.concatenate([mine.readings[name], theirs.readings[name]]) for name in mine.readings},
+        )

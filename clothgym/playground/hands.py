@@ -87,8 +87,8 @@ def nearest(x: NDArray, place: NDArray) -> int:
     return int(np.argmin(((x - place) ** 2).sum(axis=1)))
 
 
-def hit(x: NDArray, triangles: NDArray, origin: NDArray, direction: NDArray) -> tuple[NDArray, float] | None:
-    """Where a ray first meets a sheet [m], (3,), and how far from its origin, in lengths of ``direction``; None if it does not.
+def hit(x: NDArray, triangles: NDArray, origin: NDArray, direction: NDArray) -> NDArray | None:
+    """Where a ray first meets a sheet [m], (3,); None if it does not.
 
     Moeller and Trumbore 1997, for all triangles at once.  x: [m], (particles, 3).
     """
@@ -104,8 +104,7 @@ def hit(x: NDArray, triangles: NDArray, origin: NDArray, direction: NDArray) -> 
         inside = (np.abs(det) > 1e-15) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
     if not inside.any():
         return None
-    along = float(t[inside].min())
-    return origin + along * direction, along
+    return origin + float(t[inside].min()) * direction
 
 
 # --- breath -------------------------------------------------------------------------------------------------------------

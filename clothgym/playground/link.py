@@ -1,4 +1,4 @@
-"""A link that opens the page as it is: what is shown, its settings and seed, what is compared, and where the sheet is pinned."""
+"""A link that opens the page as it is: what is shown, its settings and seed, and where the sheet is pinned."""
 
 from __future__ import annotations
 
@@ -9,31 +9,19 @@ from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
 
-from clothgym.playground.episode import EpisodeStage
-from clothgym.playground.sheets import Sheet
+from clothgym.playground.scenes import Settings
 from clothgym.playground.stage import SceneStage, Stage
-from clothgym.playground.world import Settings
 
 TEXTS = ("fabric", "integrator", "bending", "self_collision")  # settings that are names; others are numbers
 
 
 @dataclass(frozen=True)
 class Link:
-    """What a link says.
-
-    Attributes:
-        scene: a name, or "".
-        changes: of its settings.
-        seed: of its start.
-        compared: integrators or fabrics side by side.
-        pins: particles that are pinned.
-        policy: who acts.
-    """
+    """What a link says: a scene's name, changes of its settings, a seed, pinned particles, and who acts."""
 
     scene: str = ""
     changes: Mapping[str, Any] = field(default_factory=dict)
     seed: int | None = None
-    compared: tuple[str, ...] = ()
     pins: tuple[int, ...] = ()
     policy: str = ""
 
@@ -45,21 +33,18 @@ def read(query: str) -> Link:
         ValueError: a number is none.
     """
     given = dict(parse_qsl(query))
-    changes: dict[str, Any] = {}
-    for item in fields(Settings):
-        if item.name in given:
-            text = given[item.name]
-            if item.name in TEXTS or text == "auto":
-                changes[item.name] = text
-            elif text == "none":
-                changes[item.name] = None
-            else:
-                changes[item.name] = int(text) if item.name == "substeps" else float(text)
+
+    def meant(name: str, text: str) -> Any:
+        if name in TEXTS or text == "auto":
+            return text
+        if text == "none":
+            return None
+        return int(text) if name == "substeps" else float(text)
+
     return Link(
         scene=given.get("scene", ""),
-        changes=changes,
+        changes={item.name: meant(item.name, given[item.name]) for item in fields(Settings) if item.name in given},
         seed=int(given["seed"]) if "seed" in given else None,
-        compared=tuple(filter(None, given.get("compared", "").split("."))),
         pins=tuple(int(one) for one in given.get("pins", "").split(".") if one),
         policy=given.get("policy", ""),
     )
@@ -69,24 +54,13 @@ def write(stage: Stage) -> str:
     """The query of a link to a stage as it is."""
     told: dict[str, Any] = {"scene": stage.name}
     if isinstance(stage, SceneStage):
+        if stage.settings.fabric != stage.scene.settings.fabric:
+            told["fabric"] = stage.settings.fabric
         begun = stage.scene.settings.changed(fabric=stage.settings.fabric)
         for item in fields(Settings):
             value = getattr(stage.settings, item.name)
-            if value != getattr(begun, item.name) or (item.name == "fabric" and value != stage.scene.settings.fabric):
+            if value != getattr(begun, item.name):
                 told[item.name] = "none" if value is None else value
-        if stage.compared:
-            told["compared"] = ".".join(stage.compared)
-        pins = pinned(stage.sheets[0])
-        if pins:
-            told["pins"] = ".".join(map(str, pins))
-    elif isinstance(stage, EpisodeStage):
-        told["policy"] = stage.policy
-    if stage.seed:
-        told["seed"] = stage.seed
-    return urlencode(told)
-
-
-def pinned(sheet: Sheet) -> list[int]:
-    """The particles that the visitor has pinned."""
-    holder = sheet.simulation.grippers.holder[0]
-    return [int(particle) for particle in np.flatnonzero(holder > 0)]
+        told["pins"] = ".".join(map(str, np.flatnonzero(stage.simulation.grippers.holder[0] > 0)))
+    told |= {"policy": stage.policy, "seed": stage.seed}
+    return urlencode({name: value for name, value in told.items() if value not in ("", None) and (name, value) != ("seed", 0)})

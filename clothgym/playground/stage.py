@@ -1,46 +1,78 @@
-"""One visitor's cloth: a scene whose settings change while it runs, with one sheet, or one for each of several integrators."""
+"""One visitor's cloth: a scene whose settings change while it runs."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym import integrators
 from clothgym.checks import indices, vector
-from clothgym.guards import refusal
-from clothgym.material import PRESETS
+from clothgym.collisions.solids.shapes import R_FRICTION
+from clothgym.guards import BURST
 from clothgym.playground import hands
-from clothgym.playground.recording import Frame, Recording, stiffness
-from clothgym.playground.scenes import scene_named
-from clothgym.playground.sheets import (
-    Attachment,
-    Sheet,
-    Stability,
-    carried_over,
-    changed_properties,
-    own,
-    set_in_place,
-    simulated,
-    stability,
-    visible,
-    within_view,
-)
-from clothgym.playground.world import FRAME, Scene, Settings, Targets, begin, drive
+from clothgym.playground.recording import Frame, Recording
+from clothgym.playground.scenes import FRAME, TITLES, Settings, begin, drive, scene_named
+from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
 GUSTS = 3600  # control steps after which the gusts repeat
-LOOK_EVERY = 6  # frames between two measurements of penetration, which cost as much as a control step
 KEPT = 1800  # most recent frames that are kept
-MOST_COMPARED = 4
+EDGE_OF_VIEW = 9.0  # of each coordinate [m]
+SHREDS = 0.12  # largest displacement at which a sheet that has blown up is drawn [m]: its real position is out of sight
+EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
 REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
-# settings that change the compiled loop or a method's plan: they need a new simulation of the same sheet
-REBUILDS = ("integrator", "bending", "strain_limit", "self_collision")
-UNTOUCHED = "Nothing can be {} here: choose a scene."
+# parts of a state that go on in a new simulation of the same sheet
+CARRIED = (
+    "holder", "attachment_positions", "attachment_targets", "openings", "wanted_openings", "colliders", "collider_homes", "steps",
+    "diverged",
+)  # fmt: skip
+
+
+class Stability(NamedTuple):
+    """The present substep [s], the largest that the integrator should be used with (0 if there is none), why, and whether a sheet
+    beyond the bound blows up, or is only inaccurate as it moves."""
+
+    substep: float
+    bound: float
+    why: str
+    explicit: bool
+
+    @property
+    def verdict(self) -> str:
+        """Where the substep is relative to the bound."""
+        within = self.bound > 0 and self.substep <= self.bound
+        if self.explicit:
+            return "stable" if within else "unstable"
+        return "accurate" if within else "stable, coarse"
+
+
+def why_it_burst(name: str, at: Stability) -> str:
+    """A sentence on a sheet that has blown up."""
+    if at.bound <= 0:
+        return f"**{name}** burst: it has no bound here, {at.why}. {REMEDY}"
+    step, bound = f"{1e3 * at.substep:.3g} ms", f"{1e3 * at.bound:.3g} ms"
+    if at.substep > at.bound:
+        return f"**{name}** burst: its substep of {step} is beyond its bound of {bound}: {at.why}. {REMEDY}"
+    return f"**{name}** burst, though its substep of {step} is within the bound of {bound} for a sheet at rest. {REMEDY}"
+
+
+def measured(simulation: Simulation, cost: float) -> dict[str, NDArray]:
+    """The readings of a sheet: largest strain of its yarns, energy [J], and a control step's cost [s], (1,) each."""
+    return {"strain": simulation.strain().max(axis=1), "energy": simulation.energy().total, "cost": np.array([cost])}
+
+
+def visible(x: NDArray) -> NDArray[np.float32]:
+    """Positions that can be drawn [m]: values that are not finite or far away are clipped to the edge of the view."""
+    return within_view(np.nan_to_num(x, nan=0.0)).astype(np.float32)
+
+
+def within_view(x: NDArray) -> NDArray:
+    """Positions [m] clipped to the edge of the view."""
+    return np.clip(x, -EDGE_OF_VIEW, EDGE_OF_VIEW)
 
 
 class Stage:
@@ -50,28 +82,27 @@ class Stage:
         name: as it was asked for; about: a sentence.
         recording: its frames, the last of which is the current one.
         notes: sentences for the visitor, by subject.
+        policies: who can act, by name, and policy, who does.
+        drops: whether a visitor can let the sheet fall, see ``drop``.
+        budget: of computing, for one frame [s].
     """
 
     name: str
     about: str
-    settings: Settings
     recording: Recording
     seed: int
+    policies: Any = ()
+    policy: str = ""
+    drops: bool = False
 
     def __init__(self) -> None:
         self.notes: dict[str, str] = {}
-        self.left: Callable[[], bool] = lambda: False  # whether the visitor has left, who need not be waited for
-        self.budget = np.inf  # of computing, for one frame [s]
+        self.budget = np.inf
 
     @property
     def frame(self) -> Frame:
         """The current frame."""
         return self.recording.frames[-1]
-
-    @property
-    def saying(self) -> str:
-        """What stands over the sheets: why one has burst, or how an episode ended."""
-        return self.notes.get("burst", "") or self.notes.get("evaluation", "")
 
     @property
     def over(self) -> bool:
@@ -86,35 +117,8 @@ class Stage:
         """Start again, with that seed or the same."""
         raise NotImplementedError
 
-    def change(self, **changes: Any) -> None:
-        """Change settings.
-
-        Raises:
-            ValueError: an unknown name or an invalid value; nothing is changed.
-        """
-        raise NotImplementedError
-
-    def attachments(self) -> list[Attachment]:
-        """The anchors and grippers."""
-        return []
-
-    def drag(self, attachment: int, place: ArrayLike | None) -> None:
-        """Move an attachment to a position [m], (3,), or stop moving it with None."""
-        raise NotImplementedError
-
-    def hold(self, attachment: int, holds: bool) -> None:
-        """Close or open an attachment."""
-        raise NotImplementedError
-
-    def stabilities(self) -> list[Stability]:
-        """The stability of each sheet; empty if nothing is simulated."""
-        return []
-
-    # --- the visitor's hand -----------------------------------------------------------------------------------------------
-
     def grab(self, place: ArrayLike) -> None:
         """Take hold of the sheet where it is nearest to a position [m], (3,)."""
-        raise ValueError(UNTOUCHED.format("held"))
 
     def pull(self, place: ArrayLike) -> None:
         """Move what is held to a position [m], (3,)."""
@@ -124,14 +128,15 @@ class Stage:
 
     def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Pin the sheet where a ray from ``origin`` [m] meets it, or take away the pin that is there."""
-        raise ValueError(UNTOUCHED.format("pinned"))
 
     def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Blow on the sheet along a ray from ``origin`` [m]."""
-        raise ValueError(UNTOUCHED.format("blown"))
 
-    def pinned(self) -> NDArray[np.float32]:
-        """Where the visitor holds and has pinned the sheets [m], (points, 3)."""
+    def drop(self) -> None:
+        """Open the grippers of a task."""
+
+    def held(self) -> NDArray[np.float32]:
+        """Where the sheets are held [m], (points, 3)."""
         return np.zeros((0, 3), np.float32)
 
     def _keep(self, frame: Frame) -> Frame:
@@ -144,28 +149,28 @@ class SceneStage(Stage):
     """A scene of the gallery.
 
     Args:
-        scene: its name, or a ``Scene``.
+        name: of the scene.
         settings: instead of the scene's own.
-        compared: two to four integrators, or fabrics, a sheet each; none for one sheet with the settings' own.
 
     Raises:
-        ValueError: no such scene, integrator or fabric, or a number of them that cannot be compared.
+        ValueError: no such scene, or an invalid setting.
     """
 
-    def __init__(self, scene: str | Scene, settings: Settings | None = None, compared: Sequence[str] = (), seed: int = 0) -> None:
+    hand: hands.Hand
+    _gusts: NDArray[np.float64]
+
+    def __init__(self, name: str, settings: Settings | None = None, seed: int = 0) -> None:
         super().__init__()
-        self.scene = scene_named(scene) if isinstance(scene, str) else scene
-        self.name, self.about = self.scene.name, self.scene.about
-        self.settings = self.scene.settings if settings is None else settings
-        self.seed = seed
-        self.steps = 0
-        self._dragged: dict[int, NDArray] = {}
-        self._held_anchor: int | None = None  # of the scene, that the visitor holds by the sheet
-        self._breath: tuple[float, NDArray, NDArray] | None = None  # until when, through where and along which way
-        self._gusts = np.zeros((1, 3))
-        self._bounds: list[Stability] | None = None
-        self.sheets: list[Sheet] = []
-        self.compare(compared)
+        self.scene = scene = scene_named(name)
+        self.name, self.about, self.seed = name, scene.about, seed
+        self.settings = scene.settings if settings is None else settings
+        self.simulation = self._simulated(self.settings)
+        self.recording = Recording(TITLES[name], scene.mesh, STEPS * FRAME, scene.camera, ("sheet",), scene.strained)
+        self.reset()
+
+    def _simulated(self, settings: Settings) -> Simulation:
+        """A simulation of the scene that a visitor can take hold of."""
+        return self.scene.simulation(settings, grippers=hands.grippers(self.scene.mesh, FRAME))
 
     @property
     def time(self) -> float:
@@ -175,248 +180,149 @@ class SceneStage(Stage):
     # --- going on -------------------------------------------------------------------------------------------------------
 
     def advance(self) -> Frame:
-        begun = time.perf_counter()
+        begun, s = time.perf_counter(), self.simulation
         for _ in range(STEPS):
             # a frame that takes too long is cut short: then the cloth moves slowly, but the page answers
-            if self.left() or time.perf_counter() - begun > self.budget:
+            if "burst" in self.notes or time.perf_counter() - begun > self.budget:
                 break
             gust = self.settings.gust * self._gusts[self.steps % len(self._gusts)]
-            wind = self.settings.wind * np.array(self.scene.downwind) + gust
-            for sheet in self.sheets:
-                if not sheet.burst and not self.left():
-                    drive(sheet.simulation, self.scene, self.time, self._targets())
-                    sheet.hand.follow()
-                    sheet.simulation.set_wind(wind)
-                    if self._breath is not None and self.time < self._breath[0]:
-                        hands.blow(sheet.simulation, *self._breath[1:], FRAME)
-                    sheet.step(1)
+            drive(s, self.scene, self.time, self._dragged)
+            self.hand.follow()
+            s.set_wind(self.settings.wind * np.array(self.scene.downwind) + gust)
+            if self._breath is not None and self.time < self._breath[0]:
+                hands.blow(s, *self._breath[1:], FRAME)
+            before = time.perf_counter()
+            s.step()
+            self.cost = time.perf_counter() - before
             self.steps += 1
-        bursts = [sheet.burst for sheet in self.sheets if sheet.burst]
-        if bursts:
-            self.notes["burst"] = " ".join([*bursts, REMEDY])
+            with np.errstate(all="ignore"):
+                strain = s.strain().max()
+            if s.diverged[0] or not strain <= BURST:
+                self.notes["burst"] = why_it_burst(s.integrator.name, self.stability())
+                return self._keep(self._shreds())
         return self._keep(self._look())
 
     def reset(self, seed: int | None = None) -> None:
         self.seed = self.seed if seed is None else int(seed)
-        self.steps = 0
-        self._dragged.clear()
-        self._held_anchor = self._breath = None
-        self.notes.pop("burst", None)
+        self.steps, self.cost = 0, 0.0
+        self._dragged: dict[int, NDArray] = {}  # where the visitor has drawn the scene's anchors [m]
+        self._held_anchor: int | None = None  # that the visitor holds by the sheet
+        self._breath: tuple[float, NDArray, NDArray] | None = None  # until when, through where and along which way
         self._gusts = Wind(gust=1.0).series(np.random.default_rng(self.seed), GUSTS, FRAME)
-        for sheet in self.sheets:
-            sheet.burst, sheet.cost, sheet.penetration, sheet.shredded = "", 0.0, 0.0, False
-            begin(sheet.simulation, self.scene, self.seed or None)
+        self.notes.pop("burst", None)
+        begin(self.simulation, self.scene, self.seed or None)
+        self.hand = hands.Hand(self.simulation)
         self.recording.frames[:] = [self._look()]
 
-    def compare(self, names: Sequence[str], unlimited: bool = False) -> None:
-        """Start again with a sheet for each of these integrators, or of these fabrics, two to four.  Without names, with one sheet
-        for the integrator of the settings, and with ``unlimited`` beside it the same without the strain limit.
-
-        Raises:
-            ValueError: another number, integrators beside fabrics, or names with ``unlimited``.
-        """
-        names = [name if name in PRESETS else integrators.get(name).name for name in dict.fromkeys(names)]
-        if len(names) == 1 or len(names) > MOST_COMPARED:
-            raise ValueError(f"compared={names!r}: choose two to {MOST_COMPARED} integrators or fabrics")
-        if len({name in PRESETS for name in names}) > 1:
-            raise ValueError(f"compared={names!r}: compare integrators or fabrics, not both")
-        if names and unlimited:
-            raise ValueError(f"compared={names!r}, unlimited=True: compare integrators, or one with and without its strain limit")
-        methods = [(name, True) for name in names] or [(self.settings.integrator, True)]
-        if unlimited:
-            methods.append((self.settings.integrator, False))
-        settings = self.settings
-        self.sheets = [Sheet(name, simulated(self.scene, own(settings, name, limited)), limited) for name, limited in methods]
-        self.compared, self.unlimited = tuple(names), unlimited
-        apart = 1.25 * self.scene.mesh.size[0]
-        self.offsets = np.array([((k - (len(methods) - 1) / 2) * apart, 0.0, 0.0) for k in range(len(methods))])
-        labels = tuple(sheet.label for sheet in self.sheets)
-        self.recording = Recording(self.scene.title, self.scene.mesh, STEPS * FRAME, self.scene.camera, labels, self.scene.strained)
-        self._bounds = None
-        self.reset()
-
     def _look(self) -> Frame:
-        due = not self.recording.frames or self.steps % (STEPS * LOOK_EVERY) == 0
-        for sheet in self.sheets:
-            sheet.look(due)
-        readings = [sheet.readings for sheet in self.sheets]
-        return Frame(
-            time=self.time,
-            positions=np.stack([sheet.positions for sheet in self.sheets]) + self.offsets[:, None].astype("f"),
-            stiffness=np.stack([stiffness(sheet.simulation) for sheet in self.sheets]),
-            touching=np.stack([sheet.touching for sheet in self.sheets]),
-            solids=tuple(
-                solid.at(np.add(solid.collider.center, offset))
-                for sheet, offset in zip(self.sheets, self.offsets)
-                for solid in self.scene.solids(sheet.simulation)
-            ),
-            # a sheet without a limit has no strain before limiting
-            readings={name: np.array([one.get(name, np.nan) for one in readings]) for name in readings[0]},
-        )
+        s = self.simulation
+        if "burst" in self.notes:
+            return self.frame
+        return Frame(self.time, visible(s.positions), tuple(self.scene.solids(s)), measured(s, self.cost))
+
+    def _shreds(self) -> Frame:
+        """The sheet that has just blown up: in shreds, and without readings."""
+        before = self.frame
+        away = np.nan_to_num(self.simulation.positions - before.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
+        x = before.positions + np.clip(away, -SHREDS, SHREDS).astype(np.float32)
+        return Frame(self.time, x, before.solids, {name: np.array([np.nan]) for name in before.readings})
 
     # --- settings -------------------------------------------------------------------------------------------------------
 
     def change(self, **changes: Any) -> None:
+        """Change settings: all but the wind in a new simulation, which goes on with the positions and velocities of the old one.
+
+        Raises:
+            ValueError: an unknown name or an invalid value; nothing is changed.
+        """
         after = self.settings.changed(**changes)
-        before, self.notes = self.settings, {k: v for k, v in self.notes.items() if k == "burst"}
-        rebuilt = {name for name in REBUILDS if getattr(after, name) != getattr(before, name)}
-        if after.self_collision != "off" and after.friction != before.friction:
-            rebuilt.add("friction")
-        made = []
-        for sheet in self.sheets:
-            name = sheet.name if self.compared else after.integrator
-            old, new = (own(settings, name, sheet.limited) for settings in (before, after))
-            method = integrators.get(new.integrator)
-            properties = changed_properties(old, new)
-            ignored = properties & method.ignored
-            if ignored:
-                self.notes["ignored"] = refusal(method, sorted(ignored)[0]).capitalize() + "."
-            if rebuilt or ignored:
-                made.append((name, carried_over(sheet.simulation, self.scene, new)))
-            else:
-                unbounded = set_in_place(sheet.simulation, old, new)
-                if unbounded:
-                    self.notes["substeps"] = unbounded
-                made.append((name, sheet.simulation))
-        # recorded positions and readings stay: a sheet that has blown up is not measured again before a reset
-        for sheet, (name, simulation) in zip(self.sheets, made):
-            sheet.name = name
-            if simulation is not sheet.simulation:
-                sheet.use(simulation)
-        self.settings, self._bounds = after, None
-        self.recording.labels = tuple(sheet.label for sheet in self.sheets)
+        if replace(after, wind=0.0, gust=0.0) != replace(self.settings, wind=0.0, gust=0.0):
+            self._carry_over(after)
+        self.settings = after
 
-    def stabilities(self) -> list[Stability]:
-        if self._bounds is None:
-            self._bounds = [stability(sheet.simulation) for sheet in self.sheets]
-        return self._bounds
+    def _carry_over(self, after: Settings) -> None:
+        old, new = self.simulation.get_state(), self._simulated(after)
+        if np.isfinite(old.positions).all() and np.isfinite(old.velocities).all():
+            new.reset(positions=old.positions, velocities=old.velocities)
+            state = new.get_state()
+            for name in CARRIED:
+                setattr(state, name, getattr(old, name))
+            state.colliders[:, :, R_FRICTION] = state.collider_homes[:, :, R_FRICTION] = after.friction
+            new.set_state(state)
+        goals = self.hand.goals
+        self.simulation, self.hand = new, hands.Hand(new)
+        self.hand.goals = goals
 
-    # --- attachments ----------------------------------------------------------------------------------------------------
-
-    def attachments(self) -> list[Attachment]:
-        s = self.sheets[0].simulation
-        held, places = s.attached[0], s.attachment_positions[0, : len(s.anchors)]
-        # an open anchor is shown at its particle
-        for attachment in np.flatnonzero(~held):
-            places[attachment] = s.positions[0, s.anchors[attachment]]
-        return [
-            Attachment(name, visible(place) + self.offsets[0], bool(holds), attachment in self.scene.handles)
-            for attachment, (name, place, holds) in enumerate(zip(self.scene.names, places, held))
-        ]
-
-    def drag(self, attachment: int, place: ArrayLike | None) -> None:
-        self._checked(attachment)
-        if place is None:
-            self._dragged.pop(attachment, None)
-            return
-        self._dragged[attachment] = within_view(vector("place", place)) - self.offsets[0]
-        self.hold(attachment, True)
-
-    def hold(self, attachment: int, holds: bool) -> None:
-        self._checked(attachment)
-        for sheet in self.sheets:
-            if holds and not sheet.simulation.attached[0, attachment]:
-                sheet.simulation.attach([0], [attachment])
-            elif not holds:
-                sheet.simulation.release([0], [attachment])
-        if not holds:
-            self._dragged.pop(attachment, None)
+    def stability(self) -> Stability:
+        """How the present substep compares with the integrator's bound."""
+        s = self.simulation
+        return Stability(s.time_step / s.substeps, *s.largest_substep(), s.integrator.name in EXPLICIT)
 
     # --- the visitor's hand -----------------------------------------------------------------------------------------------
 
     def grab(self, place: ArrayLike) -> None:
-        where = within_view(vector("place", place))
-        number = int(np.argmin([((sheet.positions + offset - where) ** 2).sum(axis=1).min() for sheet, offset in self._placed()]))
-        particle = hands.nearest(self.sheets[number].positions, where - self.offsets[number])
-        anchor = self._anchor_of(particle)
-        if anchor is not None:
-            self._held_anchor = anchor
-            return
-        if not self.sheets[number].burst:
-            for sheet in self.sheets:
-                sheet.hand.take(hands.HAND, particle)
-            # sheets beside the one that is held are held alike
-            self._apart = self.offsets[number]
+        particle = hands.nearest(self.frame.positions[0], within_view(vector("place", place)))
+        self._held_anchor = self._anchor_of(particle)
+        if self._held_anchor is None and "burst" not in self.notes:
+            self.hand.take(hands.HAND, particle)
 
     def pull(self, place: ArrayLike) -> None:
         where = within_view(vector("place", place))
         where[2] = max(where[2], 0.0)
         if self._held_anchor is not None:
-            self._dragged[self._held_anchor] = where - self.offsets[0]
-            return
-        for sheet in self.sheets:
-            if sheet.hand.held[hands.HAND]:
-                sheet.hand.goals[hands.HAND] = where - self._apart
+            self._dragged[self._held_anchor] = where
+        elif self.hand.held[hands.HAND]:
+            self.hand.goals[hands.HAND] = where
 
     def let_go(self) -> None:
         self._held_anchor = None
-        for sheet in self.sheets:
-            sheet.hand.let_go(hands.HAND)
+        self.hand.let_go(hands.HAND)
 
     def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        seen = self._seen(origin, direction)
-        if seen is None:
+        where = self._seen(origin, direction)
+        if where is None:
             return
-        number, where = seen
-        sheet = self.sheets[number]
-        particle = hands.nearest(sheet.positions, where)
+        particle = hands.nearest(self.frame.positions[0], where)
         anchor = self._anchor_of(particle)
+        away = np.linalg.norm(self.hand.goals - where, axis=1)
+        near = np.flatnonzero(self.hand.held & (away < hands.CLICK))
+        near = near[near != hands.HAND]
         if anchor is not None:
-            return self.hold(anchor, False)
-        near = [
-            pin for pin in np.flatnonzero(sheet.hand.held)
-            if pin != hands.HAND and np.linalg.norm(sheet.hand.goals[pin] - where) < hands.CLICK
-        ]  # fmt: skip
-        for one in self.sheets if near else ():
-            one.hand.let_go(int(near[0]))
-        if not near:
+            self._dragged.pop(anchor, None)
+            self.simulation.release([0], [anchor])
+        elif len(near):
+            self.hand.let_go(int(near[0]))
+        else:
             self.pin_particle(particle)
 
     def pin_particle(self, particle: int) -> None:
-        """Pin a particle of all sheets where it is, with the scene's own anchor where it has one.
+        """Pin a particle where it is.
 
         Raises:
             ValueError: there is no such particle.
         """
         indices("pins", [particle], self.scene.mesh.num_particles, "the particles of this sheet")
-        own_anchor = next((k for k, first in enumerate(self.sheets[0].simulation.anchors) if first == particle), None)
-        if own_anchor is not None:
-            return self.hold(own_anchor, True)
-        for sheet in self.sheets:
-            free = np.flatnonzero(~sheet.hand.held[1:])
-            sheet.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
+        free = np.flatnonzero(~self.hand.held[1:])
+        self.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
 
     def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        seen = self._seen(origin, direction)
-        if seen is not None:
+        where = self._seen(origin, direction)
+        if where is not None:
             way = vector("direction", direction)
-            self._breath = self.time + hands.BREATH_TIME, seen[1], way / max(float(np.linalg.norm(way)), 1e-9)
+            self._breath = self.time + hands.BREATH_TIME, where, way / max(float(np.linalg.norm(way)), 1e-9)
 
-    def pinned(self) -> NDArray[np.float32]:
-        places = [sheet.hand.goals[sheet.hand.held] + offset for sheet, offset in self._placed()]
-        for place, sheet in zip(places, self.sheets):
-            if sheet.hand.held[hands.HAND]:
-                place[0] = sheet.simulation.grippers.positions[0, hands.HAND] + self.offsets[self.sheets.index(sheet)]
-        return visible(np.concatenate(places))
+    def held(self) -> NDArray[np.float32]:
+        s, goals = self.simulation, self.hand.goals.copy()
+        goals[hands.HAND] = s.grippers.positions[0, hands.HAND]
+        anchors = s.attachment_positions[0, : len(s.anchors)][s.attached[0]]
+        return visible(np.concatenate([anchors, goals[self.hand.held]]))
 
-    def _placed(self) -> list[tuple[Sheet, NDArray]]:
-        return list(zip(self.sheets, self.offsets))
-
-    def _seen(self, origin: ArrayLike, direction: ArrayLike) -> tuple[int, NDArray] | None:
-        """The sheet that a ray meets first, and where in its own place [m]."""
+    def _seen(self, origin: ArrayLike, direction: ArrayLike) -> NDArray | None:
+        """Where a ray first meets the sheet [m], if it does."""
         start, way = within_view(vector("origin", origin)), vector("direction", direction)
-        hits = [hands.hit(sheet.positions, self.scene.mesh.triangles, start - offset, way) for sheet, offset in self._placed()]
-        met = [(found[1], number, found[0]) for number, found in enumerate(hits) if found is not None]
-        return min(met)[1:] if met else None
+        return hands.hit(self.frame.positions[0], self.scene.mesh.triangles, start, way)
 
     def _anchor_of(self, particle: int) -> int | None:
-        """The scene's anchor that holds a particle of the first sheet."""
-        s = self.sheets[0].simulation
-        holder = int(s.get_state().holder[0, particle])
-        return holder if 0 <= holder < len(s.anchors) else None
-
-    def _checked(self, attachment: int) -> None:
-        indices("attachment", [attachment], len(self.scene.anchors), "the attachments of this scene")
-
-    def _targets(self) -> Targets:
-        return self._dragged
+        """The scene's anchor that holds a particle."""
+        holder = int(self.simulation.get_state().holder[0, particle])
+        return holder if 0 <= holder < len(self.simulation.anchors) else None

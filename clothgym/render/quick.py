@@ -112,35 +112,31 @@ def surfaces_of(cloth: NDArray, meshes: list[tuple[NDArray, NDArray] | None]) ->
 
 
 @kernel
-def draw_pictures(
-    first, last, kind, envs, block, lane, x, surfaces, shapes, solids, sight, background, floor, origin, per_side, bound, pictures,
-    numbers,
-):  # fmt: skip
-    """Draw environments ``envs[first:last]`` into ``pictures`` (uint8) or ``numbers`` (float32), both (num_envs, ...), flat.
+def draw_pictures(first, last, kind, envs, places, x, surfaces, things, sight, measure, out):
+    """Draw environments ``envs[first:last]``.
 
     kind: RGB, DEPTH [m], RGBD (colors from 0 to 1, depth [m]), HEIGHTS or POINTS (in sides).
-    block, lane: of each of ``envs``; x: [m], (block, 3, particles, lane).  surfaces: the fields of ``Surfaces``.
-    shapes: of each solid, see ``quick_solids``, (solids,).  solids: (len(envs), solids, SOLID_ROWS).
-    sight, background, floor: the fields of ``Sight``.  origin: what points are relative to [m], (num_envs, 3).
-    bound: farthest depth [m]; largest height or coordinate, in sides.
+    places: block and lane of each of ``envs``; x: [m], (block, 3, particles, lane).  surfaces, sight: as these are called here.
+    things: the shape of each solid, see ``quick_solids``, (solids,), and its rows, (len(envs), solids, SOLID_ROWS).
+    measure: what points are relative to [m], (num_envs, 3); sides in a meter; and the farthest depth [m], or the largest height or
+    coordinate, in sides.  out: to be written to, uint8 for colors and float32 for numbers, both (num_envs, ...), flat.
     """
-    height, width = background.shape
+    (block, lane), (origin, per_side, bound), (pictures, numbers) = places, measure, out
+    height, width = sight.near.shape
     colored = kind in (RGB, RGBD)
     # one picture's memory, used for one after the other
     count = max(x.shape[2], surfaces[1].shape[0])
     world, screen = np.empty((count, 3)), np.empty((count, 3))
     near, what = np.empty((height, width), np.float32), np.empty((height, width), np.uint8)
     color = np.empty((height, width, 3), np.uint8)
+    picture = near, what, color
     for i in range(first, last):
         e = envs[i]
-        draw_one(
-            colored, block[i], lane[i], x, surfaces[0], surfaces[1], surfaces[2], surfaces[3], surfaces[4],
-            shapes, solids, i, sight, background, floor, world, screen, near, what, color,
-        )  # fmt: skip
+        draw_one(colored, i, block[i], lane[i], x, surfaces, things, sight, world, screen, picture)
         if kind == RGB:
             write_colors(color, e, pictures)
         elif kind == POINTS:
-            write_points(near, what, sight, origin, per_side, bound, e, numbers)
+            write_points(near, what, sight.numbers, origin, per_side, bound, e, numbers)
         elif kind == HEIGHTS:
             write_heights(near, per_side, bound, e, numbers)
         elif kind == DEPTH:
@@ -151,11 +147,10 @@ def draw_pictures(
 
 
 @uncounted
-def draw_one(
-    colored, b, l, x, cloth, vertices, triangles, first_vertex, first_triangle, shapes, solids, i, sight, background, floor, world,
-    screen, near, what, color,
-):  # fmt: skip
+def draw_one(colored, i, b, l, x, surfaces, things, view, world, screen, picture):
     """One picture: the nearest surface at each pixel, ``near``; ``what`` it is; and its ``color``, if ``colored``."""
+    cloth, vertices, triangles, first_vertex, first_triangle = surfaces
+    (shapes, solids), (sight, background, floor), (near, what, color) = things, view, picture
     height, width = near.shape
     for r in range(height):
         for c in range(width):
@@ -185,21 +180,15 @@ def draw_one(
                     for a in range(3):
                         world[v - begin, c] += vertices[v, a] * solids[i, s, AXES + 3 * a + c]
             project(world, end - begin, sight, screen)
-            red, green, blue = solids[i, s, COLOR], solids[i, s, COLOR + 1], solids[i, s, COLOR + 2]
-            draw_triangles(
-                colored, SOLID, red, green, blue, red, green, blue, triangles, first_triangle[s], first_triangle[s + 1], world,
-                screen, sight, near, what, color,
-            )  # fmt: skip
+            own = solids[i, s, COLOR], solids[i, s, COLOR + 1], solids[i, s, COLOR + 2]
+            draw_triangles(colored, SOLID, own, own, triangles, first_triangle[s], first_triangle[s + 1], world, screen, picture)
     # the cloth
     particles = x.shape[2]
     for p in range(particles):
         for c in range(3):
             world[p, c] = x[b, c, p, l]
     project(world, particles, sight, screen)
-    draw_triangles(
-        colored, CLOTH, CORAL[0], CORAL[1], CORAL[2], INDIGO[0], INDIGO[1], INDIGO[2], cloth, 0, cloth.shape[0], world, screen,
-        sight, near, what, color,
-    )  # fmt: skip
+    draw_triangles(colored, CLOTH, CORAL, INDIGO, cloth, 0, cloth.shape[0], world, screen, picture)
 
 
 @uncounted
@@ -222,14 +211,13 @@ def project(world, count, sight, screen):
 
 
 @uncounted
-def draw_triangles(
-    colored, mark, front_r, front_g, front_b, back_r, back_g, back_b, triangles, begin, end, world, screen, sight, near, what, color
-):
+def draw_triangles(colored, mark, front_color, back_color, triangles, begin, end, world, screen, picture):
     """Draw ``triangles[begin:end]`` from both sides, each in the color of the side that is seen.
 
     The edge function of the edge from i to j at the sample s is (y_i - y_j) s_x + (x_j - x_i) s_y + x_i y_j - x_j y_i: taken from j
     to i it is the same number with the other sign, to the bit, so that no sample falls between two triangles.
     """
+    near, what, color = picture
     height, width = near.shape
     for t in range(begin, end):
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
@@ -261,9 +249,9 @@ def draw_triangles(
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             sign = 1.0 if front else -1.0
             shade = lambert(sign * nx, sign * ny, sign * nz)
-            red = shade * (front_r if front else back_r)
-            green = shade * (front_g if front else back_g)
-            blue = shade * (front_b if front else back_b)
+            red = shade * (front_color[0] if front else back_color[0])
+            green = shade * (front_color[1] if front else back_color[1])
+            blue = shade * (front_color[2] if front else back_color[2])
         low, high = int(max(left, 0.0)), int(min(right, width - 1.0))
         for r in range(int(max(top, 0.0)), int(min(bottom, height - 1.0)) + 1):
             sy = r + 0.5
