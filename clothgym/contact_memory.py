@@ -5,15 +5,13 @@ What each array means is said where it is used: ``collisions.self.step.Memory`` 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import LARGEST, fits
-
-if TYPE_CHECKING:
-    from clothgym.state import Layout
+from clothgym.layout import Layout
 
 MOST_CONTACTS = 12  # contacts for each vertex; more are counted as dropped
 MOST_CONSTRAINTS = 24  # gap constraints for each vertex; more bound their vertices instead

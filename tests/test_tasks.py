@@ -17,9 +17,9 @@ import clothgym.envs
 from clothgym import Gripper, Material, Plane, grid
 from clothgym.cli import main
 from clothgym.envs import ClothEnv, ClothVectorEnv, GripperTask, Physics, Task
+from clothgym.layout import Layout
 from clothgym.playground.gallery import Gallery
 from clothgym.registration import ENVIRONMENTS, checked_id
-from clothgym.state import Layout
 
 TOWEL = "hang_towel:HangTowel-v0"
 SILK = {"density": 0.083, "stretch_stiffness": 102.6, "shear_stiffness": 51.3, "bend_rigidity": 2.77e-7}

@@ -28,8 +28,9 @@ from clothgym.contact_memory import (
     REPORT_UNCERTAIN,
 )
 from clothgym.geometry.intersections import first_intersection
+from clothgym.layout import Layout
 from clothgym.mesh import ClothMesh
-from clothgym.state import Layout, State
+from clothgym.state import State
 from clothgym.warning import warn_caller
 
 MODES = ("fast", "strict")

@@ -23,7 +23,8 @@ from clothgym.collisions.solids.shapes import (
 )
 from clothgym.collisions.solids.signed_distance import Shapes
 from clothgym.elements import SurfaceArrays
-from clothgym.state import Layout, State
+from clothgym.layout import Layout
+from clothgym.state import State
 
 
 class Solids:

@@ -23,7 +23,7 @@ from clothgym.collisions.solids.signed_distance import (
     measure_in_world,
     to_axes,
 )
-from clothgym.state import Layout
+from clothgym.layout import Layout
 
 FINENESS = 4  # parts of a triangle's sides: 15 points with weights in quarters
 
