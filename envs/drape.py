@@ -14,7 +14,6 @@ from clothgym.envs.draping import DrapingTask
 from clothgym.envs.experts import as_actions
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
@@ -89,9 +88,6 @@ class ClothDrapeEnv(ClothEnv):
     ## Action Space
     $actions corner
 
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -117,26 +113,9 @@ class ClothDrapeEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
     millimeter; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
     ## Vectorized environment
     ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded
     ``s + i``, bit for bit.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = DrapeTask
-
-
-class ClothDrapeVectorEnv(ClothVectorEnv):
-    """``ClothDrape-v0`` as a batch, see ``ClothDrapeEnv``."""
 
     task_class = DrapeTask

@@ -23,7 +23,6 @@ from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import ON_FLOOR
-from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
@@ -192,12 +191,6 @@ class ClothDrapeGripperEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -211,23 +204,6 @@ class ClothDrapeGripperEnv(ClothEnv):
     The sheet lies before the target, 0.05 to 0.15 L away from it, turned by up to 0.2 rad and up to 0.1 L to the side; in half
     of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L beside
     and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = DrapeGripperTask
-
-
-class ClothDrapeGripperVectorEnv(ClothVectorEnv):
-    """``ClothDrapeGripper-v0`` as a batch, see ``ClothDrapeGripperEnv``."""
 
     task_class = DrapeGripperTask

@@ -28,7 +28,6 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import EDGES, NEXT, OPPOSITE, observe_next
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 if TYPE_CHECKING:
@@ -164,9 +163,6 @@ class ClothFlattenEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
     ## Observation Space
     $observations
 
@@ -197,24 +193,7 @@ class ClothFlattenEnv(ClothEnv):
     random particle and dropped, twice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along
     x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are
     open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlattenTask
-
-
-class ClothFlattenVectorEnv(ClothVectorEnv):
-    """``ClothFlatten-v0`` as a batch, see ``ClothFlattenEnv``."""
 
     task_class = FlattenTask
 
@@ -229,9 +208,6 @@ class ClothFlattenHardEnv(ClothEnv):
     $physics
 
     The tropical wool has half the rigidity of the median fabric of ``ClothFlatten-v0``.
-
-    ## Action Space
-    $actions
 
     ## Observation Space
     $observations
@@ -249,23 +225,6 @@ class ClothFlattenHardEnv(ClothEnv):
     particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
     y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are open, 0.3
     to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlattenHardTask
-
-
-class ClothFlattenHardVectorEnv(ClothVectorEnv):
-    """``ClothFlatten-Hard-v0`` as a batch, see ``ClothFlattenHardEnv``."""
 
     task_class = FlattenHardTask

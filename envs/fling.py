@@ -31,7 +31,6 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import NEXT, observe_next
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 if TYPE_CHECKING:
@@ -330,16 +329,7 @@ class ClothFlingEnv(ClothEnv):
     $arguments
 
     ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlingTask
-
-
-class ClothFlingVectorEnv(ClothVectorEnv):
-    """``ClothFling-v0`` as a batch, see ``ClothFlingEnv``."""
 
     task_class = FlingTask
 
@@ -385,15 +375,6 @@ class ClothFlingHardEnv(ClothEnv):
     $arguments
 
     ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlingHardTask
-
-
-class ClothFlingHardVectorEnv(ClothVectorEnv):
-    """``ClothFling-Hard-v0`` as a batch, see ``ClothFlingHardEnv``."""
 
     task_class = FlingHardTask

@@ -21,7 +21,6 @@ from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import ON_FLOOR
-from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
@@ -355,12 +354,6 @@ class ClothFoldEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -385,23 +378,6 @@ class ClothFoldEnv(ClothEnv):
     ## Starting State
     The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
     up to 0.1 L beside and 0.2 to 0.35 L above their corners.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldTask
-
-
-class ClothFoldVectorEnv(ClothVectorEnv):
-    """``ClothFold-v0`` as a batch, see ``ClothFoldEnv``."""
 
     task_class = FoldTask

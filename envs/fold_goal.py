@@ -22,7 +22,6 @@ from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.task import REWARD_MODES
-from clothgym.envs.vector import ClothVectorEnv
 
 # largest distance of a corner from its goal, in sides; rms speed [m/s]
 ENOUGH_NEAR, ENOUGH_REST = 0.075, 0.02
@@ -252,9 +251,6 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
     these.
@@ -286,24 +282,7 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges
     is to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
     corners.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldGoalTask
-
-
-class ClothFoldGoalVectorEnv(GoalReward, ClothVectorEnv):
-    """``ClothFoldGoal-v0`` as a batch, see ``ClothFoldGoalEnv``."""
 
     task_class = FoldGoalTask
 
@@ -319,9 +298,6 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
     these.
@@ -333,23 +309,6 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
 
     ## Evaluation
     As in ``ClothFoldGoal-v0``, with the same ``info``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldGoalHardTask
-
-
-class ClothFoldGoalHardVectorEnv(GoalReward, ClothVectorEnv):
-    """``ClothFoldGoal-Hard-v0`` as a batch, see ``ClothFoldGoalHardEnv``."""
 
     task_class = FoldGoalHardTask

@@ -12,7 +12,6 @@ from clothgym.envs.fold import FoldTask
 from clothgym.envs.manipulation import PHYSICS
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.single import ClothEnv
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 # a larger sheet of silk, with the short cuts of the others but for their fabric
@@ -46,12 +45,6 @@ class ClothFoldHardEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     As in ``ClothFold-v0``.
 
@@ -61,23 +54,6 @@ class ClothFoldHardEnv(ClothEnv):
     ## Starting State
     The sheet's center is up to 0.25 L from the origin along x and y, and it is turned by any angle.  The grippers are open, up to
     0.1 L beside and 0.2 to 0.35 L above the corners of one edge.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldHardTask
-
-
-class ClothFoldHardVectorEnv(ClothVectorEnv):
-    """``ClothFold-Hard-v0`` as a batch, see ``ClothFoldHardEnv``."""
 
     task_class = FoldHardTask

@@ -22,7 +22,6 @@ from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.rumpled import rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.mesh import grid
 
 GUIDING = 0.5  # share of the potential that is for bringing the sheet to the rail
@@ -180,9 +179,6 @@ class ClothHangEnv(ClothEnv):
     ## Action Space
     $actions corner
 
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -208,24 +204,7 @@ class ClothHangEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
     the rail, with a ripple of a millimeter.  The rail's middle is within 0.15 L of the origin in x and y; it is turned by up to
     45 degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HangTask
-
-
-class ClothHangVectorEnv(ClothVectorEnv):
-    """``ClothHang-v0`` as a batch, see ``ClothHangEnv``."""
 
     task_class = HangTask
 
@@ -242,12 +221,6 @@ class ClothHangHardEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -261,23 +234,6 @@ class ClothHangHardEnv(ClothEnv):
     The sheet lies before the rail, all of it 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the side; in
     half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L
     beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HangHardTask
-
-
-class ClothHangHardVectorEnv(ClothVectorEnv):
-    """``ClothHang-Hard-v0`` as a batch, see ``ClothHangHardEnv``."""
 
     task_class = HangHardTask

@@ -39,7 +39,6 @@ from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.rumpled import rumpled_sheets
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
 
 GUIDING = 0.5  # share of the potential that is for bringing the hole to the hook
 PICKING = 0.2  # share of it that is for taking hold
@@ -209,9 +208,6 @@ class ClothHookEnv(ClothEnv):
     ## Action Space
     $actions corner
 
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -234,24 +230,7 @@ class ClothHookEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
     the hook, with a ripple of a millimeter.  The post is within 0.15 L of the origin in x and y; the hook is turned by up to 45
     degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HookTask
-
-
-class ClothHookVectorEnv(ClothVectorEnv):
-    """``ClothHook-v0`` as a batch, see ``ClothHookEnv``."""
 
     task_class = HookTask
 
@@ -268,12 +247,6 @@ class ClothHookHardEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -287,23 +260,6 @@ class ClothHookHardEnv(ClothEnv):
     The sheet lies before the hook, all of it 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad against it and up to 0.1 L to
     the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut out.  The
     grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above their corners.  The hook is drawn as in ``ClothHook-v0``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HookHardTask
-
-
-class ClothHookHardVectorEnv(ClothVectorEnv):
-    """``ClothHook-Hard-v0`` as a batch, see ``ClothHookHardEnv``."""
 
     task_class = HookHardTask

@@ -19,7 +19,6 @@ from clothgym.envs.physics import MEDIAN, Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 
@@ -217,9 +216,6 @@ class ClothReachEnv(ClothEnv):
     ## Action Space
     $actions the driven corner
 
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -237,23 +233,6 @@ class ClothReachEnv(ClothEnv):
     The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
     x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a
     millimeter.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = ReachTask
-
-
-class ClothReachVectorEnv(ClothVectorEnv):
-    """``ClothReach-v0`` as a batch, see ``ClothReachEnv``."""
 
     task_class = ReachTask

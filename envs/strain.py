@@ -354,9 +354,6 @@ class ClothStrainEnv(ClothEnv):
     $actions the left and then of the right clip
     Clips do not turn.  The post stops them.
 
-    ## Observation Space
-    $observations
-
     ## Rewards and costs
     $rewards
 
@@ -394,17 +391,6 @@ class ClothStrainEnv(ClothEnv):
     a side that is drawn, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
     goal at x = 0.7 +- 0.1 m, y within 0.3 m, z = 1.05 +- 0.2 m.  The held edge lies along y, at the last two turned by up to
     0.2 rad.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
 
     task_class = StrainTask
