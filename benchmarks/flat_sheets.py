@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from clothgym.envs.draping import ENOUGH_CENTERING, ENOUGH_COVERAGE, ENOUGH_REST, ENOUGH_SPREAD
+from clothgym.envs.draping import ENOUGH_CENTERING, ENOUGH_COVERAGE, ENOUGH_SPREAD
 from clothgym.envs.draping import PHYSICS as OWN
+from clothgym.envs.scoring import ENOUGH_REST
 from clothgym.envs.targets import SHAPES, THICKNESS
 
 TARGETS, SEED = 200, 0

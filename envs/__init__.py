@@ -4,18 +4,17 @@ if __name__ != "clothgym.envs":
     # with the repository's root on sys.path a bare `import envs` would make a second copy of every class
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
-from clothgym.envs.definition import Observation
 from clothgym.envs.drape import ClothDrapeEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv
 from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv
-from clothgym.envs.fold import ClothFoldEnv
+from clothgym.envs.fold import ClothFoldEnv, ClothFoldHardEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv
-from clothgym.envs.fold_hard import ClothFoldHardEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv
 from clothgym.envs.hook import ClothHookEnv, ClothHookHardEnv
+from clothgym.envs.observing import Observation
 from clothgym.envs.physics import Physics
 from clothgym.envs.reach import ClothReachEnv
 from clothgym.envs.single import ClothEnv

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask
 from clothgym.envs.experts import as_actions
+from clothgym.envs.scoring import holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 
@@ -28,7 +29,7 @@ class DrapeTask(DrapingTask):
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
         draping.covering, draping.evaluate_cover, draping.observe_target, act=draping.let_go,
-        done=draping.holds_nothing, account=draping.account_reference,
+        done=holds_nothing, account=draping.account_reference,
     )  # fmt: skip
     acting_steps = 60
     settling_steps = 85

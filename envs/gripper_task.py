@@ -1,7 +1,8 @@
-"""A task in which grippers pick up the sheet, the base of those that use them."""
+"""A task in which grippers pick up the sheet, the base of those that use them; and what its ids fix."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -10,12 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.checks import one_of
-from clothgym.envs import pick_place
+from clothgym.attachments import Gripper
+from clothgym.checks import one_of, shown
+from clothgym.envs import draping, pick_place
+from clothgym.envs.episode import Fields
+from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.settling import settle
 from clothgym.envs.stepping import IN_NUMPY
+from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.task import Task
+from clothgym.mesh import ClothMesh, grid
 
+REACH = 0.03  # of the fingers [m]
+# what the ids fix, see ``draping.PHYSICS``; and a larger sheet of silk, with the same short cuts but for the fabric
+PHYSICS = replace(draping.PHYSICS, grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2)
+LARGE_SILK = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0})
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
 ACTION_MODES = ("velocity", "pick_place")
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
@@ -27,6 +37,14 @@ def close_or_open(move, wanted, acting):
     if not acting or move[3] > OPENS:
         return 1.0
     return 0.0 if move[3] < CLOSES else wanted
+
+
+@inlined
+def take(own, rules, sheet, move, free):
+    """Remember which places have been taken; one gripper may take two that lie together."""
+    for k in range(rules.places.shape[0]):
+        if sheet.holder[rules.places[k]] >= 0:
+            own.picked[k] = 1
 
 
 class GripperTask(Task):
@@ -109,6 +127,12 @@ class GripperTask(Task):
     def _drawn(self) -> list[NDArray]:
         return [*super()._drawn(), self.gripper_starts]
 
+    def hover(self, env: int, rng: np.random.Generator, at: NDArray) -> None:
+        """Draw where the grippers are as an episode begins, above these points of the sheet [m], (grippers, 3)."""
+        count = len(at)
+        away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
+        self.gripper_starts[env] = at + self.physics.side * away
+
     def place_attachments(self, envs: NDArray) -> None:
         """Put the grippers where their episodes begin with them."""
         self.simulation.grippers.place(self.gripper_starts[envs], envs)
@@ -127,3 +151,37 @@ class GripperTask(Task):
         middles[..., 2] += (0.025, 0.025, 0.065)
         half_sides = np.tile([(0.005, 0.01, 0.03), (0.005, 0.01, 0.03), (0.04, 0.014, 0.012)], (count, 1))
         return boxes(middles.reshape(len(envs), -1, 3), half_sides, (FINGER, FINGER, PALM) * count)
+
+
+class PickingTask(GripperTask):
+    """Base of the tasks in which each gripper picks up its place of a sheet on the floor, flat or rumpled, and carries it away.
+
+    Attributes:
+        places: the particles that each gripper is to take.
+    """
+
+    places: NDArray
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**GripperTask.ranges, "picked": (0, 1)}
+
+    def remembers(self) -> Fields:
+        # whether each place has ever been held
+        return [*super().remembers(), ("picked", np.uint8, len(self.places))]
+
+    def constants(self) -> dict[str, Any]:
+        return super().constants() | {"places": self.places}
+
+    def check_options(self, options: Mapping[str, Any]) -> None:
+        super().check_options(options)
+        if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
+            raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
+
+
+def lying_sheet(
+    rng: np.random.Generator, rumpled: NDArray, mesh: ClothMesh, yaw: float, options: Mapping[str, Any]
+) -> NDArray[np.float64]:
+    """Draw a sheet on the floor about the origin, turned by a yaw [m], (particles, 3): flat, or one of these rumpled ones."""
+    chosen, number = bool(rng.uniform() < 0.5), int(rng.integers(len(rumpled)))
+    x = rumpled[number].copy() if options.get("rumpled", chosen) else mesh.rest_positions + (0, 0, ON_FLOOR)
+    c, s = np.cos(yaw), np.sin(yaw)
+    x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
+    return x

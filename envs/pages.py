@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.collisions import Plane
-from clothgym.envs.definition import Observation, points_observed
 from clothgym.envs.draping import LETS_GO, let_go
 from clothgym.envs.episode import BEYOND, EFFORT_PRICE, FAILURE_PENALTY, FAILURES, SUCCESS_BONUS, TWICE
 from clothgym.envs.gripper_task import CLOSES, OPENS, GripperTask
+from clothgym.envs.observing import Observation, points_observed
 from clothgym.envs.physics import MEASURED, Physics
 from clothgym.envs.pick_place import STEPS
 from clothgym.envs.stepping import Kernels

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, vector
 from clothgym.collisions import Collider
-from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
+from clothgym.envs.observing import POSITION_BOUND, Observation
 from clothgym.envs.physics import MEDIAN, Physics, settled
+from clothgym.envs.scoring import falloff
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
@@ -61,13 +62,13 @@ def _nearer(own, rules, sheet):
 @inlined
 def _at_rest(rules, sheet):
     """1 where the free corner is at rest, 1/2 at SPEED_SCALE."""
-    return 1 / (1 + (length_of(sheet.v[:, rules.free]) / (SPEED_SCALE * rules.side)) ** 2)
+    return 1 / falloff(length_of(sheet.v[:, rules.free]), SPEED_SCALE * rules.side)
 
 
 @inlined
 def _potential(own, rules, sheet):
     """How much of the way is done, and how near and at rest the corner is, in [0, 1]."""
-    close = 1 / (1 + (distance(own.goal, sheet.x[:, rules.free]) / (CLOSE_SCALE * rules.side)) ** 2)
+    close = 1 / falloff(distance(own.goal, sheet.x[:, rules.free]), CLOSE_SCALE * rules.side)
     return (_nearer(own, rules, sheet) + close * _at_rest(rules, sheet)) / 2
 
 

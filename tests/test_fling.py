@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from clothgym.envs.fling_starts import held_sheets
+from clothgym.envs.fling import held_sheets
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE
 from clothgym.envs.taking import next_edges_of, next_takes_of
 

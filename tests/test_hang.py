@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym import grid
-from clothgym.envs.hanging import hang_of
+from clothgym.envs.hang import hang_of
 
 HANG, HARD = "clothgym:ClothHang-v0", "clothgym:ClothHang-Hard-v0"
 SIDE, RADIUS, REST = 0.6, 0.03, 0.006

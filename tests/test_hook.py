@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from clothgym.envs.hooking import sheet_with_hole, threads
+from clothgym.envs.hook import sheet_with_hole, threads
 
 HOOK, HARD = "clothgym:ClothHook-v0", "clothgym:ClothHook-Hard-v0"
 IDS = [HOOK, HARD]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from clothgym.envs import draping, fold_goal, hanging, hooking
+from clothgym.envs import draping, fold_goal, hang, hanging, scoring
 from clothgym.envs.episode import FAILURES
 
 Info = Mapping[str, Any]
@@ -29,7 +29,7 @@ CRITERIA: tuple[Criterion, ...] = (
     ),
     (
         "balance",
-        lambda info: info["balance"] >= hanging.ENOUGH_BALANCE,
+        lambda info: info["balance"] >= hang.ENOUGH_BALANCE,
         lambda info: "it hangs mostly on one side",
     ),
     (
@@ -39,7 +39,7 @@ CRITERIA: tuple[Criterion, ...] = (
     ),
     (
         "lying",
-        lambda info: info["lying"] <= max(hanging.MOST_LYING, hooking.MOST_LYING),
+        lambda info: info["lying"] <= hanging.MOST_LYING,
         lambda info: f"{info['lying']:.0%} of it lies on the floor",
     ),
     (
@@ -49,7 +49,7 @@ CRITERIA: tuple[Criterion, ...] = (
     ),
     (
         "rms_speed",
-        lambda info: info["rms_speed"] < draping.ENOUGH_REST,
+        lambda info: info["rms_speed"] < scoring.ENOUGH_REST,
         lambda info: f"it still moves at {100 * info['rms_speed']:.1f} cm/s",
     ),
 )
