@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from test_envs import drawn, every_task, make, make_vec, skip, still
+from test_envs import drawn, make, make_vec, skip, still, two_tasks
 
 # --- the vector environment -----------------------------------------------------------------------------------------------
 
@@ -23,7 +23,7 @@ def run_to_an_end(env):
     raise AssertionError("no episode ended")
 
 
-@every_task
+@two_tasks
 def test_next_step_mode_resets_in_the_step_after(env_id):
     env = make_vec(env_id, 3)
     assert env.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
@@ -43,7 +43,7 @@ def test_next_step_mode_resets_in_the_step_after(env_id):
     assert np.array_equal(starts[0].holder[1], starts[1].holder[1])
 
 
-@every_task
+@two_tasks
 def test_same_step_mode_gives_the_last_observation_in_info(env_id):
     disabled, env = make_vec(env_id, 3, autoreset_mode="Disabled"), make_vec(env_id, 3, autoreset_mode=AutoresetMode.SAME_STEP)
     step, (last, *_, last_info) = run_to_an_end(disabled)
@@ -75,7 +75,7 @@ def assert_infos_agree(info, expected):
             assert not np.any(info[key][~mask].astype(bool)), key
 
 
-@every_task
+@two_tasks
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_every_mode_behaves_as_gymnasium_s_own_vector_env(env_id, mode):
     """Observations, rewards, flags and infos beside SyncVectorEnv's, over episodes that end at different steps."""
@@ -106,7 +106,7 @@ def test_every_mode_behaves_as_gymnasium_s_own_vector_env(env_id, mode):
     assert ends >= 2
 
 
-@every_task
+@two_tasks
 def test_disabled_mode_waits_for_a_masked_reset(env_id):
     env = make_vec(env_id, 3, autoreset_mode="Disabled")
     _, (last, *_) = run_to_an_end(env)
@@ -120,7 +120,7 @@ def test_disabled_mode_waits_for_a_masked_reset(env_id):
         env.reset(options={"reset_mask": np.zeros(3, bool)})
 
 
-@every_task
+@two_tasks
 def test_seeds_by_list_and_by_integer(env_id):
     env = make_vec(env_id, 3)
     a, _ = env.reset(seed=5)
@@ -131,7 +131,7 @@ def test_seeds_by_list_and_by_integer(env_id):
         env.reset(seed=[1, 2])
 
 
-@every_task
+@two_tasks
 def test_what_users_of_gymnasium_s_own_vector_envs_rely_on(env_id):
     env = make_vec(env_id, 2, render_mode="rgb_array")
     env.reset(seed=0)
@@ -142,7 +142,7 @@ def test_what_users_of_gymnasium_s_own_vector_envs_rely_on(env_id):
     assert env.render() is None
 
 
-@every_task
+@two_tasks
 def test_an_asynchronous_vector_env_after_a_native_one(env_id):
     """The native batch has used its threads; the forked workers must do without them."""
     native = make_vec(env_id, 32, threads=2)
@@ -157,7 +157,7 @@ def test_an_asynchronous_vector_env_after_a_native_one(env_id):
     env.close()
 
 
-@every_task
+@two_tasks
 def test_two_threads_step_two_vector_envs_at_once(env_id):
     from concurrent.futures import ThreadPoolExecutor
 
