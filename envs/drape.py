@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask
 from clothgym.envs.experts import as_actions
+from clothgym.envs.observing import View
 from clothgym.envs.scoring import holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.3, 0.55, 0.25
@@ -31,6 +29,7 @@ class DrapeTask(DrapingTask):
         draping.covering, draping.evaluate_cover, draping.observe_target, act=draping.let_go,
         done=holds_nothing, account=draping.account_reference,
     )  # fmt: skip
+    seen_from = View((1.6, -1.3, 1.05), (0.0, -0.19, 0.27), 33.0)
     acting_steps = 60
     settling_steps = 85
     actions_per_attachment = 4
@@ -65,11 +64,6 @@ class DrapeTask(DrapingTask):
         # half of the way in each step, both alike
         each = np.ones((1, self.num_attachments))
         return as_actions(self, (goal - middle)[:, None] / 2 * each[..., None], release[:, None] * each)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.19, 0.27), vertical_fov=33.0)
 
 
 class ClothDrapeEnv(ClothEnv):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,11 @@ from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask, covering, observe_target
 from clothgym.envs.experts import carry_by_places
 from clothgym.envs.gripper_task import PHYSICS, PickingTask, close_or_open, lying_sheet, take
-from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.scoring import grasp
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 PICKING = 0.3  # share of the potential that is for taking hold
 
@@ -73,6 +70,7 @@ class DrapeGripperTask(DrapingTask, PickingTask):
     kernels = Kernels(
         _potential, draping.evaluate_cover, _observe, act=take, account=draping.account_reference, fingers=close_or_open
     )  # fmt: skip
+    seen_from = View((1.75, -1.6, 1.2), (0.0, -0.33, 0.24), 36.0)
     acting_steps = 100
     settling_steps = 60
     observations = _observations(2)
@@ -134,11 +132,6 @@ class DrapeGripperTask(DrapingTask, PickingTask):
         goal[..., 2] = np.where(arrived, low, lift)
         down = arrived & (np.abs(tips[..., 2] - low) < 0.03)
         return carry_by_places(self, (goal - tips) / 2, down, np.array([0.0, 0.0, 0.1]))
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.33, 0.24), vertical_fov=36.0)
 
 
 class ClothDrapeGripperEnv(ClothEnv):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,9 @@ from clothgym._jit import inlined
 from clothgym.envs import flatten_expert
 from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
 from clothgym.envs.episode import Fields
-from clothgym.envs.gripper_task import PHYSICS, close_or_open
-from clothgym.envs.manipulation import CORNERS, WAYS, ManipulationTask, observe_grippers, observe_ways
+from clothgym.envs.gripper_task import CORNERS, PHYSICS, WAYS, ManipulationTask, close_or_open, observe_grippers, observe_ways
 from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
-from clothgym.envs.observing import POSITION_BOUND, VELOCITY_BOUND, Observation
+from clothgym.envs.observing import POSITION_BOUND, VELOCITY_BOUND, Observation, View
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
@@ -24,9 +23,6 @@ from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, beside_corners, observe_next
 from clothgym.mesh import grid
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 HOLDING = 0.1  # share of the potential that is for holding the sheet
 HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
@@ -179,6 +175,7 @@ class FlattenTask(SpreadingTask):
     kernels = Kernels(
         spread_potential, evaluate_spread, _observe, measure=measure_coverage, account=account_spread, fingers=close_or_open
     )  # fmt: skip
+    seen_from = View((0.9, -1.5, 1.35), (0.0, 0.0, 0.14), 36.0, scales_from=0.6)
     acting_steps = 300
     settling_steps = 40
     picks = 6
@@ -228,12 +225,6 @@ class FlattenTask(SpreadingTask):
 
     def expert_picks(self) -> NDArray:
         return flatten_expert.flatten_picks(self)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(0.9 * far, -1.5 * far, 1.35 * far), target=(0.0, 0.0, 0.14 * far), vertical_fov=36.0)
 
 
 class FlattenHardTask(FlattenTask):

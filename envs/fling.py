@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
-from clothgym.checks import shown
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.flatten import (
     SpreadingTask,
@@ -24,7 +23,7 @@ from clothgym.envs.flatten import (
 )
 from clothgym.envs.fling_expert import Throw, fling_actions
 from clothgym.envs.gripper_task import PHYSICS, REACH, GripperTask, close_or_open
-from clothgym.envs.observing import Observation
+from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.pick_place import LOWEST
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
@@ -33,9 +32,6 @@ from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import CLEAR, EDGES, NEXT, beside_corners, observe_next, places_to_take
 from clothgym.mesh import grid
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
@@ -158,6 +154,7 @@ class FlingTask(SpreadingTask):
     kernels = Kernels(
         spread_potential, _evaluate_fling, _observe_fling, measure=_measure_throws, account=_account_fling, fingers=close_or_open,
     )  # fmt: skip
+    seen_from = View((1.25, -0.9, 0.85), (0.0, 0.06, 0.31), 38.0, scales_from=0.6)
     acting_steps = 300
     # the expert's, see ``fling_expert``
     throw: ClassVar[Throw] = Throw(
@@ -185,13 +182,10 @@ class FlingTask(SpreadingTask):
         **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
         "barred": (0, 1),
     }  # fmt: skip
-    arguments: ClassVar = {
-        **GripperTask.arguments, "action_mode": '"velocity" alone: what is picked and placed is not thrown',
-    }  # fmt: skip
+    no_picks = "what is picked and placed is not thrown"
+    arguments: ClassVar = {**GripperTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
 
-    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
-        if action_mode != "velocity":
-            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed is not thrown")
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
@@ -255,12 +249,6 @@ class FlingTask(SpreadingTask):
 
     def expert_actions(self) -> NDArray:
         return fling_actions(self)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(1.25 * far, -0.9 * far, 0.85 * far), target=(0.0, 0.06 * far, 0.31 * far), vertical_fov=38.0)
 
 
 class FlingHardTask(FlingTask):

@@ -14,8 +14,7 @@ from clothgym.envs import pick_place
 from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.gripper_task import LARGE_SILK, REACH, close_or_open
-from clothgym.envs.manipulation import ManipulationTask, observe_grippers
+from clothgym.envs.gripper_task import LARGE_SILK, REACH, ManipulationTask, close_or_open, observe_grippers
 from clothgym.envs.measures import SPEED2
 from clothgym.envs.observing import Observation
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow, grasp

@@ -13,8 +13,16 @@ from clothgym.checks import one_of
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
 from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
-from clothgym.envs.gripper_task import LARGE_SILK, REACH, close_or_open
-from clothgym.envs.manipulation import CORNERS, WAYS, ManipulationTask, observe_grippers, observe_ways
+from clothgym.envs.gripper_task import (
+    CORNERS,
+    LARGE_SILK,
+    REACH,
+    WAYS,
+    ManipulationTask,
+    close_or_open,
+    observe_grippers,
+    observe_ways,
+)
 from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.observing import POSITION_BOUND, Observation
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,11 @@ from clothgym.envs.hanging import (
     picked,
 )  # fmt: skip
 from clothgym.envs.measures import CENTROID, SPEED2, share_above
-from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, TIME, falloff, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import FRICTION
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 HALF_LENGTH = 0.75  # half the rail's length between the axes of its posts, in sides
 OVER = 0.05  # cloth less than this above the rail's contact surface rests on it, in sides
@@ -209,6 +206,7 @@ class RailTask(HangingTask):
     radius: ClassVar[float] = 0.05
     rail_friction: ClassVar[float] = FRICTION
     rail_thickness: ClassVar[float] = 0.006
+    seen_from = View((0.8, -2.0, 1.0), (0.0, -0.15, 0.36), 37.0, scales_from=0.6)
     points_relative_to = "the middle of the rail"
     evaluation = (("balance", float), ("support", float), ("lying", float), ("rms_speed", float))
     ranges: ClassVar = {**HangingTask.ranges, "hang": (-1e-6, 1 + 1e-6), "rail": (-2.0, 2.0)}
@@ -261,12 +259,6 @@ class RailTask(HangingTask):
         goal[..., 1] = np.where(down & high, EXPERT_BEYOND * side, goal[..., 1])
         there = down & (np.abs(above + EXPERT_DROP * side) < 0.02) & (np.abs(across - EXPERT_AT * side) < 0.02)
         return goal - hands, there, SPEED
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(0.8 * far, -2.0 * far, 1.0 * far), target=(0.0, -0.15 * far, 0.36 * far), vertical_fov=37.0)
 
 
 class HangTask(RailTask):

@@ -237,14 +237,8 @@ class FromFloorTask(PickingTask, HangingTask):
     """Base of those in which two grippers pick up their corners of a sheet on the floor, flat or rumpled."""
 
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**PickingTask.ranges, **HangingTask.ranges}
-    arguments: ClassVar = {
-        **PickingTask.arguments, "action_mode": '"velocity" alone: what is picked and placed ends on the floor',
-    }  # fmt: skip
-
-    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
-        if action_mode != "velocity":
-            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed ends on the floor")
-        super().__init__(num_envs, **kwargs)
+    no_picks = "what is picked and placed ends on the floor"
+    arguments: ClassVar = {**PickingTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
 
     def rumpled(self) -> NDArray:
         """Rumpled sheets about the origin [m], (sheets, particles, 3)."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ from clothgym.envs.hanging import (
     picked,
 )  # fmt: skip
 from clothgym.envs.measures import SPEED2, distance, share_above
-from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.rumpled import rumpled_sheets
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, TIME, falloff, holds_nothing
 from clothgym.envs.single import ClothEnv
@@ -42,9 +42,6 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import FRICTION
 from clothgym.mesh import ClothMesh, grid
 from clothgym.triangles import triangle_mesh
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 # in sides: the arm's length; radii of arm and post; height of the post above the arm's root
 ARM, ARM_RADIUS, POST_RADIUS, TOP = 0.3, 0.02, 0.03, 0.3
@@ -277,6 +274,7 @@ class HookingTask(HangingTask):
     heights, heights_allowed = (1.15, 1.35), (1.1, 1.5)
     extent = ARM
     sheet_cut: ClassVar[HoledSheet]
+    seen_from = View((-2.0, -1.5, 1.05), (0.0, -0.3, 0.43), 38.0, scales_from=0.6)
     points_relative_to = "the arm's tip"
     key_points = "corners, middles of the edges, and corners of the hole"
     evaluation = (("threaded", bool), ("lying", float), ("rms_speed", float))
@@ -354,12 +352,6 @@ class HookingTask(HangingTask):
         ways = EXPERT_GAIN * common[:, None] + (middle + aside - hands)
         there = near & (w < axis - EXPERT_DROP * side)
         return ways, there[:, None], np.where(along, EXPERT_CARRIES, SPEED)[:, None]
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(-2.0 * far, -1.5 * far, 1.05 * far), target=(0.0, -0.3 * far, 0.43 * far), vertical_fov=38.0)
 
 
 class HookTask(HookingTask):

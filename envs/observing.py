@@ -50,6 +50,15 @@ class Observation(NamedTuple):
     function: Callable[[Any], NDArray] | None = None
 
 
+class View(NamedTuple):
+    """Where films see a task from, as ``render.Camera`` takes it; scales_from: the side for which it is, if it scales [m]."""
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    vertical_fov: float
+    scales_from: float | None = None
+
+
 def points_observed(task: Task | type[Task], obs_mode: str, count: int) -> list[Observation]:
     """What is observed of so many points of the sheet, "particles" or "keypoints": where they are, and their velocities."""
     what = task.key_points if obs_mode == "keypoints" else "all particles, row by row"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from clothgym.checks import LARGEST, vector
 from clothgym.collisions import Collider
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
-from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.physics import MEDIAN, Physics, settled
 from clothgym.envs.scoring import falloff
 from clothgym.envs.single import ClothEnv
@@ -22,9 +22,6 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 PINCHED = 1 / 8  # of a side: the corner's triangle that is held there, since a sheet that hangs from a point spins
 NEAR_ENOUGH, SLOW_ENOUGH = 0.05, 0.1  # in sides, and sides a second
@@ -103,6 +100,7 @@ class ReachTask(Task):
         fast={"material": Material.preset("penava_cotton", air_drag=0.72), "air_density": 0.0, "substeps": 50},
     )
     kernels = Kernels(_potential, _evaluate, _observe)
+    seen_from = View((1.5, -1.8, 1.15), (0.0, 0.05, 0.84), 36.0)
     acting_steps = 40
     observations = (
         Observation(
@@ -184,11 +182,6 @@ class ReachTask(Task):
 
         goal = balls(self.episode["goal"][envs, None], NEAR_ENOUGH * self.physics.side, GOAL)
         return np.concatenate([super().marks(envs), goal], axis=1)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.84), vertical_fov=36.0)
 
 
 @cache

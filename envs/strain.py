@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from clothgym.checks import LARGEST, not_negative, positive, shown
 from clothgym.collisions import Capsule, Collider
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, largest_strain, length_of, stretch_quantile
-from clothgym.envs.observing import Observation
+from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
@@ -25,9 +25,6 @@ from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY
 from clothgym.wind import Wind
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 FABRIC = Material.preset("knit", damping_time=1e-3)
 WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
@@ -168,6 +165,7 @@ class StrainTask(Task):
         fast={"substeps": 35},
     )
     kernels = Kernels(_potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account)
+    seen_from = View((-1.75, -1.15, 1.65), (0.05, 0.05, 0.82), 37.0)
     acting_steps = 150
     strain_shown = 0.1
     observations = (
@@ -310,11 +308,6 @@ class StrainTask(Task):
         colors = np.repeat([WAYPOINT] * (WAYPOINTS - 1) + [GOAL], 2, axis=0)
         places = balls(self.episode["places"][envs].reshape(len(envs), -1, 3), 0.02, colors, np.repeat(ahead, 2, axis=1))
         return np.concatenate([super().marks(envs), places], axis=1)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.82), vertical_fov=37.0)
 
 
 def _post(x: float, y: float) -> Capsule:

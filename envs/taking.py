@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.envs.gripper_task import REACH
-from clothgym.envs.manipulation import CORNERS
+from clothgym.envs.gripper_task import CORNERS, REACH
 from clothgym.envs.measures import distance, length_of, squared_distance
 from clothgym.envs.observing import Observation
 from clothgym.envs.pick_place import LOWEST

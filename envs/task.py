@@ -24,7 +24,7 @@ from clothgym.envs import answers, hooks
 from clothgym.envs.episode import Fields, TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
 from clothgym.envs.generators import Generators
 from clothgym.envs.measures import centers_of_area, key_particles
-from clothgym.envs.observing import POSITION_BOUND, Observation, Observer, StateVector, has_own
+from clothgym.envs.observing import POSITION_BOUND, Observation, Observer, StateVector, View, has_own
 from clothgym.envs.physics import (
     Physics,
     check_ranges,
@@ -99,6 +99,7 @@ class Task:
         arguments: meaning of the task's own keywords, for the page, and of those that mean something else than elsewhere.
         ranges: least and greatest value of the fields that episodes remember, for ``set_state``; of others any finite number does.
         strain_shown: where the colors of render_color="strain" end.
+        seen_from: where films see it from.
         simulation: the batch of sheets.
         sheet: rows and side as they were asked for.
         episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
@@ -134,6 +135,7 @@ class Task:
     arguments: ClassVar[Mapping[str, str]] = {}
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     strain_shown: ClassVar[float] = 0.05
+    seen_from: ClassVar[View | None] = None
 
     def __init__(
         self,
@@ -396,9 +398,13 @@ class Task:
         return (low[:2] + high[:2]) / 2, float(max(high[:2] - low[:2])) / 2
 
     def camera(self) -> Camera:
-        """Where the scene is seen from; by default the whole arena from the front and right."""
+        """Where the scene is seen from: ``seen_from``; by default the whole arena from the front and right."""
         from clothgym.render import Camera  # imported here: training draws nothing
 
+        if self.seen_from is not None:
+            eye, target, fov, side = self.seen_from
+            far = 1.0 if side is None else self.physics.side / side
+            return Camera(eye=tuple(far * c for c in eye), target=tuple(far * c for c in target), vertical_fov=fov)  # type: ignore[arg-type]
         low, high = self.arena()
         far = float(max(high - low))
         return Camera(eye=(0.7 * far, -0.6 * far, 0.45 * far), target=(0.0, 0.0, 0.15 * far), vertical_fov=40.0)
