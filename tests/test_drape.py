@@ -22,14 +22,14 @@ def start(seed=3, **kwargs):
     return env, observation
 
 
-def potential(env):
+def potential(env, reach=0.15):
     """The potential of the manual page, from positions and the target alone, in float64."""
     task, x = env.task, env.task.simulation.positions[0].astype(float)
     target = task.targets[0]
     points = target.upper_surface(32)
     points = points[np.arange(32) % len(points)]
     nearest = np.min(np.linalg.norm(points[:, None] - x[None], axis=2), axis=1)
-    near = np.mean(1 / (1 + (nearest / (0.15 * SIDE)) ** 2))
+    near = np.mean(1 / (1 + (nearest / (reach * SIDE)) ** 2))
     weights = SHEET.area / SHEET.area.sum()
     off = np.linalg.norm(weights @ x[:, :2] - target.center) / SIDE
     return (near + 1 / (1 + (off / 0.2) ** 2)) / 2

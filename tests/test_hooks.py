@@ -109,23 +109,6 @@ def test_what_does_not_fit_when_a_task_is_made(case):
             made(**methods)
 
 
-@pytest.mark.parametrize("case", [case for case in WRONG if case.startswith("begin")])
-def test_a_start_that_is_refused_changes_nothing(case):
-    batch, _ = made()
-    batch.reset(seed=0)
-    batch.step(np.zeros(batch.action_space.shape))
-    before, methods = batch.get_state(), WRONG[case][0]
-    if "begin" not in methods:
-        return
-    type(batch.task).begin = methods["begin"]
-    with pytest.raises(ValueError, match="Mine.begin"):
-        batch.reset(seed=7)
-    after = batch.get_state()
-    assert before.generators == after.generators
-    assert all(np.array_equal(before.episode[name], after.episode[name]) for name in before.episode)
-    assert np.array_equal(before.simulation.positions, after.simulation.positions)
-
-
 def test_an_expert_s_wrong_shape_is_named():
     batch, single = made(expert_actions=returning(np.zeros(3)))
     for env, ask in ((batch, "expert_actions"), (single, "expert_action")):

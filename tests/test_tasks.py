@@ -86,19 +86,6 @@ def test_its_batch_equals_its_single_environments_and_its_seeds_their_episodes()
             assert np.array_equal(own, observation[i]) and own_reward == reward[i]
 
 
-def test_it_goes_on_from_a_state_bit_for_bit():
-    env, other = gym.make(TOWEL).unwrapped, gym.make(TOWEL).unwrapped
-    env.reset(seed=1)
-    for _ in range(5):
-        env.step(lifting(0.2))
-    state = env.get_state()
-    other.set_state(state)
-    for _ in range(40 - 5):
-        one, two = env.step(lifting(0.1)), other.step(lifting(0.1))
-        assert np.array_equal(one[0], two[0]) and one[1:3] == two[1:3]
-    assert one[2]
-
-
 def test_tools_take_it(tmp_path, capsys):
     sb3 = pytest.importorskip("clothgym.adapters.sb3")
     env = sb3.make_sb3_vec_env(TOWEL, 3, seed=0)

@@ -342,17 +342,6 @@ def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
     assert not np.array_equal(state.episode["wind"], env.get_state().episode["wind"])
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
-def test_a_batch_with_wind_goes_on_after_an_episode_s_end(mode):
-    env = make_vec("ClothDrape-v0", 2, autoreset_mode=mode, wind={"gust": 0.1})
-    env.reset(seed=0)
-    env.unwrapped.task.episode["step"][0] += 3
-    ends = 0
-    for _ in range(env.unwrapped.task.acting_steps + env.unwrapped.task.settling_steps + 3):
-        ends += env.step(np.zeros(env.action_space.shape))[2].any()
-    assert ends
-
-
 @pytest.mark.parametrize(
     ("wind", "name"),
     [BAD_WINDS[0], ({"force": 3}, "speed, direction, gust, gust_time"), (3.0, "wind=3.0"), ("strong", "wind='strong'")],
