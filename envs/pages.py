@@ -1,8 +1,8 @@
 """An environment's manual page, and the refusal of keywords that there are not.
 
-A class's docstring is its page.  Sections that follow from the task alone, see ``STANDARD``, are added when the class is made where
-the docstring lacks them, and lines of it that begin with one of ``MARKS`` are replaced by what that function returns of the task,
-some by means of the words that follow.  Every number comes from where the code has it.
+A class's docstring is its page.  When the class is made, lines of it that begin with one of ``MARKS`` are replaced by what that
+function returns of the task, some by means of the words that follow; and a page with the mark ``$physics`` gets the sections of
+``STANDARD`` that it lacks, which follow from the task alone.  Every number comes from where the code has it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from clothgym.material import PRESETS, Material
 if TYPE_CHECKING:
     from clothgym.envs.single import TaskHolder
 
-# sections that a page has without being asked, and the order of all
+# sections that are added to pages, and the order of all
 STANDARD = {
     "Action Space": "$actions",
     "Observation Space": "$observations",
@@ -152,12 +152,13 @@ def check_keywords(env: TaskHolder, given: Mapping[str, Any]) -> None:
 
 
 def completed(page: str | None, task_class: type[Task] | None) -> str | None:
-    """A page with all sections and tables; made of the task's docstring where there is none, and nothing where there is no task."""
+    """A page with its sections and tables, or the task's docstring above both tables; nothing where there is no task."""
     if task_class is None:
         return page
-    page = inspect.cleandoc(page or f"{task_class.__doc__ or task_class.__name__}\n\n## Observation Space\n$observations")
-    lines = []
-    for line in _whole(page).split("\n"):
+    if page is None:
+        page = f"{task_class.__doc__ or task_class.__name__}\n\n## Observation Space\n$observations\n\n## Arguments\n$arguments\n"
+    page, lines = inspect.cleandoc(page), []
+    for line in (_whole(page) if "$physics" in page else page).split("\n"):
         mark, _, words = line.partition(" ")
         if mark not in MARKS:
             lines.append(line)
@@ -170,7 +171,7 @@ def _whole(page: str) -> str:
     """A page with the sections of ``STANDARD`` that it lacks, each in its place among the others."""
     first, *parts = re.split(r"\n(?=## )", page)
     found = {part.partition("\n")[0][3:]: part.strip() for part in parts}
-    for heading in (heading for heading in STANDARD if found and heading not in found):
+    for heading in (heading for heading in STANDARD if heading not in found):
         later = ORDER[ORDER.index(heading) :]
         place = next((k for k, other in enumerate(found) if other in later), len(found))
         new = (heading, f"## {heading}\n{STANDARD[heading]}")

@@ -353,6 +353,11 @@ def test_a_page_of_a_task_without_one_is_made_from_its_own():
     page = hang_towel.HangTowelEnv.__doc__
     assert "| 54 | ``goal`` | its height | m | 1 |" in page and "``fabric``" in page
     assert env_of(Counting).__doc__.startswith("A sheet on the floor")
+    # what a page does not ask for is not added
+    assert "## Episode End" not in page
+    assert (
+        type("Env", (ClothEnv,), {"task_class": Counting, "__doc__": "Mine.\n\n## About\nIt."}).__doc__ == "Mine.\n\n## About\nIt."
+    )
 
 
 def test_block_and_lane_of_environments():
