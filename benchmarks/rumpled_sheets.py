@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from clothgym import starts
 from clothgym.envs.coverage import FINE_CELL, covered_area
-from clothgym.envs.drape_gripper import REACH
 from clothgym.envs.draping import PHYSICS
+from clothgym.envs.gripper_task import REACH
 from clothgym.envs.rumpled import BANKS, RUMPLED, UNIT, Bank, robust
 from clothgym.envs.targets import ON_FLOOR
 from clothgym.mesh import ClothMesh, grid

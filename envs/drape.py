@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from clothgym.envs import draping
 from clothgym.envs.draping import DrapingTask
 from clothgym.envs.experts import as_actions
+from clothgym.envs.observing import View
+from clothgym.envs.scoring import holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP = 0.3, 0.55, 0.25
@@ -29,8 +27,9 @@ class DrapeTask(DrapingTask):
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
         draping.covering, draping.evaluate_cover, draping.observe_target, act=draping.let_go,
-        done=draping.holds_nothing, account=draping.account_reference,
+        done=holds_nothing, account=draping.account_reference,
     )  # fmt: skip
+    seen_from = View((1.6, -1.3, 1.05), (0.0, -0.19, 0.27), 33.0)
     acting_steps = 60
     settling_steps = 85
     actions_per_attachment = 4
@@ -66,11 +65,6 @@ class DrapeTask(DrapingTask):
         each = np.ones((1, self.num_attachments))
         return as_actions(self, (goal - middle)[:, None] / 2 * each[..., None], release[:, None] * each)
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.6, -1.3, 1.05), target=(0.0, -0.19, 0.27), vertical_fov=33.0)
-
 
 class ClothDrapeEnv(ClothEnv):
     """Lay a hanging sheet over a target and let go of it.
@@ -88,9 +82,6 @@ class ClothDrapeEnv(ClothEnv):
 
     ## Action Space
     $actions corner
-
-    ## Observation Space
-    $observations
 
     ## Rewards
     $rewards
@@ -117,26 +108,9 @@ class ClothDrapeEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.1 L to the side, with a ripple of a
     millimeter; the target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
 
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
     ## Vectorized environment
     ``gym.make_vec("clothgym:ClothDrape-v0", num_envs=256)``; environment ``i`` seeded ``s`` equals a single one seeded
     ``s + i``, bit for bit.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = DrapeTask
-
-
-class ClothDrapeVectorEnv(ClothVectorEnv):
-    """``ClothDrape-v0`` as a batch, see ``ClothDrapeEnv``."""
 
     task_class = DrapeTask

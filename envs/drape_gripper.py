@@ -4,33 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.attachments import Gripper
-from clothgym.checks import shown
 from clothgym.envs import draping
-from clothgym.envs.definition import POSITION_BOUND, Observation
-from clothgym.envs.draping import PHYSICS, DrapingTask, covering, observe_target
-from clothgym.envs.episode import Fields
+from clothgym.envs.draping import DrapingTask, covering, observe_target
 from clothgym.envs.experts import carry_by_places
-from clothgym.envs.gripper_task import GripperTask, close_or_open
-from clothgym.envs.measures import distance
+from clothgym.envs.gripper_task import PHYSICS, PickingTask, close_or_open, lying_sheet, take
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
+from clothgym.envs.scoring import grasp
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import ON_FLOOR
-from clothgym.envs.vector import ClothVectorEnv
 
-if TYPE_CHECKING:
-    from clothgym.render import Camera
-
-REACH = 0.03  # of the fingers [m]
 PICKING = 0.3  # share of the potential that is for taking hold
-PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
 
 # the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
 # above it before it sets out
@@ -41,22 +31,11 @@ EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
 
 
 @inlined
-def _take(own, rules, sheet, move, free):
-    """Remember what has been taken; one gripper may have taken two corners that lay together."""
-    for k in range(rules.places.shape[0]):
-        if sheet.holder[rules.places[k]] >= 0:
-            own.picked[k] = 1
-
-
-@inlined
 def _potential(own, rules, sheet):
     """How far the taking hold is along, and how near the sheet is to the target."""
-    # 1 for a place that is held, at most a half for one that its gripper is near
     taken = 0.0
     for k in range(rules.places.shape[0]):
-        place = rules.places[k]
-        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
-        taken += 1.0 if sheet.holder[place] >= 0 else 0.5 / (1 + away**2)
+        taken += grasp(sheet.holder[rules.places[k]] >= 0, rules, sheet, k)
     return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * covering(own, rules, sheet)
 
 
@@ -83,28 +62,24 @@ def _observations(grippers: int) -> tuple[Observation, ...]:
     return (*draping.observations(grippers, "whether each gripper holds anything"), own)
 
 
-class DrapeGripperTask(DrapingTask, GripperTask):
+class DrapeGripperTask(DrapingTask, PickingTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
-    physics = replace(PHYSICS, grippers=(Gripper(speed=2 * PHYSICS.attachment_speed, reach=REACH),) * 2)
+    physics = PHYSICS
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _potential,
-        draping.evaluate_cover,
-        _observe,
-        act=_take,
-        account=draping.account_reference,
-        fingers=close_or_open,
-    )
+        _potential, draping.evaluate_cover, _observe, act=take, account=draping.account_reference, fingers=close_or_open
+    )  # fmt: skip
+    seen_from = View((1.75, -1.6, 1.2), (0.0, -0.33, 0.24), 36.0)
     acting_steps = 100
     settling_steps = 60
     observations = _observations(2)
     guide_reach = 0.4  # the sheet begins farther away than in ClothDrape-v0
-    ranges: ClassVar = {**DrapingTask.ranges, **GripperTask.ranges, "picked": (0, 1)}
+    ranges: ClassVar = {**DrapingTask.ranges, **PickingTask.ranges}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target", "rumpled")
     arguments: ClassVar = {
         **DrapingTask.arguments,
-        **GripperTask.arguments,
+        **PickingTask.arguments,
         "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
         "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.70 N",
     }
@@ -117,40 +92,23 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         super().__init__(num_envs, **kwargs)
 
     @property
-    def places(self) -> NDArray:
+    def places(self) -> NDArray:  # type: ignore[override]
         """The particles that each gripper is to take: both corners of the edge at the target, or its middle."""
         mesh = self.physics.mesh
         left, right = mesh.corners[2:]
         return np.array([left, right] if len(self.physics.grippers) == 2 else [left + mesh.grid_shape[1] // 2])
 
-    def remembers(self) -> Fields:
-        # whether each place has ever been held
-        return [*super().remembers(), ("picked", np.uint8, len(self.places))]
-
-    def constants(self) -> dict[str, Any]:
-        return super().constants() | {"places": self.places}
-
     # --- reset ----------------------------------------------------------------------------------------------------------
-
-    def check_options(self, options: Mapping[str, Any]) -> None:
-        if not isinstance(options.get("rumpled", False), (bool, np.bool_)):
-            raise ValueError(f"reset option rumpled={shown(options['rumpled'])}: must be True or False")
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         target, mesh, side = self.draw_target(env, rng, options.get("target", {})), self.physics.mesh, self.physics.side
         gap, sideways, yaw = side * rng.uniform(0.05, 0.15), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
-        sheets = rumpled_sheets(*mesh.grid_shape, side)
-        rumpled, number = bool(rng.uniform() < 0.5), int(rng.integers(len(sheets)))
-        x = sheets[number].copy() if options.get("rumpled", rumpled) else mesh.rest_positions + (0, 0, ON_FLOOR)
-        c, s = np.cos(yaw), np.sin(yaw)
-        x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
+        x = lying_sheet(rng, rumpled_sheets(*mesh.grid_shape, side), mesh, yaw, options)
         # before the target, whose half width is at most sqrt(2) radii
         edge = target.center[1] - np.sqrt(2) * target.radius - gap
         x += (target.center[0] + sideways, edge - x[:, 1].max(), 0)
         x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
-        count = len(self.places)
-        away = np.concatenate([rng.uniform(-0.1, 0.1, (count, 2)), rng.uniform(0.2, 0.35, (count, 1))], axis=1)
-        self.gripper_starts[env] = x[self.places] + side * away
+        self.hover(env, rng, x[self.places])
         self.episode["picked"][env] = False
         return x
 
@@ -175,11 +133,6 @@ class DrapeGripperTask(DrapingTask, GripperTask):
         down = arrived & (np.abs(tips[..., 2] - low) < 0.03)
         return carry_by_places(self, (goal - tips) / 2, down, np.array([0.0, 0.0, 0.1]))
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.75, -1.6, 1.2), target=(0.0, -0.33, 0.24), vertical_fov=36.0)
-
 
 class ClothDrapeGripperEnv(ClothEnv):
     """Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.
@@ -191,12 +144,6 @@ class ClothDrapeGripperEnv(ClothEnv):
     then is as good as to let go.
 
     $physics
-
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
 
     ## Rewards
     $rewards
@@ -211,23 +158,6 @@ class ClothDrapeGripperEnv(ClothEnv):
     The sheet lies before the target, 0.05 to 0.15 L away from it, turned by up to 0.2 rad and up to 0.1 L to the side; in half
     of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L beside
     and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = DrapeGripperTask
-
-
-class ClothDrapeGripperVectorEnv(ClothVectorEnv):
-    """``ClothDrapeGripper-v0`` as a batch, see ``ClothDrapeGripperEnv``."""
 
     task_class = DrapeGripperTask

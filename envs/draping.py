@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from clothgym._jit import inlined, kernel
 from clothgym.checks import shown
 from clothgym.collisions import Collider, Plane
-from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields
 from clothgym.envs.measures import CENTROID, SPEED2, count_layers, soft_coverage
+from clothgym.envs.observing import POSITION_BOUND, Observation
 from clothgym.envs.physics import MEDIAN, Physics
 from clothgym.envs.reference import EVALUATED_POINTS, limits, reference_coverage
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, TIME, falloff, observe_time
 from clothgym.envs.targets import FRICTION, ON_FLOOR, SHAPES, THICKNESS, Target, placed, unit_normals, unit_surface
 from clothgym.envs.task import Task
 from clothgym.material import Material
@@ -37,9 +38,8 @@ PHYSICS = Physics(
 
 GUIDE_POINTS = 32
 CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
-SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
-# of the reference's coverage; of the covered points under one layer; in sides; [m/s]
-ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING, ENOUGH_REST = 0.9, 0.9, 0.1, 0.02
+# of the reference's coverage; of the covered points under one layer; in sides
+ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING = 0.9, 0.9, 0.1
 
 LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
 BOX = SHAPES.index("box")
@@ -60,9 +60,7 @@ def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
         Observation("target_radius", "the target's radius or half side", (), "L"),
         Observation("target_height", "its height", (), "L"),
         Observation("target_yaw", "its yaw", (), "45 degrees"),
-        Observation("settling", "whether the sheet settles, and actions are ignored"),
-        Observation("episode_left", "share of the episode left"),
-        Observation("acting_left", "share of the acting time left"),
+        *TIME,
     )
 
 
@@ -80,15 +78,6 @@ def let_go(own, rules, sheet, move, free):
     for k in range(free.shape[0]):
         if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
             free[k], sheet.holds[k] = 1, 0
-
-
-@inlined
-def holds_nothing(own, rules, sheet):
-    """Whether all anchors are open."""
-    for k in range(sheet.holds.shape[0]):
-        if sheet.holds[k] > 0:
-            return False
-    return True
 
 
 # --- the target of an episode -------------------------------------------------------------------------------------------------
@@ -169,7 +158,8 @@ class DrapingTask(Task):
             for unit, count in ((unit_surface, GUIDE_POINTS), (unit_surface, EVALUATED_POINTS), (unit_normals, EVALUATED_POINTS))
         )
         surface, side = {"guides": guides, "evaluated": evaluated, "normals": normals}, self.physics.side
-        return {"guide_reach": np.float32(self.guide_reach * side), "judged_within": limits(side), **surface}
+        own = {"guide_reach": np.float32(self.guide_reach * side), "judged_within": limits(side)}
+        return super().constants() | own | surface
 
     def draw_target(self, env: int, rng: np.random.Generator, wanted: Any) -> Target:
         """Draw the target of an environment's episode, of which some properties may be wanted, and write it into its record.
@@ -233,16 +223,10 @@ def _off_center(own, rules, sheet):
 
 
 @inlined
-def _centering(off_center):
-    """1 in the center, 1/2 at CENTERING_SCALE sides: smooth, and with a gradient from afar."""
-    return 1 / (1 + (off_center / CENTERING_SCALE) ** 2)
-
-
-@inlined
 def covering(own, rules, sheet):
     """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
     near = _nearness(sheet.x, _surface_of(own, rules.guides), rules.guide_reach)
-    return (near + _centering(_off_center(own, rules, sheet))) / 2
+    return (near + 1 / falloff(_off_center(own, rules, sheet), CENTERING_SCALE)) / 2
 
 
 @inlined
@@ -257,8 +241,8 @@ def evaluate_cover(own, rules, sheet, info):
     share = info.coverage / own.reference
     covered, flat = share >= ENOUGH_COVERAGE, info.spread >= ENOUGH_SPREAD
     info.is_success = covered and flat and info.off_center <= ENOUGH_CENTERING and info.rms_speed < ENOUGH_REST
-    performance = min(share, 1.0) * info.spread * _centering(info.off_center)
-    return performance / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+    performance = min(share, 1.0) * info.spread * (1 / falloff(info.off_center, CENTERING_SCALE))
+    return performance / falloff(info.rms_speed, SPEED_SCALE)
 
 
 @inlined
@@ -281,7 +265,4 @@ def observe_target(own, rules, sheet, seen):
         seen.target_shape[k] = own.solid == k
     seen.target_radius, seen.target_height = own.radius / rules.side, own.top[2] / rules.side
     seen.target_yaw = own.yaw * (4 / np.pi)
-    # where the episode is
-    seen.settling = own.settling_since >= 0
-    seen.episode_left = 1 - own.step / (rules.acting_steps + rules.settling_steps)
-    seen.acting_left = max(rules.acting_steps - own.step, 0) / rules.acting_steps
+    observe_time(own, rules, seen)

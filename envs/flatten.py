@@ -4,37 +4,96 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
-from clothgym.envs.definition import POSITION_BOUND, VELOCITY_BOUND, Observation
-from clothgym.envs.flatten_expert import flatten_actions, flatten_picks
-from clothgym.envs.flattening import (
-    LIFTED,
-    SpreadingTask,
-    account_spread,
-    evaluate_spread,
-    measure_coverage,
-    observe_spread,
-    spread_potential,
-)
-from clothgym.envs.gripper_task import close_or_open
-from clothgym.envs.manipulation import CORNERS, PHYSICS, WAYS, observe_ways
+from clothgym.envs import flatten_expert
+from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
+from clothgym.envs.episode import Fields
+from clothgym.envs.gripper_task import CORNERS, PHYSICS, WAYS, ManipulationTask, close_or_open, observe_grippers, observe_ways
+from clothgym.envs.measures import FINITE, SPEED2, STRETCH2, squared_distance
+from clothgym.envs.observing import POSITION_BOUND, VELOCITY_BOUND, Observation, View
 from clothgym.envs.physics import chosen_fabric
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
+from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import EDGES, NEXT, OPPOSITE, observe_next
-from clothgym.envs.vector import ClothVectorEnv
+from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, beside_corners, observe_next
 from clothgym.mesh import grid
 
-if TYPE_CHECKING:
-    from clothgym.render import Camera
-
+HOLDING = 0.1  # share of the potential that is for holding the sheet
+HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
+FLAT_ALREADY = 0.99  # coverage of which there is nothing to improve
+SANE_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
 SHORTEST = 1e-9  # distance of tips that hold both ends of an edge, which has no direction if they touch [m]
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def improvement(coverage, start):
+    """Normalized improvement: share of what was not covered at the start that is covered now, in [0, 1]."""
+    if coverage >= FLAT_ALREADY:
+        return 1.0
+    return 0.0 if start >= FLAT_ALREADY else min(max((coverage - start) / (1 - start), 0.0), 1.0)
+
+
+@inlined
+def measure_coverage(own, rules, sheet):
+    """Grips; how high each gripper has been since it took hold; and the coverage, on the coarser grid but for the start."""
+    for k in range(sheet.holds.shape[0]):
+        own.raised[k] = max(own.raised[k], sheet.attachments[k, 2]) if sheet.holds[k] > 0 else 0.0
+    # a sheet that has failed keeps the last one
+    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= SANE_STRETCH2 and not own.over:
+        cell = FINE_CELL if own.step == 0 else CELL
+        own.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, cell) / rules.flat_area, 1.0)
+        if own.step == 0:
+            own.coverage_start = own.coverage
+
+
+@inlined
+def spread_potential(own, rules, sheet):
+    """Coverage, and for each gripper 1 if it holds cloth, else at most a half as it nears it."""
+    held = 0.0
+    for k in range(sheet.holds.shape[0]):
+        if sheet.holds[k] > 0:
+            held += 1.0
+            continue
+        nearest = np.inf
+        for p in range(sheet.x.shape[1]):
+            nearest = min(nearest, squared_distance(sheet.x[:, p], sheet.attachments[k]))
+        held += 0.5 / falloff(np.sqrt(nearest), HOLD_SCALE * rules.side)
+    return HOLDING * held / sheet.holds.shape[0] + (1 - HOLDING) * own.coverage
+
+
+@inlined
+def evaluate_spread(own, rules, sheet, info):
+    """Write how much the sheet covers, and how much at rest it is; returns the normalized improvement."""
+    info.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL) / rules.flat_area, 1.0)
+    info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.flat_area
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    info.is_success = info.coverage >= rules.enough and info.rms_speed < ENOUGH_REST and holds_nothing(own, rules, sheet)
+    return improvement(info.coverage, own.coverage_start)
+
+
+@inlined
+def account_spread(own, rules, sheet, info, terms, running, failure):
+    """Coverage now and at the start, and what has become of a success; no reward terms."""
+    info.coverage, info.coverage_start = own.coverage, own.coverage_start
+    score = improvement(own.coverage, own.coverage_start)
+    follow(own, info, score, own.coverage >= rules.enough, running, failure)
+    return 0.0
+
+
+@inlined
+def observe_spread(own, rules, sheet, seen):
+    """Grippers, time, coverage, and how fast the sheet moves."""
+    observe_grippers(own, rules, sheet, seen)
+    seen.coverage, seen.speed = own.coverage, np.sqrt(sheet.summary[SPEED2])
 
 
 @inlined
@@ -76,18 +135,47 @@ def _observe(own, rules, sheet, seen):
     _observe_held_edge(rules, sheet, seen)
 
 
+# --- the tasks ----------------------------------------------------------------------------------------------------------------
+
+
+class SpreadingTask(ManipulationTask):
+    """Base of the tasks that end with a sheet spread on the floor.
+
+    Attributes:
+        enough: coverage of a success.
+    """
+
+    enough: ClassVar[float]
+    evaluation = (("softgym_coverage", float), ("rms_speed", float))
+    accounts: ClassVar[Fields] = (*ManipulationTask.accounts, ("coverage", float), ("coverage_start", float))
+    observations: ClassVar[tuple[Observation, ...]] = (
+        *ManipulationTask.observations,
+        Observation("coverage", "share of the sheet's area that it covers"),
+        Observation("speed", "rms speed of the sheet", (), "m/s", VELOCITY_BOUND),
+    )
+    ranges: ClassVar = {
+        **ManipulationTask.ranges, "coverage": (0.0, 1.0), "coverage_start": (0.0, 1.0), "raised": (0.0, 10.0),
+    }  # fmt: skip
+
+    def remembers(self) -> Fields:
+        grippers = len(self.physics.grippers)
+        return [*super().remembers(), ("coverage", float), ("coverage_start", float), ("raised", float, grippers)]
+
+    def constants(self) -> dict[str, Any]:
+        mesh = self.physics.mesh
+        own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
+        taken = {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh), "columns": mesh.grid_shape[1]}
+        return super().constants() | own | taken
+
+
 class FlattenTask(SpreadingTask):
     """The task of ``ClothFlatten-v0``, see ``ClothFlattenEnv``."""
 
     physics = PHYSICS
     kernels = Kernels(
-        spread_potential,
-        evaluate_spread,
-        _observe,
-        measure=measure_coverage,
-        account=account_spread,
-        fingers=close_or_open,
-    )
+        spread_potential, evaluate_spread, _observe, measure=measure_coverage, account=account_spread, fingers=close_or_open
+    )  # fmt: skip
+    seen_from = View((0.9, -1.5, 1.35), (0.0, 0.0, 0.14), 36.0, scales_from=0.6)
     acting_steps = 300
     settling_steps = 40
     picks = 6
@@ -133,16 +221,10 @@ class FlattenTask(SpreadingTask):
         return self.uneven(x, rng)
 
     def expert_actions(self) -> NDArray:
-        return flatten_actions(self)
+        return flatten_expert.flatten_actions(self)
 
     def expert_picks(self) -> NDArray:
-        return flatten_picks(self)
-
-    def camera(self) -> Camera:
-        from clothgym.render import Camera
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(0.9 * far, -1.5 * far, 1.35 * far), target=(0.0, 0.0, 0.14 * far), vertical_fov=36.0)
+        return flatten_expert.flatten_picks(self)
 
 
 class FlattenHardTask(FlattenTask):
@@ -163,9 +245,6 @@ class ClothFlattenEnv(ClothEnv):
     open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
     $physics
-
-    ## Action Space
-    $actions
 
     ## Observation Space
     $observations
@@ -197,24 +276,7 @@ class ClothFlattenEnv(ClothEnv):
     random particle and dropped, twice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along
     x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are
     open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlattenTask
-
-
-class ClothFlattenVectorEnv(ClothVectorEnv):
-    """``ClothFlatten-v0`` as a batch, see ``ClothFlattenEnv``."""
 
     task_class = FlattenTask
 
@@ -229,9 +291,6 @@ class ClothFlattenHardEnv(ClothEnv):
     $physics
 
     The tropical wool has half the rigidity of the median fabric of ``ClothFlatten-v0``.
-
-    ## Action Space
-    $actions
 
     ## Observation Space
     $observations
@@ -249,23 +308,6 @@ class ClothFlattenHardEnv(ClothEnv):
     particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
     y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are open, 0.3
     to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlattenHardTask
-
-
-class ClothFlattenHardVectorEnv(ClothVectorEnv):
-    """``ClothFlatten-Hard-v0`` as a batch, see ``ClothFlattenHardEnv``."""
 
     task_class = FlattenHardTask

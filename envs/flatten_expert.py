@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
-from clothgym.envs.flattening import LIFTED
 from clothgym.envs.pick_place import STEPS
-from clothgym.envs.taking import EDGES, FLAT, OPPOSITE, next_takes_of
+from clothgym.envs.taking import EDGES, FLAT, LIFTED, OPPOSITE, next_takes_of
 
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 LIFT, LIFT_ONE = 1.25, 0.95  # height that is aimed at with an edge, and with a corner alone, in sides; LIFTED is enough

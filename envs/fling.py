@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import cache
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
-from clothgym.checks import shown
-from clothgym.envs.definition import Observation
-from clothgym.envs.episode import Fields
-from clothgym.envs.flattening import (
+from clothgym.envs.episode import Fields, length
+from clothgym.envs.flatten import (
     SpreadingTask,
     evaluate_spread,
     improvement,
@@ -23,25 +22,24 @@ from clothgym.envs.flattening import (
     spread_potential,
 )
 from clothgym.envs.fling_expert import Throw, fling_actions
-from clothgym.envs.fling_starts import held_sheets
-from clothgym.envs.gripper_task import GripperTask, close_or_open
-from clothgym.envs.manipulation import PHYSICS, REACH, follow
+from clothgym.envs.gripper_task import PHYSICS, REACH, GripperTask, close_or_open
+from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import chosen_fabric
-from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank
+from clothgym.envs.pick_place import LOWEST
+from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
+from clothgym.envs.scoring import follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import NEXT, observe_next
-from clothgym.envs.vector import ClothVectorEnv
+from clothgym.envs.taking import CLEAR, EDGES, NEXT, beside_corners, observe_next, places_to_take
 from clothgym.mesh import grid
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
 CLOSING = 4  # steps in which the fingers close on the corners as an episode begins
 PERIODS = (12, 36, 108)  # of the waves that are observed [steps]
 NOT_MADE = -1.0  # coverage after a throw that has not been made
+APART = 0.15  # least distance of the tips as an episode begins, in sides
+NEARER = 0.75  # share of the distance at which tips take a corner otherwise: a sheet may stir as it is taken
 # the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
 BOX = (0.9, 0.3, 1.25)
 
@@ -123,6 +121,32 @@ def _observe_fling(own, rules, sheet, seen):
             seen.clock[i, quarter] = 4 * abs((own.step + quarter * period // 4) % period / period - 0.5) - 1
 
 
+class Start(NamedTuple):
+    """A sheet, by its place among ``rumpled_sheets``, and the tips that hold both corners of an edge of it [m], (2, 3)."""
+
+    sheet: int
+    tips: NDArray
+
+
+@cache
+def held_sheets(rows: int, columns: int, side: float, bank: Bank) -> tuple[NDArray, list[Start]]:
+    """Crumpled sheets [m], (sheets, particles, 3), and their edges whose corners grippers can take without any other cloth.
+
+    If there is none, those at which they take the least.
+    """
+    sheets, mesh = rumpled_sheets(rows, columns, side, bank), grid(rows, columns, side, side)
+    near, at = beside_corners(mesh) > 0, sheets[:, list(mesh.corners)]
+    takes = at + NEARER * (places_to_take(sheets, mesh)[0] - at)
+    takes[..., 2] = np.maximum(takes[..., 2], LOWEST)
+    # what is taken beside the corners, (sheets, 4)
+    others = ((length(takes[:, :, None] - sheets[:, None]) < CLEAR) & ~near).sum(axis=2)
+    # and by edge, and how far apart the tips are, seen from above
+    tips = takes[:, EDGES]
+    close = np.linalg.norm((tips[:, :, 1] - tips[:, :, 0])[..., :2], axis=2) < APART * side
+    taken = others[:, EDGES].sum(axis=2) + 1000 * close
+    return sheets, [Start(sheet, tips[sheet, edge]) for sheet, edge in np.argwhere(taken == taken.min()).tolist()]
+
+
 class FlingTask(SpreadingTask):
     """The task of ``ClothFling-v0``, see ``ClothFlingEnv``."""
 
@@ -130,6 +154,7 @@ class FlingTask(SpreadingTask):
     kernels = Kernels(
         spread_potential, _evaluate_fling, _observe_fling, measure=_measure_throws, account=_account_fling, fingers=close_or_open,
     )  # fmt: skip
+    seen_from = View((1.25, -0.9, 0.85), (0.0, 0.06, 0.31), 38.0, scales_from=0.6)
     acting_steps = 300
     # the expert's, see ``fling_expert``
     throw: ClassVar[Throw] = Throw(
@@ -157,13 +182,10 @@ class FlingTask(SpreadingTask):
         **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
         "barred": (0, 1),
     }  # fmt: skip
-    arguments: ClassVar = {
-        **GripperTask.arguments, "action_mode": '"velocity" alone: what is picked and placed is not thrown',
-    }  # fmt: skip
+    no_picks = "what is picked and placed is not thrown"
+    arguments: ClassVar = {**GripperTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
 
-    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
-        if action_mode != "velocity":
-            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity': what is picked and placed is not thrown")
+    def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
         # the sheets of this resolution, before the first reset asks for them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
@@ -228,12 +250,6 @@ class FlingTask(SpreadingTask):
     def expert_actions(self) -> NDArray:
         return fling_actions(self)
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera
-
-        far = self.physics.side / 0.6
-        return Camera(eye=(1.25 * far, -0.9 * far, 0.85 * far), target=(0.0, 0.06 * far, 0.31 * far), vertical_fov=38.0)
-
 
 class FlingHardTask(FlingTask):
     """The task of ``ClothFling-Hard-v0``, see ``ClothFlingHardEnv``."""
@@ -256,9 +272,6 @@ class ClothFlingEnv(ClothEnv):
     """Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.
 
     ## Description
-    True physics, as in ``ClothDrape-v0``: the whole sheet touches the table and, strictly, itself, bends with its rigidity, and
-    moves through air.
-
     A square sheet, L = 0.6 m, lies crumpled on a table, the plane z = 0.  Two grippers are at two neighboring corners of it: in the
     first four steps they stay there and close, whatever the action, and hold these corners.  They are those of
     ``ClothDrapeGripper-v0``: they take the particles within 3 cm of their tips when their fingers have closed, other layers too.
@@ -271,15 +284,7 @@ class ClothFlingEnv(ClothEnv):
     let go, it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps they
     open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
-    The id fixes the physics, that of ``ClothDrape-v0``; ``physics="fast"`` has the same short cuts as there.
-
-    ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 2 m/s; a vector longer than 1 is shortened | [-1, 1] | 2 m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $physics
 
     ## Observation Space
     $observations
@@ -292,12 +297,10 @@ class ClothFlingEnv(ClothEnv):
     and while a sheet that nothing holds covers 0.905 or more.
 
     ## Rewards
-    ``reward_mode="delta"``: the change of a potential in [0, 1], less ``0.001 |a|^2`` for the motion and 0.5 for a failure, plus
-    0.25 for a success.  On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one
-    that holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.  At the end it
-    is the normalized performance, at a failure 0.  So a return is that performance, less the potential at the start and these
-    terms: doing nothing may return less than 0.
-    ``reward_mode="sparse"``: the normalized performance, at the evaluation.
+    $rewards
+
+    On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one that holds cloth,
+    else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
 
     ## Evaluation
     The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1, as in
@@ -319,27 +322,7 @@ class ClothFlingEnv(ClothEnv):
     within 0.3 rad of the x axis, one gripper on either side; its middle is up to 0.1 L from the origin along x and y, or as near to
     that as both corners are within reach.  Held-out seeds draw from the same sheets: what is new in them is the combination, not
     the sheet.
-
-    ## Episode End
-    Terminated when evaluated, or at a failure, which ``env.metadata["failures"]`` names by the code ``info["failure"]``: "torn" (a
-    structural spring at twice its rest length),
-    "out_of_bounds" (the sheet's center 0.5 m beyond the box), "diverged" (not finite; the last finite observation goes out).  Never
-    truncated: the time limit is part of the task.
-
-    ## Arguments
-    $arguments
-
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlingTask
-
-
-class ClothFlingVectorEnv(ClothVectorEnv):
-    """``ClothFling-v0`` as a batch, see ``ClothFlingEnv``."""
 
     task_class = FlingTask
 
@@ -348,20 +331,11 @@ class ClothFlingHardEnv(ClothEnv):
     """Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.
 
     ## Description
-    True physics, as in ``ClothFling-v0``: the whole sheet touches the table and, strictly, itself, bends with its rigidity, and
-    moves through air.
-
     Everything is as in ``ClothFling-v0`` but for the sheet, L = 0.8 m with 21 x 21 particles, its fabric, the tropical wool of
     ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity, its start, and its time, 320 steps.  The grippers are
     as fast, 2 m/s, which is less for a larger sheet, and the box has the same size in sides.
 
-    ## Action Space
-    ``Box(-1, 1, (8,))``; for each gripper:
-
-    | Num | Action | Range | Unit |
-    | --- | --- | --- | --- |
-    | 0-2, 4-6 | velocity x, y, z, scaled by 2 m/s; a vector longer than 1 is shortened | [-1, 1] | 2 m/s |
-    | 3, 7 | close if below -0.5, open if above 0.5, else go on as before; the fingers take 0.1 s | [-1, 1] | |
+    $physics
 
     ## Observation Space
     $observations
@@ -377,23 +351,6 @@ class ClothFlingHardEnv(ClothEnv):
     ## Starting State
     As in ``ClothFling-v0``, but one of the crumpled sheets of ``ClothFlatten-Hard-v0``, dropped three times: 55 edges of 41 sheets;
     and the line of both corners is within 0.6 rad of the x axis.
-
-    ## Episode End
-    As in ``ClothFling-v0``, after 320 steps and 40 of settling.
-
-    ## Arguments
-    $arguments
-
-    ``reset(options=...)`` takes ``"material"``, a preset's name or a dict of properties, for one episode.
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FlingHardTask
-
-
-class ClothFlingHardVectorEnv(ClothVectorEnv):
-    """``ClothFling-Hard-v0`` as a batch, see ``ClothFlingHardEnv``."""
 
     task_class = FlingHardTask

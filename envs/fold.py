@@ -1,4 +1,4 @@
-"""ClothFold-v0: fold a sheet that lies on the floor in half, along its diagonal, or twice."""
+"""ClothFold-v0 and ClothFold-Hard-v0: fold a sheet that lies on the floor in half, along its diagonal, or twice."""
 
 from __future__ import annotations
 
@@ -12,27 +12,23 @@ from clothgym._jit import apart, inlined, kernel
 from clothgym.checks import one_of
 from clothgym.envs import pick_place
 from clothgym.envs.coverage import FINE_CELL, shared_area
-from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.gripper_task import close_or_open
-from clothgym.envs.manipulation import REACH, ManipulationTask, follow, observe_grippers
-from clothgym.envs.measures import SPEED2, distance
+from clothgym.envs.gripper_task import LARGE_SILK, REACH, ManipulationTask, close_or_open, observe_grippers
+from clothgym.envs.measures import SPEED2
+from clothgym.envs.observing import Observation
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow, grasp
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import ON_FLOOR
-from clothgym.envs.vector import ClothVectorEnv
 
 if TYPE_CHECKING:
     from clothgym.render import Camera
 
 FOLDS = ("half", "diagonal", "quarter")
 ACTING_STEPS = {"half": 80, "diagonal": 90, "quarter": 150}
-# largest distance of a point of the sheet from its place and mean height over the floor, in sides; rms speed [m/s]
-ENOUGH_FOLDED, ENOUGH_FLAT, ENOUGH_REST = {"half": 0.1, "diagonal": 0.1, "quarter": 0.15}, 0.05, 0.02
-SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
+# largest distance of a point of the sheet from its place and mean height over the floor, in sides
+ENOUGH_FOLDED, ENOUGH_FLAT = {"half": 0.1, "diagonal": 0.1, "quarter": 0.15}, 0.05
 PICKING = 0.3  # share of the potential that is for taking hold
-PICK_SCALE = 0.15  # in sides: how the potential rises as a gripper nears its place
 
 # the scripted expert: height of its arc over that of a half circle; how near the end it opens, and how near points have met, in
 # sides; how far it looks ahead on the arc, and the arc's lowest height in each fold [m]: what is pressed on the layers below jumps
@@ -155,9 +151,7 @@ def _potential(own, rules, sheet):
     """How the taking hold is along, and the fold."""
     taken = 0.0
     for k in range(rules.places.shape[0]):
-        place = rules.places[k]
-        away = distance(sheet.x[:, place], sheet.attachments[k]) / (PICK_SCALE * rules.side)
-        taken += 1.0 if sheet.holder[place] >= 0 else 0.5 / (1 + away**2)
+        taken += grasp(sheet.holder[rules.places[k]] >= 0, rules, sheet, k)
     return PICKING * taken / rules.places.shape[0] + (1 - PICKING) * _folded(own, rules)
 
 
@@ -169,7 +163,7 @@ def _evaluate(own, rules, sheet, info):
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = _reached(own, rules) and info.rms_speed < ENOUGH_REST
     flat = 1 / (1 + (own.height / ENOUGH_FLAT) ** 4)
-    return _folded(own, rules) * flat / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+    return _folded(own, rules) * flat / falloff(info.rms_speed, SPEED_SCALE)
 
 
 @inlined
@@ -209,14 +203,7 @@ class FoldTask(ManipulationTask):
         fold: one of ``FOLDS``.
     """
 
-    kernels = Kernels(
-        _potential,
-        _evaluate,
-        _observe,
-        measure=_measure,
-        account=_account,
-        fingers=close_or_open,
-    )
+    kernels = Kernels(_potential, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
     settling_steps = 60
     observations = (
         *ManipulationTask.observations,
@@ -267,16 +254,10 @@ class FoldTask(ManipulationTask):
     # --- reset ----------------------------------------------------------------------------------------------------------
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        mesh, side = self.physics.mesh, self.physics.side
-        yaw, (dx, dy) = rng.uniform(-self.turned, self.turned), side * rng.uniform(-self.away, self.away, 2)
-        flat = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
-        c, s = np.cos(yaw), np.sin(yaw)
-        x = np.stack([c * flat[:, 0] - s * flat[:, 1] + dx, s * flat[:, 0] + c * flat[:, 1] + dy, flat[:, 2] + ON_FLOOR], axis=1)
-        self.episode["origin"][env], self.episode["turn"][env] = (dx, dy, 0), (c, s)
+        x, center, turn = self.lie_flat(rng, self.away, self.turned)
+        self.episode["origin"][env], self.episode["turn"][env] = (*center, 0), turn
         # both grippers above the edge that they are meant to take first
-        left, right = mesh.corners[2:]
-        away = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
-        self.gripper_starts[env] = x[[left, right]] + side * away
+        self.hover(env, rng, x[list(self.physics.mesh.corners[2:])])
         return self.uneven(x, rng)
 
     def _began(self) -> NDArray:
@@ -344,6 +325,23 @@ class FoldTask(ManipulationTask):
         return Camera(eye=(0.9 * far, -1.35 * far, 1.05 * far), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
 
 
+class FoldHardTask(FoldTask):
+    """The task of ``ClothFold-Hard-v0``, see ``ClothFoldHardEnv``.
+
+    Args:
+        fold: as ``FoldTask`` takes it.
+    """
+
+    physics = LARGE_SILK
+    acting: ClassVar[Mapping[str, int]] = {"half": 100, "diagonal": 120, "quarter": 190}
+    settling_steps = 90
+    away = 0.25
+    turned = np.pi
+
+    def __init__(self, num_envs: int, fold: str = "quarter", **kwargs: Any) -> None:
+        super().__init__(num_envs, fold=fold, **kwargs)
+
+
 class ClothFoldEnv(ClothEnv):
     """Fold a sheet that lies on the floor in half, along its diagonal, or twice.
 
@@ -354,12 +352,6 @@ class ClothFoldEnv(ClothEnv):
     let go.
 
     $physics
-
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
 
     ## Rewards
     $rewards
@@ -385,23 +377,30 @@ class ClothFoldEnv(ClothEnv):
     ## Starting State
     The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
     up to 0.1 L beside and 0.2 to 0.35 L above their corners.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
 
     task_class = FoldTask
 
 
-class ClothFoldVectorEnv(ClothVectorEnv):
-    """``ClothFold-v0`` as a batch, see ``ClothFoldEnv``."""
+class ClothFoldHardEnv(ClothEnv):
+    """Fold a large sheet of silk, turned by any angle on the floor, in half twice.
 
-    task_class = FoldTask
+    ## Description
+    Everything is as in ``ClothFold-v0`` but for the sheet, L = 0.8 m (21 x 21 particles), its fabric, silk
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), its start, and the fold, which is the quarter unless ``fold`` says
+    another: two folds after each other, the second of two layers.  The sheet settles for three seconds.
+
+    $physics
+
+    ## Rewards
+    As in ``ClothFold-v0``.
+
+    ## Evaluation
+    As in ``ClothFold-v0``, with the same ``info``.
+
+    ## Starting State
+    The sheet's center is up to 0.25 L from the origin along x and y, and it is turned by any angle.  The grippers are open, up to
+    0.1 L beside and 0.2 to 0.35 L above the corners of one edge.
+    """
+
+    task_class = FoldHardTask

@@ -10,23 +10,27 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.checks import one_of
-from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
 from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
-from clothgym.envs.fold_hard import LARGE_SILK
-from clothgym.envs.gripper_task import close_or_open
-from clothgym.envs.manipulation import CORNERS, REACH, WAYS, ManipulationTask, follow, observe_grippers, observe_ways
+from clothgym.envs.gripper_task import (
+    CORNERS,
+    LARGE_SILK,
+    REACH,
+    WAYS,
+    ManipulationTask,
+    close_or_open,
+    observe_grippers,
+    observe_ways,
+)
 from clothgym.envs.measures import SPEED2, distance
+from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.task import REWARD_MODES
-from clothgym.envs.vector import ClothVectorEnv
 
-# largest distance of a corner from its goal, in sides; rms speed [m/s]
-ENOUGH_NEAR, ENOUGH_REST = 0.075, 0.02
-SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
+ENOUGH_NEAR = 0.075  # largest distance of a corner from its goal, in sides
 LAYER = 0.008  # height of what is folded over the layer below [m]
 LEAST, MOST = 0.5, 1.0  # how far a corner is carried, as a share of the way to the opposite edge or corner
 # the corners in order around the sheet, as places in ``mesh.corners``: each edge joins one to the next
@@ -58,7 +62,7 @@ def _evaluate(own, rules, sheet, info):
     """Write how much at rest the sheet is, and whether it is folded as asked for; returns the normalized performance."""
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = own.worst <= ENOUGH_NEAR and info.rms_speed < ENOUGH_REST
-    return _near(own, rules, sheet) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
+    return _near(own, rules, sheet) / falloff(info.rms_speed, SPEED_SCALE)
 
 
 @inlined
@@ -98,14 +102,7 @@ class FoldGoalTask(ManipulationTask):
         reward_mode: "goal", or what ``Task`` takes.
     """
 
-    kernels = Kernels(
-        _near,
-        _evaluate,
-        _observe,
-        measure=_measure,
-        account=_account,
-        fingers=close_or_open,
-    )
+    kernels = Kernels(_near, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
     acting_steps = 80
     settling_steps = 40
     obs_modes = ("keypoints", "particles")
@@ -145,11 +142,8 @@ class FoldGoalTask(ManipulationTask):
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         mesh, side, own = self.physics.mesh, self.physics.side, self.episode[env]
-        yaw, (dx, dy) = rng.uniform(-self.turned, self.turned), side * rng.uniform(-self.away, self.away, 2)
-        flat = mesh.rest_positions - mesh.rest_positions.mean(axis=0)
-        c, s = np.cos(yaw), np.sin(yaw)
-        x = np.stack([c * flat[:, 0] - s * flat[:, 1] + dx, s * flat[:, 0] + c * flat[:, 1] + dy, flat[:, 2] + ON_FLOOR], axis=1)
-        own["origin"] = dx, dy, 0
+        x, center, _ = self.lie_flat(rng, self.away, self.turned)
+        own["origin"] = *center, 0
         # the fold: of an edge or of a corner, which, and how far
         corners, edge, first = x[list(mesh.corners)], rng.uniform() >= self.single, int(rng.integers(4))
         share = rng.uniform(LEAST, MOST)
@@ -163,8 +157,7 @@ class FoldGoalTask(ManipulationTask):
             own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * side
             own["goal"][a] += share * (corners[beyond] - corners[a]) + (0, 0, LAYER)
         # above the corner that each is to take
-        beside = np.concatenate([rng.uniform(-0.1, 0.1, (2, 2)), rng.uniform(0.2, 0.35, (2, 1))], axis=1)
-        self.gripper_starts[env] = corners[[a, b]] + side * beside
+        self.hover(env, rng, corners[[a, b]])
         return self.uneven(x, rng)
 
     def advance(self, actions: Any) -> None:
@@ -252,9 +245,6 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
     these.
@@ -286,24 +276,7 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges
     is to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
     corners.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldGoalTask
-
-
-class ClothFoldGoalVectorEnv(GoalReward, ClothVectorEnv):
-    """``ClothFoldGoal-v0`` as a batch, see ``ClothFoldGoalEnv``."""
 
     task_class = FoldGoalTask
 
@@ -319,9 +292,6 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
     ## Observation Space
     ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
     these.
@@ -333,23 +303,6 @@ class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
 
     ## Evaluation
     As in ``ClothFoldGoal-v0``, with the same ``info``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = FoldGoalHardTask
-
-
-class ClothFoldGoalHardVectorEnv(GoalReward, ClothVectorEnv):
-    """``ClothFoldGoal-Hard-v0`` as a batch, see ``ClothFoldGoalHardEnv``."""
 
     task_class = FoldGoalHardTask

@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined
-from clothgym.attachments import Gripper
-from clothgym.envs import draping, hanging
-from clothgym.envs.definition import Observation
-from clothgym.envs.draping import holds_nothing, let_go
-from clothgym.envs.experts import as_actions, carry_by_places
-from clothgym.envs.from_floor import REACH, FromFloorTask, grippers_seen, observe_picking, take, taken
-from clothgym.envs.gripper_task import close_or_open
-from clothgym.envs.hanging import HangingTask, guidance, hang_score, measure_hang, observe_rail
-from clothgym.envs.physics import MEDIAN, chosen_fabric
-from clothgym.envs.rumpled import rumpled_sheets
+from clothgym._jit import apart, inlined
+from clothgym.collisions import Capsule, Collider
+from clothgym.envs import draping
+from clothgym.envs.draping import let_go
+from clothgym.envs.episode import Fields
+from clothgym.envs.experts import SPEED
+from clothgym.envs.gripper_task import LARGE_SILK, close_or_open, take
+from clothgym.envs.hanging import (
+    GUIDE_SCALE,
+    HOLDS,
+    LYING,
+    MOST_LYING,
+    FromFloorTask,
+    HangingTask,
+    account_hanging,
+    grippers_seen,
+    guided,
+    observe_held,
+    observe_picking,
+    picked,
+)  # fmt: skip
+from clothgym.envs.measures import CENTROID, SPEED2, share_above
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, TIME, falloff, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
-from clothgym.mesh import grid
+from clothgym.envs.targets import FRICTION
 
-GUIDING = 0.5  # share of the potential that is for bringing the sheet to the rail
-PICKING = 0.2  # share of it that is for taking hold
+HALF_LENGTH = 0.75  # half the rail's length between the axes of its posts, in sides
+OVER = 0.05  # cloth less than this above the rail's contact surface rests on it, in sides
+ENOUGH_BALANCE, ENOUGH_SUPPORT = 0.6, 0.9  # twice the smaller side's share; in sides
 
 # the scripted expert's ways, in sides: how far above the rail on the way and how far beyond it; where it lets go, beyond the rail
 # and below it; and how far above the rail it sets out
@@ -36,111 +48,246 @@ EXPERT_LIFT, EXPERT_BEYOND, EXPERT_AT, EXPERT_DROP, EXPERT_CLEARS = 0.42, 0.32, 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
 
 
+@apart
+def hang_of(x, triangles, rest, areas, side, rail, turn, ends, low, high, out):
+    """How a sheet hangs over a rail: (share of it beyond the rail, share on the floor, length that the rail carries, in sides).
+
+    The rail's vertical plane cuts the sheet's triangles.  Areas and lengths are those of the flat sheet, by linear functions on the
+    triangles, so that the same surface in other triangles has the same shares.  A point of the cut is carried if it is between
+    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.  A line that halves a square is as
+    long as a side or longer: length beyond that counts for nothing.
+
+    x: (3, particles) [m].  rest: (particles, 2) [m].  areas: of the triangles, summing to 1.  rail: middle of its axis [m].
+    turn: cosine and sine of its yaw.
+    """
+    beyond, lying, carried = 0.0, 0.0, 0.0
+    v, cut, d = np.empty(3), np.empty((2, 4)), np.empty(3)
+    for t in range(triangles.shape[0]):
+        # signed distances from the rail's plane, and the areas
+        for m in range(3):
+            p = triangles[t, m]
+            v[m] = turn[0] * (np.float64(x[1, p]) - rail[1]) - turn[1] * (np.float64(x[0, p]) - rail[0])
+            d[m] = LYING - np.float64(x[2, p])
+        share = share_above(v[0], v[1], v[2])
+        beyond += areas[t] * share
+        lying += areas[t] * share_above(d[0], d[1], d[2])
+        if share == 0 or share == 1:
+            continue
+        # the ends of the cut: along the rail, above it, and in the flat sheet
+        found = 0
+        for m in range(3):
+            n = (m + 1) % 3
+            if (v[m] > 0) != (v[n] > 0):
+                s, p, q = v[m] / (v[m] - v[n]), triangles[t, m], triangles[t, n]
+                for c in range(2):
+                    cut[found, 2 + c] = rest[p, c] + s * (rest[q, c] - rest[p, c])
+                here_x, here_y = x[0, p] + s * (x[0, q] - x[0, p]), x[1, p] + s * (x[1, q] - x[1, p])
+                cut[found, 0] = turn[0] * (here_x - rail[0]) + turn[1] * (here_y - rail[1])
+                cut[found, 1] = x[2, p] + s * (x[2, q] - x[2, p]) - rail[2]
+                found += 1
+        along, above = (cut[0, 0] + cut[1, 0]) / 2, (cut[0, 1] + cut[1, 1]) / 2
+        if abs(along) <= ends and low <= above <= high:
+            carried += np.sqrt((cut[1, 2] - cut[0, 2]) ** 2 + (cut[1, 3] - cut[0, 3]) ** 2)
+    out[0], out[1], out[2] = beyond, lying, min(carried / side, 1.0)
+
+
+@inlined
+def measure_hang(own, rules, sheet):
+    """Write how the sheet hangs, see ``hang_of``."""
+    hang_of(
+        sheet.x, sheet.mesh.triangles, rules.rest, rules.areas, rules.side, own.rail, own.turn, rules.ends, 0.0,
+        rules.carried_within, own.hang,
+    )  # fmt: skip
+
+
+@inlined
+def balance_of(own):
+    """Twice the share of the sheet on the smaller side of the rail: 1 for halves."""
+    return 2 * min(own.hang[0], 1 - own.hang[0])
+
+
+@inlined
+def hang_score(own):
+    """How well the sheet hangs, in [0, 1]: 1 for halves on both sides that the rail carries, and nothing on the floor."""
+    return balance_of(own) * own.hang[2] * (1 - own.hang[1])
+
+
+@inlined
+def hangs(own):
+    """Whether it hangs, at rest or not."""
+    return balance_of(own) >= ENOUGH_BALANCE and own.hang[2] >= ENOUGH_SUPPORT and own.hang[1] <= MOST_LYING
+
+
+@inlined
+def _guidance(own, rules, sheet):
+    """How near the center of area is to that of a sheet that hangs, in [0, 1]: a quarter of a side below the rail."""
+    x, y = sheet.summary[CENTROID] - own.rail[0], sheet.summary[CENTROID + 1] - own.rail[1]
+    # anywhere along the rail where the sheet does not reach beyond its ends
+    along = max(abs(own.turn[0] * x + own.turn[1] * y) - (rules.ends - rules.side / 2), 0.0)
+    across, up = own.turn[0] * y - own.turn[1] * x, sheet.summary[CENTROID + 2] - own.rail[2] + rules.side / 4
+    return 1 / (1 + (along * along + across * across + up * up) / (GUIDE_SCALE * rules.side) ** 2)
+
+
 @inlined
 def _hanging(own, rules, sheet):
-    """How well the sheet hangs, and how near it is to that."""
-    return GUIDING * guidance(own, rules, sheet) + (1 - GUIDING) * hang_score(own)
-
-
-@inlined
-def _observe_held(own, rules, sheet, seen):
-    """What is observed in both tasks, and whether each corner is held."""
-    observe_rail(own, rules, sheet, seen)
-    for k in range(sheet.holds.shape[0]):
-        seen.holds[k] = sheet.holds[k] > 0
+    """How well a held sheet hangs, and how near it is to that."""
+    return guided(_guidance(own, rules, sheet), hang_score(own))
 
 
 @inlined
 def _picking_and_hanging(own, rules, sheet):
     """How far the taking hold is along, and the hanging."""
-    return PICKING * taken(own, rules, sheet) + (1 - PICKING) * _hanging(own, rules, sheet)
+    return picked(own, rules, sheet, _hanging(own, rules, sheet))
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write how the sheet hangs and how much it is at rest; returns the normalized performance."""
+    info.balance, info.support, info.lying = balance_of(own), own.hang[2], own.hang[1]
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    info.is_success = hangs(own) and info.rms_speed < ENOUGH_REST
+    return hang_score(own) / falloff(info.rms_speed, SPEED_SCALE)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    """What has become of the score and of a success; no reward terms."""
+    return account_hanging(own, rules, sheet, info, hang_score(own), hangs(own), running, failure)
+
+
+@inlined
+def _observe_rail(own, rules, sheet, seen):
+    """The sheet's center and how it hangs, and the rail."""
+    for c in range(3):
+        seen.center[c] = (sheet.summary[CENTROID + c] - own.origin[c]) / rules.side
+        seen.hang[c] = own.hang[c]
+    seen.rail_height = own.rail[2] / rules.side
+    seen.rail_turn[0], seen.rail_turn[1] = own.turn[0], own.turn[1]
+
+
+@inlined
+def _observe_held(own, rules, sheet, seen):
+    """What is observed in both tasks, and what is held."""
+    _observe_rail(own, rules, sheet, seen)
+    observe_held(own, rules, sheet, seen)
 
 
 @inlined
 def _observe_grippers(own, rules, sheet, seen):
     """What is observed in both tasks, and each gripper."""
-    observe_rail(own, rules, sheet, seen)
+    _observe_rail(own, rules, sheet, seen)
     observe_picking(own, rules, sheet, seen)
+
+
+OBSERVATIONS = (
+    Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND),
+    Observation(
+        "hang", "share of the sheet beyond the rail, share on the floor, length that the rail carries [L], at most 1", (3,)
+    ),
+    Observation("rail_height", "height of the rail's axis", (), "L", 2.0),
+    Observation("rail_turn", "cosine and sine of its yaw", (2,)),
+    *TIME,
+)
 
 
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
 
 
-def ways_over(task: HangingTask, hands: NDArray, beside: NDArray) -> tuple[NDArray, NDArray]:
-    """What is left of the way of two hands that carry an edge over the rail [m], in its frame, (num_envs, 2, 3), and whether they
-    are there, (num_envs, 1).
+class RailTask(HangingTask):
+    """Base of both tasks.
 
-    hands: in that frame [m], (num_envs, 2, 3).  beside: of each on the rail, at the end [m], (2,).
+    Attributes:
+        radius: of the rail and its posts, in sides.  rail_friction: between them and the cloth.  rail_thickness: distance at which
+            the cloth rests on them [m]: about the height of the arc over a side of a triangle, so that particles carry the sheet.
     """
-    side = task.physics.side
-    across, above = hands[..., 1].mean(axis=1, keepdims=True), hands[..., 2].min(axis=1, keepdims=True)
-    high = above > EXPERT_CLEARS * side
-    # over it; or, beyond the rail, down
-    down = (across > (EXPERT_BEYOND - 0.04) * side) | ((across > 0.5 * EXPERT_AT * side) & ~high)
-    goal = np.empty_like(hands)
-    goal[..., 0] = beside
-    goal[..., 1] = np.where(down, EXPERT_AT * side, np.where(high, EXPERT_BEYOND * side, hands[..., 1]))
-    goal[..., 2] = np.where(down, -EXPERT_DROP * side, EXPERT_LIFT * side)
-    # on the way down, outside first
-    goal[..., 1] = np.where(down & high, EXPERT_BEYOND * side, goal[..., 1])
-    there = down & (np.abs(above + EXPERT_DROP * side) < 0.02) & (np.abs(across - EXPERT_AT * side) < 0.02)
-    return goal - hands, there
+
+    stand = frame_at = "rail"
+    heights, heights_allowed = (0.75, 1.0), (0.6, 1.2)
+    radius: ClassVar[float] = 0.05
+    rail_friction: ClassVar[float] = FRICTION
+    rail_thickness: ClassVar[float] = 0.006
+    seen_from = View((0.8, -2.0, 1.0), (0.0, -0.15, 0.36), 37.0, scales_from=0.6)
+    points_relative_to = "the middle of the rail"
+    evaluation = (("balance", float), ("support", float), ("lying", float), ("rms_speed", float))
+    ranges: ClassVar = {**HangingTask.ranges, "hang": (-1e-6, 1 + 1e-6), "rail": (-2.0, 2.0)}
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "rail")
+
+    def remembers(self) -> Fields:
+        # how the sheet hangs
+        return [*super().remembers(), ("hang", float, 3)]
+
+    def constants(self) -> dict[str, Any]:
+        side, rest = self.physics.side, self.physics.mesh.rest_positions[:, :2]
+        radius = self.radius * side
+        return super().constants() | {
+            "rest": np.ascontiguousarray(rest, np.float64), "ends": HALF_LENGTH * side, "radius": radius,
+            "carried_within": radius + self.rail_thickness + OVER * side,
+        }  # fmt: skip
+
+    def solids_of(self, at: NDArray, turn: NDArray) -> list[Collider]:
+        """A rail and its posts."""
+        side, friction, thickness = self.physics.side, self.rail_friction, self.rail_thickness
+        radius, half = self.radius * side, HALF_LENGTH * side
+        x, y, z = at.tolist()
+        along = (float(turn[0]), float(turn[1]), 0.0)
+        bar = Capsule(
+            center=(x, y, z), radius=radius, height=2 * (half + radius), axis=along, friction=friction, thickness=thickness
+        )
+        # the lower round end of a post is sunk, and its upper one is the rail's
+        ends = [(x + way * half * along[0], y + way * half * along[1]) for way in (-1, 1)]
+        posts = [
+            Capsule(center=(*end, z / 2), radius=radius, height=z + 2 * radius, friction=friction, thickness=thickness)
+            for end in ends
+        ]
+        return [bar, *posts]
+
+    def stands(self, own: Any) -> bool:
+        return bool(own["rail"][2] > self.radius * self.physics.side)
+
+    def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
+        """Up, over the rail, and down on its other side until half of the sheet is there."""
+        side, mesh = self.physics.side, self.physics.mesh
+        across, above = hands[..., 1].mean(axis=1, keepdims=True), hands[..., 2].min(axis=1, keepdims=True)
+        high = above > EXPERT_CLEARS * side
+        # over it; or, beyond the rail, down
+        down = (across > (EXPERT_BEYOND - 0.04) * side) | ((across > 0.5 * EXPERT_AT * side) & ~high)
+        goal = np.empty_like(hands)
+        goal[..., 0] = mesh.rest_positions[list(mesh.corners[2:]), 0]
+        goal[..., 1] = np.where(down, EXPERT_AT * side, np.where(high, EXPERT_BEYOND * side, hands[..., 1]))
+        goal[..., 2] = np.where(down, -EXPERT_DROP * side, EXPERT_LIFT * side)
+        # on the way down, outside first
+        goal[..., 1] = np.where(down & high, EXPERT_BEYOND * side, goal[..., 1])
+        there = down & (np.abs(above + EXPERT_DROP * side) < 0.02) & (np.abs(across - EXPERT_AT * side) < 0.02)
+        return goal - hands, there, SPEED
 
 
-class HangTask(HangingTask):
+class HangTask(RailTask):
     """The task of ``ClothHang-v0``, see ``ClothHangEnv``."""
 
     physics = replace(draping.PHYSICS, anchors=draping.upper_corners)
     kernels = Kernels(
-        _hanging, hanging.evaluate_hang, _observe_held, act=let_go, measure=measure_hang, done=holds_nothing,
-        account=hanging.account_hang,
+        _hanging, _evaluate, _observe_held, act=let_go, measure=measure_hang, done=holds_nothing, account=_account
     )  # fmt: skip
     acting_steps = 80
-    actions_per_attachment = 4
-    observations = (*hanging.OBSERVATIONS, Observation("holds", "whether each corner is held", (2,)))
-
-    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        self.draw_rail(env, rng, options.get("rail", {}))
-        mesh, side = self.physics.mesh, self.physics.side
-        away, sideways, clearance = side * rng.uniform(0.5, 0.7), side * rng.uniform(-0.15, 0.15), side * rng.uniform(0.1, 0.25)
-        yaw, ripple = rng.uniform(-0.3, 0.3), rng.normal(scale=1e-3, size=mesh.num_particles)
-        # the sheet hangs in a plane before the rail, its held edge up
-        rest = mesh.rest_positions
-        c, s = np.cos(yaw), np.sin(yaw)
-        x = np.stack([c * rest[:, 0] - s * ripple, s * rest[:, 0] + c * ripple, clearance + side / 2 + rest[:, 1]], axis=1)
-        return self.before(env, x, -away, sideways)
-
-    def expert_actions(self) -> NDArray:
-        """Up, over the rail, and down on its other side until half of the sheet is there, then let go.
-
-        Without memory: where the anchors are says which part of the way they are on.
-        """
-        hands = self.episode["targets"]
-        goal, there = ways_over(self, self.in_frame(hands), self.physics.mesh.rest_positions[list(self.physics.held), 0])
-        return as_actions(self, self.out_of_frame(goal) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)))
+    away = (0.5, 0.7)
+    observations = (*OBSERVATIONS, HOLDS)
 
 
-class HangHardTask(HangingTask, FromFloorTask):
+class HangHardTask(RailTask, FromFloorTask):
     """The task of ``ClothHang-Hard-v0``, see ``ClothHangHardEnv``."""
 
-    physics = replace(
-        draping.PHYSICS,
-        mesh=grid(21, 21, 0.8, 0.8),
-        material=chosen_fabric("silk", MEDIAN),
-        grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2,
-        fast={"air_density": 0.0},
-    )
+    physics = LARGE_SILK
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _picking_and_hanging, hanging.evaluate_hang, _observe_grippers, act=take, measure=measure_hang,
-        account=hanging.account_hang, fingers=close_or_open,
+        _picking_and_hanging, _evaluate, _observe_grippers, act=take, measure=measure_hang, account=_account,
+        fingers=close_or_open,
     )  # fmt: skip
     acting_steps = 130
-    radius = 0.035
+    radius = extent = 0.035
     rail_friction = 0.3
     rail_thickness = 0.007
-    observations = (*hanging.OBSERVATIONS, grippers_seen("the middle of the rail"))
-    ranges: ClassVar = {**HangingTask.ranges, **FromFloorTask.ranges}
+    observations = (*OBSERVATIONS, grippers_seen("the middle of the rail"))
+    ranges: ClassVar = {**RailTask.ranges, **FromFloorTask.ranges}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "rail", "rumpled")
 
     @property
@@ -148,18 +295,8 @@ class HangHardTask(HangingTask, FromFloorTask):
         """Both corners of the edge at the rail."""
         return np.array(self.physics.mesh.corners[2:])
 
-    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        self.draw_rail(env, rng, options.get("rail", {}))
-        side = self.physics.side
-        return self.lie(env, rng, options, rumpled_sheets(*self.physics.mesh.grid_shape, side), self.radius * side)
-
-    def expert_actions(self) -> NDArray:
-        """Up with both corners, over the rail, and down on its other side until half of the sheet is there."""
-        hands = self.hands()
-        goal, there = ways_over(self, hands, self.physics.mesh.rest_positions[self.places, 0])
-        # when it hangs, out of its way
-        away = self.out_of_frame(np.where((hands[..., 1] > 0)[..., None], (0.0, 0.1, 0.0), (0.0, 0.0, 0.1)))
-        return carry_by_places(self, self.out_of_frame(goal) / 2, there, away)
+    def leaving(self, hands: NDArray) -> NDArray:
+        return np.where((hands[..., 1] > 0)[..., None], (0.0, 0.1, 0.0), (0.0, 0.0, 0.1))
 
 
 class ClothHangEnv(ClothEnv):
@@ -179,9 +316,6 @@ class ClothHangEnv(ClothEnv):
 
     ## Action Space
     $actions corner
-
-    ## Observation Space
-    $observations
 
     ## Rewards
     $rewards
@@ -208,24 +342,7 @@ class ClothHangEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
     the rail, with a ripple of a millimeter.  The rail's middle is within 0.15 L of the origin in x and y; it is turned by up to
     45 degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HangTask
-
-
-class ClothHangVectorEnv(ClothVectorEnv):
-    """``ClothHang-v0`` as a batch, see ``ClothHangEnv``."""
 
     task_class = HangTask
 
@@ -242,12 +359,6 @@ class ClothHangHardEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -261,23 +372,6 @@ class ClothHangHardEnv(ClothEnv):
     The sheet lies before the rail, all of it 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the side; in
     half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L
     beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HangHardTask
-
-
-class ClothHangHardVectorEnv(ClothVectorEnv):
-    """``ClothHang-Hard-v0`` as a batch, see ``ClothHangHardEnv``."""
 
     task_class = HangHardTask

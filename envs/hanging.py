@@ -1,270 +1,267 @@
-"""What the hanging tasks share: the rail on its posts, how a sheet hangs over it, what is observed, and the evaluation.
+"""What the tasks share in which a sheet is hung on something that stands on the floor, a rail or a hook, and let go.
 
-Their tasks are ``HangingTask``, and name these kernels; the rail of an episode is kept in its record, see ``remembers``.
+A sheet is held by two corners of its upper edge, ``HangingTask``, or lies on the floor, ``FromFloorTask``.  An episode's record
+says where the stand is, and its yaw; its frame is along, across and above it, and the sheet comes from where across is negative.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, inlined
+from clothgym._jit import inlined
 from clothgym.checks import finite, number, shown
-from clothgym.collisions import Capsule, Collider, Plane
-from clothgym.envs.definition import POSITION_BOUND, Observation
+from clothgym.collisions import Collider, Plane
 from clothgym.envs.episode import Fields
-from clothgym.envs.framed import FramedTask
-from clothgym.envs.manipulation import follow
-from clothgym.envs.measures import CENTROID, SPEED2, share_above
+from clothgym.envs.experts import as_actions, carry_by_places
+from clothgym.envs.gripper_task import PickingTask, lying_sheet
+from clothgym.envs.observing import POSITION_BOUND, Observation
+from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
+from clothgym.envs.scoring import FOLLOWED, FOLLOWED_INFO, FOLLOWED_RANGES, follow, grasp, holds_nothing, observe_time
 from clothgym.envs.targets import FRICTION, ON_FLOOR
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
-
-# in sides: half the rail's length between the axes of its posts; heights of its axis; how far its middle is from the origin
-HALF_LENGTH, HEIGHTS, SPREAD = 0.75, (0.75, 1.0), 0.15
-TURN = np.pi / 4  # [rad]: a rail is turned by at most this
-RAIL_SLOT, POSTS = 1, (2, 3)  # places among ``colliders``
+from clothgym.envs.task import Task
 
 LYING = 0.03  # cloth lower than this lies on the floor [m]
-OVER = 0.05  # cloth less than this above the rail's contact surface rests on it, in sides
-GUIDE_SCALE = 0.4  # in sides: how the guidance falls with the center's distance from where it should be
-SPEED_SCALE = 0.1  # [m/s]: performance is halved at this rms speed
-# twice the smaller side's share; in sides; share of the sheet; [m/s]
-ENOUGH_BALANCE, ENOUGH_SUPPORT, MOST_LYING, ENOUGH_REST = 0.6, 0.9, 0.02, 0.02
+MOST_LYING = 0.02  # of a success, as a share of the sheet
+GUIDE_SCALE = 0.4  # in sides: how the guidance falls with the way that is left
+GUIDING = 0.5  # share of the potential that is for bringing the sheet to the stand
+PICKING = 0.2  # share of it that is for taking hold
+SPREAD, TURN = 0.15, np.pi / 4  # how far stands are from the origin along x and y, in sides; and turned at most [rad]
 
 
-# --- how a sheet hangs --------------------------------------------------------------------------------------------------------
-
-
-@apart
-def hang_of(x, triangles, rest, areas, side, rail, turn, ends, low, high, out):
-    """How a sheet hangs over a rail: (share of it beyond the rail, share on the floor, length that the rail carries, in sides).
-
-    The rail's vertical plane cuts the sheet's triangles.  Areas and lengths are those of the flat sheet, by linear functions on the
-    triangles, so that the same surface in other triangles has the same shares.  A point of the cut is carried if it is between
-    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.  A line that halves a square is as
-    long as a side or longer: length beyond that counts for nothing.
-
-    x: (3, particles) [m].  rest: (particles, 2) [m].  areas: of the triangles, summing to 1.  rail: middle of its axis [m].
-    turn: cosine and sine of its yaw.
-    """
-    beyond, lying, carried = 0.0, 0.0, 0.0
-    v, cut, d = np.empty(3), np.empty((2, 4)), np.empty(3)
-    for t in range(triangles.shape[0]):
-        # signed distances from the rail's plane, and the areas
-        for m in range(3):
-            p = triangles[t, m]
-            v[m] = turn[0] * (np.float64(x[1, p]) - rail[1]) - turn[1] * (np.float64(x[0, p]) - rail[0])
-            d[m] = LYING - np.float64(x[2, p])
-        share = share_above(v[0], v[1], v[2])
-        beyond += areas[t] * share
-        lying += areas[t] * share_above(d[0], d[1], d[2])
-        if share == 0 or share == 1:
-            continue
-        # the ends of the cut: along the rail, above it, and in the flat sheet
-        found = 0
-        for m in range(3):
-            n = (m + 1) % 3
-            if (v[m] > 0) != (v[n] > 0):
-                s, p, q = v[m] / (v[m] - v[n]), triangles[t, m], triangles[t, n]
-                for c in range(2):
-                    cut[found, 2 + c] = rest[p, c] + s * (rest[q, c] - rest[p, c])
-                here_x, here_y = x[0, p] + s * (x[0, q] - x[0, p]), x[1, p] + s * (x[1, q] - x[1, p])
-                cut[found, 0] = turn[0] * (here_x - rail[0]) + turn[1] * (here_y - rail[1])
-                cut[found, 1] = x[2, p] + s * (x[2, q] - x[2, p]) - rail[2]
-                found += 1
-        along, above = (cut[0, 0] + cut[1, 0]) / 2, (cut[0, 1] + cut[1, 1]) / 2
-        if abs(along) <= ends and low <= above <= high:
-            carried += np.sqrt((cut[1, 2] - cut[0, 2]) ** 2 + (cut[1, 3] - cut[0, 3]) ** 2)
-    out[0], out[1], out[2] = beyond, lying, min(carried / side, 1.0)
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
 
 
 @inlined
-def measure_hang(own, rules, sheet):
-    """Write how the sheet hangs, see ``hang_of``."""
-    hang_of(
-        sheet.x, sheet.mesh.triangles, rules.rest, rules.areas, rules.side, own.rail, own.turn, rules.ends, 0.0,
-        rules.carried_within, own.hang,
-    )  # fmt: skip
+def guided(guidance, score):
+    """The potential of a held sheet, by how near it is and how well it hangs."""
+    return GUIDING * guidance + (1 - GUIDING) * score
 
 
 @inlined
-def balance_of(own):
-    """Twice the share of the sheet on the smaller side of the rail: 1 for halves."""
-    return 2 * min(own.hang[0], 1 - own.hang[0])
+def picked(own, rules, sheet, potential):
+    """The potential of a sheet from the floor: how far the taking hold is along, and the hanging."""
+    found = 0.0
+    for k in range(rules.places.shape[0]):
+        found += grasp(own.picked[k], rules, sheet, k)
+    return PICKING * (found / rules.places.shape[0]) + (1 - PICKING) * potential
 
 
 @inlined
-def hang_score(own):
-    """How well the sheet hangs, in [0, 1]: 1 for halves on both sides that the rail carries, and nothing on the floor."""
-    return balance_of(own) * own.hang[2] * (1 - own.hang[1])
-
-
-@inlined
-def hangs(own):
-    """Whether it hangs, at rest or not."""
-    return balance_of(own) >= ENOUGH_BALANCE and own.hang[2] >= ENOUGH_SUPPORT and own.hang[1] <= MOST_LYING
-
-
-@inlined
-def guidance(own, rules, sheet):
-    """How near the center of area is to that of a sheet that hangs, in [0, 1]: a quarter of a side below the rail."""
-    x, y = sheet.summary[CENTROID] - own.rail[0], sheet.summary[CENTROID + 1] - own.rail[1]
-    # anywhere along the rail where the sheet does not reach beyond its ends
-    along = max(abs(own.turn[0] * x + own.turn[1] * y) - (rules.ends - rules.side / 2), 0.0)
-    across, up = own.turn[0] * y - own.turn[1] * x, sheet.summary[CENTROID + 2] - own.rail[2] + rules.side / 4
-    return 1 / (1 + (along * along + across * across + up * up) / (GUIDE_SCALE * rules.side) ** 2)
-
-
-@inlined
-def evaluate_hang(own, rules, sheet, info):
-    """Write how the sheet hangs and how much it is at rest; returns the normalized performance."""
-    info.balance, info.support, info.lying = balance_of(own), own.hang[2], own.hang[1]
-    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
-    info.is_success = hangs(own) and info.rms_speed < ENOUGH_REST
-    return hang_score(own) / (1 + (info.rms_speed / SPEED_SCALE) ** 2)
-
-
-@inlined
-def account_hang(own, rules, sheet, info, terms, running, failure):
+def account_hanging(own, rules, sheet, info, score, hangs, running, failure):
     """The episode's best score, and since when the sheet hangs by itself and whether that has lasted; no reward terms."""
-    free = True
-    for k in range(sheet.holds.shape[0]):
-        free = free and sheet.holds[k] == 0
-    follow(own, info, hang_score(own), free and hangs(own), running, failure)
+    follow(own, info, score, holds_nothing(own, rules, sheet) and hangs, running, failure)
     return 0.0
 
 
 @inlined
-def observe_rail(own, rules, sheet, seen):
-    """The sheet's center and how it hangs, the rail, and the time."""
-    for c in range(3):
-        seen.center[c] = (sheet.summary[CENTROID + c] - own.origin[c]) / rules.side
-        seen.hang[c] = own.hang[c]
-    seen.rail_height = own.rail[2] / rules.side
-    seen.rail_turn[0], seen.rail_turn[1] = own.turn[0], own.turn[1]
-    seen.settling = own.settling_since >= 0
-    seen.episode_left = 1 - own.step / (rules.acting_steps + rules.settling_steps)
-    seen.acting_left = max(rules.acting_steps - own.step, 0) / rules.acting_steps
+def observe_held(own, rules, sheet, seen):
+    """The time, and whether each corner is held."""
+    observe_time(own, rules, seen)
+    for k in range(sheet.holds.shape[0]):
+        seen.holds[k] = sheet.holds[k] > 0
 
 
-OBSERVATIONS = (
-    Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND),
-    Observation(
-        "hang", "share of the sheet beyond the rail, share on the floor, length that the rail carries [L], at most 1", (3,)
-    ),
-    Observation("rail_height", "height of the rail's axis", (), "L", 2.0),
-    Observation("rail_turn", "cosine and sine of its yaw", (2,)),
-    Observation("settling", "whether the sheet settles, and actions are ignored"),
-    Observation("episode_left", "share of the episode left"),
-    Observation("acting_left", "share of the acting time left"),
-)
+@inlined
+def observe_picking(own, rules, sheet, seen):
+    """The time, and each gripper: its tip, the way to its corner, its fingers, whether it holds anything."""
+    observe_time(own, rules, seen)
+    for k in range(rules.places.shape[0]):
+        attachment, place = sheet.attachments[k], rules.places[k]
+        for c in range(3):
+            seen.grippers[k, c] = (attachment[c] - own.origin[c]) / rules.side
+            seen.grippers[k, 3 + c] = (sheet.x[c, place] - attachment[c]) * (10 / rules.side)
+        seen.grippers[k, 6], seen.grippers[k, 7] = sheet.openings[k], sheet.holds[k] > 0
+
+
+HOLDS = Observation("holds", "whether each corner is held", (2,))
+
+
+def grippers_seen(frame: str) -> Observation:
+    """What ``observe_picking`` writes of both grippers, relative to the origin of the frame, which is named."""
+    return Observation(
+        "grippers",
+        f"for each gripper its tip relative to {frame} [L], the way from its tip to the corner that it is meant "
+        "to take [L/10], how far open its fingers are, and whether it holds anything",
+        (2, 8),
+        "",
+        (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0, 1.0),
+    )
 
 
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
 
 
-class HangingTask(FramedTask):
-    """Base of the hanging tasks.
+class HangingTask(Task):
+    """Base of the hanging tasks, with starts of a held sheet.
 
     Attributes:
-        radius: of the rail and its posts, in sides.  rail_friction: between them and the cloth.  rail_thickness: distance at which
-            the cloth rests on them [m]: about the height of the arc over a side of a triangle, so that particles carry the sheet.
+        stand: what the sheet is hung on, as ``reset(options=...)`` names it.
+        frame_at: the field of an episode's record that says where that is [m].
+        heights, heights_allowed: of this point above the floor, as drawn, and as options may ask for, in sides.
+        extent: how far the stand reaches across to where the sheet comes from, in sides.
+        away: how far before that the sheet hangs, in sides.
     """
 
-    frame_at = "rail"
-    radius: ClassVar[float] = 0.05
-    rail_friction: ClassVar[float] = FRICTION
-    rail_thickness: ClassVar[float] = 0.006
+    stand: ClassVar[str]
+    frame_at: ClassVar[str]
+    heights: ClassVar[tuple[float, float]]
+    heights_allowed: ClassVar[tuple[float, float]]
+    extent: ClassVar[float] = 0.0
+    away: ClassVar[tuple[float, float]]
+    actions_per_attachment = 4
     settling_steps = 150
-    points_relative_to = "the middle of the rail"
-    evaluation = (("balance", float), ("support", float), ("lying", float), ("rms_speed", float))
-    accounts: ClassVar[Fields] = (("best", float), ("first_success", np.int64), ("success_held", bool))
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {
-        "best": (0.0, 1.0), "first_success": (-1, 10_000), "lost": (0, 1), "turn": (-1.0, 1.0), "hang": (-1e-6, 1 + 1e-6),
-        "rail": (-2.0, 2.0),
-    }  # fmt: skip
-    reset_options: ClassVar[tuple[str, ...]] = ("material", "rail")
+    accounts: ClassVar[Fields] = FOLLOWED_INFO
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**FOLLOWED_RANGES, "turn": (-1.0, 1.0)}
 
     def remembers(self) -> Fields:
-        # the middle of the rail's axis [m], cosine and sine of its yaw, and how the sheet hangs
-        own: Fields = [("rail", float, 3), ("turn", float, 2), ("hang", float, 3)]
-        return [*super().remembers(), *own, ("best", float), ("first_success", np.int64), ("lost", np.uint8)]
-
-    def check_episode(self, env: int, own: Any) -> None:
-        super().check_episode(env, own)
-        if abs(own["turn"] @ own["turn"] - 1) > 1e-9 or own["rail"][2] <= self.radius * self.physics.side:
-            raise ValueError(f"the state's rail {own['rail'].tolist()} or its turn is none: give what get_state() gave")
+        # cosine and sine of the stand's yaw
+        return [*super().remembers(), (self.frame_at, float, 3), ("turn", float, 2), *FOLLOWED]
 
     def constants(self) -> dict[str, Any]:
-        mesh, side = self.physics.mesh, self.physics.side
-        rest = mesh.rest_positions[:, :2]
-        a, b = rest[mesh.triangles[:, 1]] - rest[mesh.triangles[:, 0]], rest[mesh.triangles[:, 2]] - rest[mesh.triangles[:, 0]]
+        mesh = self.physics.mesh
+        a, b = (mesh.rest_positions[mesh.triangles[:, k]] - mesh.rest_positions[mesh.triangles[:, 0]] for k in (1, 2))
         areas = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-        own = {"rest": np.ascontiguousarray(rest, np.float64), "areas": areas / areas.sum(), "ends": HALF_LENGTH * side}
-        radius = self.radius * side
-        return super().constants() | own | {"radius": radius, "carried_within": radius + self.rail_thickness + OVER * side}
+        return super().constants() | {"areas": areas / areas.sum()}
 
-    # --- the rail -------------------------------------------------------------------------------------------------------
+    # --- the stand ------------------------------------------------------------------------------------------------------
+
+    def solids_of(self, at: NDArray, turn: NDArray) -> list[Collider]:
+        """What stands on the floor, with these records."""
+        raise NotImplementedError
 
     def colliders(self) -> list[Collider]:
-        """The floor, the rail and its posts, in whose places each episode has its own."""
+        """The floor, and a stand in whose place each episode has its own."""
         floor = Plane(friction=FRICTION, thickness=ON_FLOOR)
-        return [floor, *self.frame(np.array([0, 0, self.physics.side]), np.array([1.0, 0.0]))]
-
-    def frame(self, rail: NDArray, turn: NDArray) -> list[Collider]:
-        """A rail and its posts, with these records."""
-        side, friction, thickness = self.physics.side, self.rail_friction, self.rail_thickness
-        radius, half = self.radius * side, HALF_LENGTH * side
-        x, y, z = rail.tolist()
-        along = (float(turn[0]), float(turn[1]), 0.0)
-        bar = Capsule(
-            center=(x, y, z), radius=radius, height=2 * (half + radius), axis=along, friction=friction, thickness=thickness
-        )
-        # the lower round end of a post is sunk, and its upper one is the rail's
-        ends = [(x + way * half * along[0], y + way * half * along[1]) for way in (-1, 1)]
-        posts = [
-            Capsule(center=(*end, z / 2), radius=radius, height=z + 2 * radius, friction=friction, thickness=thickness)
-            for end in ends
-        ]
-        return [bar, *posts]
+        return [floor, *self.solids_of(np.array([0, 0, self.physics.side]), np.array([1.0, 0.0]))]
 
     def episode_colliders(self, env: int) -> Mapping[int, Collider]:
         own = self.episode[env]
-        return dict(zip((RAIL_SLOT, *POSTS), self.frame(own["rail"], own["turn"])))
+        return dict(enumerate(self.solids_of(own[self.frame_at], own["turn"]), 1))
+
+    def stands(self, own: Any) -> bool:
+        """Whether there can be what an episode's record says of the stand."""
+        raise NotImplementedError
+
+    def check_episode(self, env: int, own: Any) -> None:
+        super().check_episode(env, own)
+        if abs(own["turn"] @ own["turn"] - 1) > 1e-9 or not self.stands(own):
+            raise ValueError(
+                f"the state's {self.stand} at {own[self.frame_at].tolist()} or its turn is none: give what get_state() gave"
+            )
 
     def check_options(self, options: Mapping[str, Any]) -> None:
         super().check_options(options)
-        wanted, side = options.get("rail", {}), self.physics.side
-        known = ("height", "center", "yaw")
+        what, side = self.stand, self.physics.side
+        wanted, known = options.get(what, {}), ("height", "center", "yaw")
         if not isinstance(wanted, Mapping):
-            raise ValueError(f"reset option rail={shown(wanted)}: must be a dict with any of {', '.join(known)}")
+            raise ValueError(f"reset option {what}={shown(wanted)}: must be a dict with any of {', '.join(known)}")
         unknown = set(wanted) - set(known)
         if unknown:
-            raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option 'rail' (there are: {', '.join(known)})")
-        if not 0.6 * side <= number("rail height", wanted.get("height", side)) <= 1.2 * side:
-            raise ValueError(f"rail height={wanted['height']!r}: must be from {0.6 * side:g} to {1.2 * side:g} m, to hang over")
-        if abs(number("rail yaw", wanted.get("yaw", 0.0))) > np.pi / 2:
-            raise ValueError(f"rail yaw={wanted['yaw']!r}: must be within 90 degrees (pi/2)")
-        center = finite("rail center", wanted.get("center", (0.0, 0.0)))
+            raise ValueError(f"unknown key {sorted(unknown)[0]!r} of the reset option {what!r} (there are: {', '.join(known)})")
+        low, high = (share * side for share in self.heights_allowed)
+        if not low <= number(f"{what} height", wanted.get("height", low)) <= high:
+            raise ValueError(f"{what} height={wanted['height']!r}: must be from {low:g} to {high:g} m, for the sheet to hang")
+        if abs(number(f"{what} yaw", wanted.get("yaw", 0.0))) > np.pi / 2:
+            raise ValueError(f"{what} yaw={wanted['yaw']!r}: must be within 90 degrees (pi/2)")
+        center = finite(f"{what} center", wanted.get("center", (0.0, 0.0)))
         if center.shape != (2,) or np.abs(center).max() > 0.5 * side:
-            raise ValueError(f"rail center={shown(wanted['center'])}: must be two numbers within {0.5 * side:g} m of the origin")
+            raise ValueError(f"{what} center={shown(wanted['center'])}: must be two numbers within {0.5 * side:g} m of the origin")
 
-    def draw_rail(self, env: int, rng: np.random.Generator, wanted: Mapping[str, Any]) -> None:
-        """Draw the rail of an environment's episode, of which some properties may be wanted, and write it into its record."""
-        side, own = self.physics.side, self.episode[env]
-        height, center, yaw = side * rng.uniform(*HEIGHTS), side * rng.uniform(-SPREAD, SPREAD, 2), rng.uniform(-TURN, TURN)
-        x, y = wanted.get("center", center)
-        yaw = float(wanted.get("yaw", yaw))
-        own["rail"] = own["origin"] = x, y, wanted.get("height", height)
+    def draw_stand(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        """Draw an episode's stand, of which the options may want some properties, and write it into its record."""
+        side, own, wanted = self.physics.side, self.episode[env], options.get(self.stand, {})
+        height, center = side * rng.uniform(*self.heights), side * rng.uniform(-SPREAD, SPREAD, 2)
+        yaw = float(wanted.get("yaw", rng.uniform(-TURN, TURN)))
+        own[self.frame_at] = own["origin"] = *wanted.get("center", center), wanted.get("height", height)
         own["turn"] = np.cos(yaw), np.sin(yaw)
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
+    # --- its frame ------------------------------------------------------------------------------------------------------
 
-        far = self.physics.side / 0.6
-        return Camera(eye=(0.8 * far, -2.0 * far, 1.0 * far), target=(0.0, -0.15 * far, 0.36 * far), vertical_fov=37.0)
+    def in_frame(self, points: NDArray) -> NDArray:
+        """World points as along, across and above it [m], (num_envs, points, 3)."""
+        d, (c, s) = points - self.episode[self.frame_at][:, None], self.turns
+        return np.stack([c * d[..., 0] + s * d[..., 1], c * d[..., 1] - s * d[..., 0], d[..., 2]], axis=2)
+
+    def out_of_frame(self, ways: NDArray) -> NDArray:
+        """Ways along, across and above it as ways in the world, (num_envs, ways, 3)."""
+        c, s = self.turns
+        return np.stack([c * ways[..., 0] - s * ways[..., 1], s * ways[..., 0] + c * ways[..., 1], ways[..., 2]], axis=2)
+
+    @property
+    def turns(self) -> tuple[NDArray, NDArray]:
+        """Cosines and sines of the yaws, each (num_envs, 1)."""
+        return self.episode["turn"][:, :1], self.episode["turn"][:, 1:]
+
+    def before(self, env: int, x: NDArray, across: float, along: float) -> NDArray:
+        """A sheet about the origin [m], (particles, 3), turned with the stand and put before it."""
+        own = self.episode[env]
+        c, s = own["turn"]
+        u, v = x[:, 0] + along, x[:, 1] + across
+        return np.stack([own[self.frame_at][0] + c * u - s * v, own[self.frame_at][1] + s * u + c * v, x[:, 2]], axis=1)
+
+    # --- starts and expert ----------------------------------------------------------------------------------------------
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        self.draw_stand(env, rng, options)
+        mesh, side = self.physics.mesh, self.physics.side
+        away, sideways, clearance = side * rng.uniform(*self.away), side * rng.uniform(-0.15, 0.15), side * rng.uniform(0.1, 0.25)
+        yaw, ripple = rng.uniform(-0.3, 0.3), rng.normal(scale=1e-3, size=mesh.num_particles)
+        # the sheet hangs in a plane before the stand, its held edge up
+        rest = mesh.rest_positions
+        c, s = np.cos(yaw), np.sin(yaw)
+        x = np.stack([c * rest[:, 0] - s * ripple, s * rest[:, 0] + c * ripple, clearance + side / 2 + rest[:, 1]], axis=1)
+        return self.before(env, x, -(self.extent * side + away), sideways)
+
+    def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
+        """What is left of the way of two hands that hang the sheet up [m], in the frame, (num_envs, 2, 3); whether they are there,
+        (num_envs, 1); and their speed, as ``as_actions`` takes it.
+
+        hands: in the frame [m], (num_envs, 2, 3).
+        """
+        raise NotImplementedError
+
+    def expert_actions(self) -> NDArray:
+        """To where the sheet hangs, and let go.
+
+        Without memory: where hands and sheet are says which part of the way they are on.
+        """
+        way, there, speed = self.ways(self.in_frame(self.episode["targets"]))
+        return as_actions(self, self.out_of_frame(way) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)), speed)
+
+
+class FromFloorTask(PickingTask, HangingTask):
+    """Base of those in which two grippers pick up their corners of a sheet on the floor, flat or rumpled."""
+
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**PickingTask.ranges, **HangingTask.ranges}
+    no_picks = "what is picked and placed ends on the floor"
+    arguments: ClassVar = {**PickingTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
+
+    def rumpled(self) -> NDArray:
+        """Rumpled sheets about the origin [m], (sheets, particles, 3)."""
+        return rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side)
+
+    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
+        self.draw_stand(env, rng, options)
+        side, sheets = self.physics.side, self.rumpled()
+        gap, sideways, yaw = side * rng.uniform(0.1, 0.2), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
+        x = lying_sheet(rng, sheets, self.physics.mesh, yaw, options)
+        # all of it beside
+        x = self.before(env, x, -x[:, 1].max() - (self.extent * side + gap), sideways)
+        x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
+        self.hover(env, rng, x[self.places])
+        self.episode["picked"][env] = False
+        return x
+
+    def leaving(self, hands: NDArray) -> NDArray:
+        """Ways of hands that have let go, out of the sheet's way, in the frame [m], (num_envs, 2, 3)."""
+        raise NotImplementedError
+
+    def expert_actions(self) -> NDArray:
+        """Up with both corners, to where the sheet hangs, open, and away."""
+        hands = self.in_frame(self.simulation.grippers.positions.astype(np.float64))
+        way, there, speed = self.ways(hands)
+        return carry_by_places(self, self.out_of_frame(way) / 2, there, self.out_of_frame(self.leaving(hands)), speed)

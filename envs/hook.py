@@ -1,51 +1,53 @@
-"""ClothHook-v0 and ClothHook-Hard-v0: hang a sheet by its hole on a hook, held by two corners or lying on the floor, and let go."""
+"""ClothHook-v0 and ClothHook-Hard-v0: hang a sheet by its hole on a hook, held by two corners or lying on the floor, and let go.
+
+A hook is an arm that rises from a post.  In its frame the arm is across from 0 to before it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined
-from clothgym.attachments import Gripper
-from clothgym.envs import draping, hooking
-from clothgym.envs.definition import Observation
-from clothgym.envs.draping import holds_nothing, let_go
-from clothgym.envs.experts import SPEED, as_actions, carry_by_places
-from clothgym.envs.from_floor import (
-    REACH,
+from clothgym._jit import apart, inlined
+from clothgym.collisions import Capsule, Collider
+from clothgym.envs import draping
+from clothgym.envs.draping import let_go
+from clothgym.envs.episode import Fields
+from clothgym.envs.experts import SPEED
+from clothgym.envs.gripper_task import LARGE_SILK, close_or_open, take
+from clothgym.envs.hanging import (
+    GUIDE_SCALE,
+    HOLDS,
+    LYING,
+    MOST_LYING,
     FromFloorTask,
+    HangingTask,
+    account_hanging,
     grippers_seen,
+    guided,
+    observe_held,
     observe_picking,
-    take,
-    taken,
-)
-from clothgym.envs.gripper_task import close_or_open
-from clothgym.envs.hooking import (
-    ARM,
-    POST_RADIUS,
-    RISE,
-    HookingTask,
-    guidance,
-    hook_score,
-    measure_hook,
-    observe_hook,
-    sheet_with_hole,
-)
-from clothgym.envs.physics import MEDIAN, chosen_fabric
+    picked,
+)  # fmt: skip
+from clothgym.envs.measures import SPEED2, distance, share_above
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.rumpled import rumpled_sheets
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, TIME, falloff, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.vector import ClothVectorEnv
+from clothgym.envs.targets import FRICTION
+from clothgym.mesh import ClothMesh, grid
+from clothgym.triangles import triangle_mesh
 
-GUIDING = 0.5  # share of the potential that is for bringing the hole to the hook
-PICKING = 0.2  # share of it that is for taking hold
-ROWS, ROWS_HARD = 17, 21  # of the grids that the sheets are cut from
-SHEET = sheet_with_hole(ROWS, 0.6, 4, 2, below=2)
-SHEET_HARD = sheet_with_hole(ROWS_HARD, 0.8, 2, 2, below=2)
+# in sides: the arm's length; radii of arm and post; height of the post above the arm's root
+ARM, ARM_RADIUS, POST_RADIUS, TOP = 0.3, 0.02, 0.03, 0.3
+RISE = np.pi / 6  # by which the arm rises [rad]
+# distance at which cloth rests on them [m]: the height of the arc over a side of a triangle, so that it does not tremble
+ON_HOOK = 0.01
 
 # the scripted expert, in sides: how far before the tip it brings the hole; how far beside the arm's axis the hole's middle may be
 # on its way along the arm; how near the root that way ends; where the hole's middle is below the axis when it lets go; and how far
@@ -55,139 +57,340 @@ EXPERT_CARRIES = 0.4  # its speed along the arm, as a share of the limit
 EXPERT_GAIN = 0.3  # share of the hole's way that the hands go at once: it swings below them
 
 
+# --- the sheet ----------------------------------------------------------------------------------------------------------------
+
+
+class HoledSheet(NamedTuple):
+    """A square sheet with a rectangular hole.
+
+    mesh: its triangles.  kept: its particles in the grid that it is cut from, (particles,).  rim: its particles around the hole, in
+    order, (rim,).  corners: as a grid's.  key: particles that are observed: corners, middles of the edges, corners of the hole.
+    """
+
+    mesh: ClothMesh
+    kept: NDArray
+    rim: NDArray
+    corners: tuple[int, int, int, int]
+    key: NDArray
+
+
+def sheet_with_hole(rows: int, side: float, width: int, height: int, below: int) -> HoledSheet:
+    """A sheet cut from a square grid of an odd number of rows: without ``width`` x ``height`` of its cells, amid them, ``below`` so
+    many cells from the upper edge; width is even."""
+    whole = grid(rows, rows, side, side)
+    index = np.arange(rows * rows).reshape(rows, rows)
+    left, top = (rows - 1 - width) // 2, rows - 1 - below
+    right, bottom = left + width, top - height
+    # a triangle is in the hole if its middle is
+    row, column = (whole.triangles // rows).mean(axis=1), (whole.triangles % rows).mean(axis=1)
+    hole = (bottom < row) & (row < top) & (left < column) & (column < right)
+    triangles = whole.triangles[~hole]
+    kept = np.unique(triangles)
+    new = np.full(rows * rows, -1)
+    new[kept] = np.arange(len(kept))
+    mesh = triangle_mesh(whole.rest_positions[kept], new[triangles])
+    # around the hole, counter-clockwise
+    rim = np.concatenate([
+        index[bottom, left:right], index[bottom:top, right], index[top, right:left:-1], index[top:bottom:-1, left]
+    ])  # fmt: skip
+    middle, last = rows // 2, rows - 1
+    edges = index[[0, middle, middle, last], [middle, 0, last, middle]]
+    cut = index[[bottom, bottom, top, top], [left, right, left, right]]
+    corners = tuple(int(new[corner]) for corner in whole.corners)
+    return HoledSheet(mesh, kept, new[rim], corners, np.concatenate([corners, new[edges], new[cut]]))  # type: ignore[arg-type]
+
+
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@apart
+def threads(x, rim, a, b):
+    """How often the segment from a to b goes through a hole, less how often it comes back.
+
+    The hole is spanned by the fan of triangles from the mean of its rim to the rim's edges.  A line meets a triangle where it has
+    all three edges on the same side: the signs of three volumes.  Of two triangles that share an edge, both have the same numbers.
+
+    x: (3, particles) [m].  rim: particles around the hole, in order, (rim,).
+    """
+    count, n = 0, rim.shape[0]
+    # all from a: along the segment, and to the hole's middle
+    d, m = (b[0] - a[0], b[1] - a[1], b[2] - a[2]), np.zeros(3)
+    for k in range(n):
+        for c in range(3):
+            m[c] += (np.float64(x[c, rim[k]]) - a[c]) / n
+    q = (x[0, rim[n - 1]] - a[0], x[1, rim[n - 1]] - a[1], x[2, rim[n - 1]] - a[2])
+    for k in range(n):
+        p, q = q, (x[0, rim[k]] - a[0], x[1, rim[k]] - a[1], x[2, rim[k]] - a[2])
+        # volumes that the segment's line makes with the triangle's edges
+        u = _volume(d, p, q)
+        v = _volume(d, q, m)
+        w = _volume(d, m, p)
+        if (u > 0) != (v > 0) or (v > 0) != (w > 0):
+            continue
+        # and whether both ends are on different sides of the triangle: their volumes with it
+        before = _volume(p, q, m)
+        after = before - (u + v + w)
+        if (before > 0) != (after > 0):
+            count += 1 if u > 0 else -1
+    return count
+
+
+@inlined
+def _volume(p, q, r):
+    """Six times the signed volume of the tetrahedron of the origin and three points."""
+    return (
+        p[0] * (q[1] * r[2] - q[2] * r[1]) + p[1] * (q[2] * r[0] - q[0] * r[2]) + p[2] * (q[0] * r[1] - q[1] * r[0])
+    )  # fmt: skip
+
+
+@apart
+def lying_of(x, triangles, areas):
+    """Share of a sheet's area that is lower than ``LYING``; areas: of the flat sheet's triangles, summing to 1."""
+    lying = 0.0
+    for t in range(triangles.shape[0]):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        lying += areas[t] * share_above(LYING - np.float64(x[2, a]), LYING - np.float64(x[2, b]), LYING - np.float64(x[2, c]))
+    return lying
+
+
+@inlined
+def measure_hook(own, rules, sheet):
+    """Write whether the arm is in the hole, the hole's middle and normal, and the share of the sheet on the floor."""
+    # the arm's ends
+    own.tip[0] = own.root[0] + rules.arm_out * own.turn[1]
+    own.tip[1] = own.root[1] - rules.arm_out * own.turn[0]
+    own.tip[2] = own.root[2] + rules.arm_up
+    own.threaded = threads(sheet.x, rules.rim, own.root, own.tip) != 0
+    own.lying = lying_of(sheet.x, sheet.mesh.triangles, rules.areas)
+    # middle of the rim; and the area that it goes around, as a vector
+    n = rules.rim.shape[0]
+    for c in range(3):
+        own.hole[c] = own.facing[c] = 0.0
+    for k in range(n):
+        for c in range(3):
+            own.hole[c] += np.float64(sheet.x[c, rules.rim[k]]) / n
+    for k in range(n):
+        p, q = rules.rim[k], rules.rim[(k + 1) % n]
+        for c in range(3):
+            i, j = (c + 1) % 3, (c + 2) % 3
+            own.facing[c] += (np.float64(sheet.x[i, p]) - own.hole[i]) * (np.float64(sheet.x[j, q]) - own.hole[j])
+            own.facing[c] -= (np.float64(sheet.x[j, p]) - own.hole[j]) * (np.float64(sheet.x[i, q]) - own.hole[i])
+    size = np.sqrt(own.facing[0] ** 2 + own.facing[1] ** 2 + own.facing[2] ** 2)
+    for c in range(3):
+        own.facing[c] /= max(size, 1e-12)
+
+
+@inlined
+def hook_score(own):
+    """The share of the sheet off the floor if the arm is in the hole, else 0."""
+    return 1 - own.lying if own.threaded else 0.0
+
+
+@inlined
+def on_hook(own):
+    """Whether the sheet hangs on the hook, at rest or not."""
+    return own.threaded and own.lying <= MOST_LYING
+
+
+@inlined
+def _guidance(own, rules):
+    """How short the way is that is left to the hole's middle, in [0, 1]: along the arm to its root, from before its tip."""
+    left = distance(own.hole, own.root) if own.threaded else distance(own.hole, own.tip) + rules.arm
+    return 1 / falloff(left, GUIDE_SCALE * rules.side)
 
 
 @inlined
 def _hooking(own, rules, sheet):
-    """How well the sheet hangs, and how near it is to that."""
-    return GUIDING * guidance(own, rules) + (1 - GUIDING) * hook_score(own)
-
-
-@inlined
-def _observe_held(own, rules, sheet, seen):
-    """What is observed in both tasks, and whether each corner is held."""
-    observe_hook(own, rules, sheet, seen)
-    for k in range(sheet.holds.shape[0]):
-        seen.holds[k] = sheet.holds[k] > 0
+    """How well a held sheet hangs, and how near it is to that."""
+    return guided(_guidance(own, rules), hook_score(own))
 
 
 @inlined
 def _picking_and_hooking(own, rules, sheet):
     """How far the taking hold is along, and the hooking."""
-    return PICKING * taken(own, rules, sheet) + (1 - PICKING) * _hooking(own, rules, sheet)
+    return picked(own, rules, sheet, _hooking(own, rules, sheet))
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write how the sheet hangs and how much it is at rest; returns the normalized performance."""
+    info.threaded, info.lying, info.rms_speed = own.threaded, own.lying, np.sqrt(sheet.summary[SPEED2])
+    info.is_success = on_hook(own) and info.rms_speed < ENOUGH_REST
+    return hook_score(own) / falloff(info.rms_speed, SPEED_SCALE)
+
+
+@inlined
+def _account(own, rules, sheet, info, terms, running, failure):
+    """What has become of the score and of a success; no reward terms."""
+    return account_hanging(own, rules, sheet, info, hook_score(own), on_hook(own), running, failure)
+
+
+@inlined
+def _observe_hook(own, rules, sheet, seen):
+    """The hole and the hook, relative to the arm's tip."""
+    for c in range(3):
+        seen.hole[c] = (own.hole[c] - own.tip[c]) / rules.side
+        seen.hole_normal[c] = own.facing[c]
+        seen.arm[c] = (own.root[c] - own.tip[c]) / rules.arm
+    seen.tip_height, seen.threaded, seen.lying = own.tip[2] / rules.side, own.threaded, own.lying
+
+
+@inlined
+def _observe_held(own, rules, sheet, seen):
+    """What is observed in both tasks, and what is held."""
+    _observe_hook(own, rules, sheet, seen)
+    observe_held(own, rules, sheet, seen)
 
 
 @inlined
 def _observe_grippers(own, rules, sheet, seen):
     """What is observed in both tasks, and each gripper."""
-    observe_hook(own, rules, sheet, seen)
+    _observe_hook(own, rules, sheet, seen)
     observe_picking(own, rules, sheet, seen)
+
+
+OBSERVATIONS = (
+    Observation("hole", "middle of the hole's rim, relative to the arm's tip", (3,), "L", POSITION_BOUND),
+    Observation("hole_normal", "unit normal of the hole", (3,)),
+    Observation("arm", "direction of the arm, from its tip to its root, a unit vector", (3,)),
+    Observation("tip_height", "height of the arm's tip", (), "L", 2.0),
+    Observation("threaded", "whether the arm is in the hole"),
+    Observation("lying", "share of the sheet on the floor"),
+    *TIME,
+)
 
 
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
 
 
-def ways_onto(task: HookingTask, hands: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """What is left of the way of two hands that bring the hole onto the arm [m], in the hook's frame, (num_envs, 2, 3); whether
-    they are there, (num_envs, 1); and their speed, as a share of the limit, (num_envs, 1).
+class HookingTask(HangingTask):
+    """Base of both tasks.
 
-    hands: in that frame [m], (num_envs, 2, 3).
+    Attributes:
+        sheet_cut: the sheet, whose mesh is that of ``physics``.
     """
-    side, episode = task.physics.side, task.episode
-    u, v, w = np.moveaxis(task.in_frame(episode["hole"][:, None])[:, 0], 1, 0)
-    out, threaded = ARM * np.cos(RISE) * side, episode["threaded"] == 1
-    # the axis at the hole, and beyond the tip where it would go on
-    axis = -np.minimum(v, 0) * np.tan(RISE)
-    beside = np.hypot(u, w - axis)
-    along = threaded | ((beside < EXPERT_WITHIN * side) & (v < 0))
-    near = threaded & (v > -EXPERT_NEAR * side)
-    # to a point before the tip; along the arm; and down
-    before = out + EXPERT_BEFORE * side
-    goal = np.stack([
-        np.zeros_like(u),
-        np.where(near, v, np.where(along, v + 0.1 * side, np.minimum(v + beside, -before))),
-        np.where(near, axis - 3 * EXPERT_DROP * side, np.where(along, axis - 0.1 * side * np.tan(RISE), before * np.tan(RISE))),
-    ], axis=1)  # fmt: skip
-    common = goal - np.stack([u, v, w], axis=1)
-    # level, and apart
-    middle, aside = hands.mean(axis=1, keepdims=True), np.zeros((2, 3))
-    aside[:, 0] = EXPERT_WIDE * task.physics.mesh.rest_positions[list(task.sheet_cut.corners[2:]), 0]
-    ways = EXPERT_GAIN * common[:, None] + (middle + aside - hands)
-    there = near & (w < axis - EXPERT_DROP * side)
-    return ways, there[:, None], np.where(along, EXPERT_CARRIES, SPEED)[:, None]
+
+    stand, frame_at = "hook", "root"
+    heights, heights_allowed = (1.15, 1.35), (1.1, 1.5)
+    extent = ARM
+    sheet_cut: ClassVar[HoledSheet]
+    seen_from = View((-2.0, -1.5, 1.05), (0.0, -0.3, 0.43), 38.0, scales_from=0.6)
+    points_relative_to = "the arm's tip"
+    key_points = "corners, middles of the edges, and corners of the hole"
+    evaluation = (("threaded", bool), ("lying", float), ("rms_speed", float))
+    ranges: ClassVar = {
+        **HangingTask.ranges, "root": (-2.0, 2.0), "tip": (-2.5, 2.5), "threaded": (0, 1), "lying": (-1e-6, 1 + 1e-6),
+        "facing": (-1.0, 1.0),
+    }  # fmt: skip
+    reset_options: ClassVar[tuple[str, ...]] = ("material", "hook")
+    arguments: ClassVar = {"rows": "none: the sheet has one mesh, of triangles", "side": "none other, as for ``rows``"}
+
+    def remembers(self) -> Fields:
+        # the end of the arm's axis [m]; the hole's middle [m] and normal; and how the sheet hangs
+        own: Fields = [("tip", float, 3), ("hole", float, 3), ("facing", float, 3), ("threaded", np.uint8), ("lying", float)]
+        return [*super().remembers(), *own]
+
+    def constants(self) -> dict[str, Any]:
+        side = self.physics.side
+        own = {"rim": self.sheet_cut.rim, "arm": ARM * side}
+        own |= {"arm_out": ARM * side * float(np.cos(RISE)), "arm_up": ARM * side * float(np.sin(RISE))}
+        return super().constants() | own
+
+    @classmethod
+    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+        return cls.sheet_cut.key
+
+    def tip_of(self, root: NDArray, turn: NDArray) -> NDArray:
+        """Where the arm from this root, turned so, ends [m]."""
+        (c, s), side = turn, self.physics.side
+        return root + ARM * side * np.array([np.cos(RISE) * s, -np.cos(RISE) * c, np.sin(RISE)])
+
+    def solids_of(self, at: NDArray, turn: NDArray) -> list[Collider]:
+        """Arm and post."""
+        side, root, tip = self.physics.side, at, self.tip_of(at, turn)
+        radius, high = POST_RADIUS * side, float(root[2]) + TOP * side
+        arm = Capsule(
+            center=tuple(((root + tip) / 2).tolist()), radius=ARM_RADIUS * side, height=(ARM + 2 * ARM_RADIUS) * side,
+            axis=tuple((tip - root).tolist()), friction=FRICTION, thickness=ON_HOOK,
+        )  # fmt: skip
+        # the lower round end of the post is sunk
+        post = Capsule(
+            center=(float(root[0]), float(root[1]), high / 2), radius=radius, height=high + 2 * radius, friction=FRICTION,
+            thickness=ON_HOOK,
+        )  # fmt: skip
+        return [arm, post]
+
+    def stands(self, own: Any) -> bool:
+        return own["root"][2] > 0 and np.allclose(own["tip"], self.tip_of(own["root"], own["turn"]))
+
+    def draw_stand(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> None:
+        super().draw_stand(env, rng, options)
+        own = self.episode[env]
+        own["tip"] = own["origin"] = self.tip_of(own["root"], own["turn"])
+
+    def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
+        """The hole before the tip, along the arm, and down until the rim lies on it."""
+        side, episode = self.physics.side, self.episode
+        u, v, w = np.moveaxis(self.in_frame(episode["hole"][:, None])[:, 0], 1, 0)
+        out, threaded = ARM * np.cos(RISE) * side, episode["threaded"] == 1
+        # the axis at the hole, and beyond the tip where it would go on
+        axis = -np.minimum(v, 0) * np.tan(RISE)
+        beside = np.hypot(u, w - axis)
+        along = threaded | ((beside < EXPERT_WITHIN * side) & (v < 0))
+        near = threaded & (v > -EXPERT_NEAR * side)
+        # to a point before the tip; along the arm; and down
+        before = out + EXPERT_BEFORE * side
+        goal = np.stack([
+            np.zeros_like(u),
+            np.where(near, v, np.where(along, v + 0.1 * side, np.minimum(v + beside, -before))),
+            np.where(near, axis - 3 * EXPERT_DROP * side, np.where(along, axis - 0.1 * side * np.tan(RISE), before * np.tan(RISE))),
+        ], axis=1)  # fmt: skip
+        common = goal - np.stack([u, v, w], axis=1)
+        # level, and apart
+        middle, aside = hands.mean(axis=1, keepdims=True), np.zeros((2, 3))
+        aside[:, 0] = EXPERT_WIDE * self.physics.mesh.rest_positions[list(self.sheet_cut.corners[2:]), 0]
+        ways = EXPERT_GAIN * common[:, None] + (middle + aside - hands)
+        there = near & (w < axis - EXPERT_DROP * side)
+        return ways, there[:, None], np.where(along, EXPERT_CARRIES, SPEED)[:, None]
 
 
 class HookTask(HookingTask):
     """The task of ``ClothHook-v0``, see ``ClothHookEnv``."""
 
-    sheet_cut = SHEET
-    physics = replace(draping.PHYSICS, mesh=SHEET.mesh, anchors=SHEET.corners[2:], substeps=56)
+    sheet_cut = sheet_with_hole(17, 0.6, 4, 2, below=2)
+    physics = replace(draping.PHYSICS, mesh=sheet_cut.mesh, anchors=sheet_cut.corners[2:], substeps=56)
     kernels = Kernels(
-        _hooking, hooking.evaluate_hook, _observe_held, act=let_go, measure=measure_hook, done=holds_nothing,
-        account=hooking.account_hook,
+        _hooking, _evaluate, _observe_held, act=let_go, measure=measure_hook, done=holds_nothing, account=_account
     )  # fmt: skip
     acting_steps = 100
-    actions_per_attachment = 4
-    observations = (*hooking.OBSERVATIONS, Observation("holds", "whether each corner is held", (2,)))
-
-    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        self.draw_hook(env, rng, options.get("hook", {}))
-        mesh, side = self.physics.mesh, self.physics.side
-        away, sideways, clearance = side * rng.uniform(0.3, 0.5), side * rng.uniform(-0.15, 0.15), side * rng.uniform(0.1, 0.25)
-        yaw, ripple = rng.uniform(-0.3, 0.3), rng.normal(scale=1e-3, size=mesh.num_particles)
-        # the sheet hangs in a plane before the hook, its held edge up
-        rest = mesh.rest_positions
-        c, s = np.cos(yaw), np.sin(yaw)
-        x = np.stack([c * rest[:, 0] - s * ripple, s * rest[:, 0] + c * ripple, clearance + side / 2 + rest[:, 1]], axis=1)
-        return self.before(env, x, -(ARM * side + away), sideways)
-
-    def expert_actions(self) -> NDArray:
-        """The hole before the tip, along the arm, and down until the rim lies on it, then let go.
-
-        Without memory: where the hole is says which part of the way it is on.
-        """
-        goal, there, speed = ways_onto(self, self.in_frame(self.episode["targets"]))
-        return as_actions(self, self.out_of_frame(goal) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)), speed)
+    away = (0.3, 0.5)
+    observations = (*OBSERVATIONS, HOLDS)
 
 
 class HookHardTask(HookingTask, FromFloorTask):
     """The task of ``ClothHook-Hard-v0``, see ``ClothHookHardEnv``."""
 
-    sheet_cut = SHEET_HARD
-    physics = replace(
-        draping.PHYSICS,
-        mesh=SHEET_HARD.mesh,
-        material=chosen_fabric("silk", MEDIAN),
-        grippers=(Gripper(speed=2 * draping.PHYSICS.attachment_speed, reach=REACH),) * 2,
-        substeps=46,
-        fast={"air_density": 0.0},
-    )
+    sheet_cut = sheet_with_hole(21, 0.8, 2, 2, below=2)
+    physics = replace(LARGE_SILK, mesh=sheet_cut.mesh, substeps=46)
     # an agent is never done: it may take hold again until its time is up
     kernels = Kernels(
-        _picking_and_hooking, hooking.evaluate_hook, _observe_grippers, act=take, measure=measure_hook,
-        account=hooking.account_hook, fingers=close_or_open,
+        _picking_and_hooking, _evaluate, _observe_grippers, act=take, measure=measure_hook, account=_account,
+        fingers=close_or_open,
     )  # fmt: skip
     acting_steps = 160
-    observations = (*hooking.OBSERVATIONS, grippers_seen("the arm's tip"))
+    extent = POST_RADIUS + ARM
+    observations = (*OBSERVATIONS, grippers_seen("the arm's tip"))
     ranges: ClassVar = {**HookingTask.ranges, **FromFloorTask.ranges}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "hook", "rumpled")
     arguments: ClassVar = {**HookingTask.arguments, **FromFloorTask.arguments}
-    places = np.array(SHEET_HARD.corners[2:])
+    places = np.array(sheet_cut.corners[2:])
 
-    def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        self.draw_hook(env, rng, options.get("hook", {}))
-        side = self.physics.side
-        sheets = rumpled_sheets(ROWS_HARD, ROWS_HARD, side)[:, self.sheet_cut.kept]
-        return self.lie(env, rng, options, sheets, (POST_RADIUS + ARM) * side)
+    def rumpled(self) -> NDArray:
+        return rumpled_sheets(21, 21, self.physics.side)[:, self.sheet_cut.kept]
 
-    def expert_actions(self) -> NDArray:
-        """Up with both corners, the hole before the tip, along the arm, and down until the rim lies on it."""
-        hands = self.hands()
-        goal, there, speed = ways_onto(self, hands)
+    def leaving(self, hands: NDArray) -> NDArray:
         aside = np.sign(self.physics.mesh.rest_positions[self.places, 0])[:, None] * (0.1, 0.0, 0.0)
-        away = self.out_of_frame(np.broadcast_to(aside, hands.shape))
-        return carry_by_places(self, self.out_of_frame(goal) / 2, there, away, speed)
+        return np.broadcast_to(aside, hands.shape)
 
 
 class ClothHookEnv(ClothEnv):
@@ -208,9 +411,6 @@ class ClothHookEnv(ClothEnv):
 
     ## Action Space
     $actions corner
-
-    ## Observation Space
-    $observations
 
     ## Rewards
     $rewards
@@ -234,24 +434,7 @@ class ClothHookEnv(ClothEnv):
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
     the hook, with a ripple of a millimeter.  The post is within 0.15 L of the origin in x and y; the hook is turned by up to 45
     degrees.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HookTask
-
-
-class ClothHookVectorEnv(ClothVectorEnv):
-    """``ClothHook-v0`` as a batch, see ``ClothHookEnv``."""
 
     task_class = HookTask
 
@@ -268,12 +451,6 @@ class ClothHookHardEnv(ClothEnv):
 
     $physics
 
-    ## Action Space
-    $actions
-
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -287,23 +464,6 @@ class ClothHookHardEnv(ClothEnv):
     The sheet lies before the hook, all of it 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad against it and up to 0.1 L to
     the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut out.  The
     grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above their corners.  The hook is drawn as in ``ClothHook-v0``.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = HookHardTask
-
-
-class ClothHookHardVectorEnv(ClothVectorEnv):
-    """``ClothHook-Hard-v0`` as a batch, see ``ClothHookHardEnv``."""
 
     task_class = HookHardTask

@@ -16,12 +16,12 @@ from clothgym.collisions import Collider, Plane
 from clothgym.envs.episode import Fields
 
 if TYPE_CHECKING:
-    from clothgym.envs.definition import TaskDefinition
+    from clothgym.envs.task import Task
 
 SUNK = 1e-3  # how far below a plane an episode may start: what contact leaves of a sheet at rest [m]
 
 
-def named(task: TaskDefinition | type[TaskDefinition], hook: str) -> str:
+def named(task: Task | type[Task], hook: str) -> str:
     """A method of a task, for messages."""
     return f"{(task if isinstance(task, type) else type(task)).__name__}.{hook}()"
 
@@ -56,14 +56,14 @@ def as_flags(name: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.bool_]
 # --- when a task is made --------------------------------------------------------------------------------------------------------
 
 
-def colliders(task: TaskDefinition) -> list[Collider]:
+def colliders(task: Task) -> list[Collider]:
     """What ``colliders`` returns."""
     made = task.colliders()
     members(named(task, "colliders"), made, Collider, "solids; [] where there are none")
     return list(made)
 
 
-def arena(task: TaskDefinition) -> tuple[NDArray, NDArray]:
+def arena(task: Task) -> tuple[NDArray, NDArray]:
     """What ``arena`` returns."""
     name, corners = named(task, "arena"), task.arena()
     if not isinstance(corners, Sequence | np.ndarray) or len(corners) != 2:
@@ -74,7 +74,7 @@ def arena(task: TaskDefinition) -> tuple[NDArray, NDArray]:
     return low, high
 
 
-def fields(task: TaskDefinition, hook: str, declared: Any, taken: Sequence[str] = ()) -> Fields:
+def fields(task: Task, hook: str, declared: Any, taken: Sequence[str] = ()) -> Fields:
     """Fields that a task declares, ``(name, type)`` or ``(name, type, shape)``; taken: names that all tasks have.
 
     Raises:
@@ -101,7 +101,7 @@ def fields(task: TaskDefinition, hook: str, declared: Any, taken: Sequence[str] 
 # --- when an episode begins -----------------------------------------------------------------------------------------------------
 
 
-def start(task: TaskDefinition, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray[np.float64]:
+def start(task: Task, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray[np.float64]:
     """What ``begin`` returns: a sheet that is nowhere below a floor, (particles, 3).
 
     Raises:

@@ -7,8 +7,8 @@ from a restored state it is drawn as its sheet is then, and a sheet that is not 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from clothgym import _jit
 from clothgym.checks import count, flag, shown
 from clothgym.collisions.solids.shapes import KIND_MESH, R_HALF, R_POINT, R_RADIUS, R_THICKNESS
-from clothgym.envs.definition import TaskDefinition, points_observed
 from clothgym.envs.episode import DIVERGED
 from clothgym.mesh import SHEAR, ClothMesh
 
@@ -25,6 +24,7 @@ if TYPE_CHECKING:
     from clothgym.envs.task import Task
     from clothgym.render import Camera
 
+POSITION_BOUND, VELOCITY_BOUND = 4.0, 5.0  # of observed points, in sides unless a task says otherwise, and in m/s
 PICTURES = ("heightmap", "pointcloud", "rgb", "depth", "rgbd")
 CAMERA = ("rgb", "depth", "rgbd", "pointcloud")  # of these the modes that a camera takes
 LARGEST_PICTURE, MOST_POINTS = 1024, 100_000
@@ -32,6 +32,40 @@ FAR = 2.0  # depths end at so many distances of the camera from its target
 DISTANCE = 3.0  # of the camera straight above the working area, in halves of its side; then it sees 37 degrees
 HIGHEST = 2.0  # heights end so many sides above the arena
 PICTURES_A_THREAD = 4  # fewer are not worth another thread
+
+
+class Observation(NamedTuple):
+    """What is observed beside the points of the sheet: a number, or an array of numbers.
+
+    name: its key in ``observation_slices``.  about, unit: for the page; "L" is the sheet's longer side.  shape: of the array.
+    bound: largest magnitude, one for all or one for each number along the last axis.  function: its values from the task,
+    (num_envs, ...); without one they are the field of ``Task.episode`` of that name, or written by the task's kernel ``observe``.
+    """
+
+    name: str
+    about: str
+    shape: tuple[int, ...] = ()
+    unit: str = ""
+    bound: float | tuple[float, ...] = 1.0
+    function: Callable[[Any], NDArray] | None = None
+
+
+class View(NamedTuple):
+    """Where films see a task from, as ``render.Camera`` takes it; scales_from: the side for which it is, if it scales [m]."""
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    vertical_fov: float
+    scales_from: float | None = None
+
+
+def points_observed(task: Task | type[Task], obs_mode: str, count: int) -> list[Observation]:
+    """What is observed of so many points of the sheet, "particles" or "keypoints": where they are, and their velocities."""
+    what = task.key_points if obs_mode == "keypoints" else "all particles, row by row"
+    return [
+        Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
+        Observation("velocities", "their velocities", (count, 3), "m/s", VELOCITY_BOUND),
+    ]
 
 
 class StateVector:
@@ -43,7 +77,7 @@ class StateVector:
         bound: largest magnitude of each number, float32.
     """
 
-    def __init__(self, task: TaskDefinition, mode: str) -> None:
+    def __init__(self, task: Task, mode: str) -> None:
         mesh = task.physics.mesh
         self.particles = np.arange(mesh.num_particles) if mode == "particles" else task.observed_particles(mesh)
         declared = [*points_observed(task, mode, len(self.particles)), *task.observations]
@@ -108,9 +142,10 @@ class Observer:
         kinds = {"heightmap": quick.HEIGHTS, "pointcloud": quick.POINTS, "rgb": quick.RGB, "depth": quick.DEPTH}
         self._kind = kinds.get(mode, quick.RGBD)
         colliders = task.simulation.colliders
-        own = type(task).solids is TaskDefinition.solids
-        self._shapes = np.array([quick_solids.shape_of(one) for one in colliders] if own else [], np.int64)
-        meshes = [one.surface if one.kind == KIND_MESH else None for one in colliders] if own else []  # type: ignore[attr-defined]
+        self._drawn_by_task = has_own(task, "solids")
+        seen = [] if self._drawn_by_task else colliders
+        self._shapes = np.array([quick_solids.shape_of(one) for one in seen], np.int64)
+        meshes = [one.surface if one.kind == KIND_MESH else None for one in seen]  # type: ignore[attr-defined]
         self._surfaces = quick.surfaces_of(task.physics.mesh.triangles, meshes)
         side = task.physics.side
         if mode == "heightmap":
@@ -195,11 +230,11 @@ class Observer:
         from clothgym.render import quick_solids
 
         task = self.task
-        if type(task).solids is TaskDefinition.solids:
-            parts, shapes = [self._solids(envs)], [self._shapes]
-        else:
+        if self._drawn_by_task:
             parts = [quick_solids.solid_rows([task.solids(env) for env in envs.tolist()])]
             shapes = [np.ones(parts[0].shape[1], np.int64)]
+        else:
+            parts, shapes = [self._solids(envs)], [self._shapes]
         if self.mode in ("rgb", "depth", "rgbd"):
             parts.append(marks(task, envs))
             shapes.append(np.ones(parts[1].shape[1], np.int64))
@@ -229,7 +264,14 @@ def _part(space: gym.spaces.Box, where: slice) -> gym.spaces.Box:
 _NO_COLORS, _NO_NUMBERS = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float32)
 
 
-def marks(task: TaskDefinition, envs: NDArray) -> NDArray:
+def has_own(task: Task, hook: str) -> bool:
+    """Whether a task gives a method that ``Task`` has a default of."""
+    from clothgym.envs.task import Task
+
+    return getattr(type(task), hook) is not getattr(Task, hook)
+
+
+def marks(task: Task, envs: NDArray) -> NDArray:
     """What ``markers`` draws of environments, as rows of ``quick_solids``: by the task's own ``marks``, unless a class derived from
     the one that defines it has given ``markers`` in its place."""
     classes = type(task).__mro__
@@ -241,7 +283,7 @@ def marks(task: TaskDefinition, envs: NDArray) -> NDArray:
     return solid_rows([task.markers(env) for env in envs.tolist()])
 
 
-def checked_camera(task: TaskDefinition, camera: Any) -> Camera:
+def checked_camera(task: Task, camera: Any) -> Camera:
     """Where pictures are taken from.
 
     Raises:

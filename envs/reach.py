@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, vector
 from clothgym.collisions import Collider
-from clothgym.envs.definition import POSITION_BOUND, Observation
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.measures import distance, length_of
+from clothgym.envs.observing import POSITION_BOUND, Observation, View
 from clothgym.envs.physics import MEDIAN, Physics, settled
+from clothgym.envs.scoring import falloff
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import Task
-from clothgym.envs.vector import ClothVectorEnv
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 PINCHED = 1 / 8  # of a side: the corner's triangle that is held there, since a sheet that hangs from a point spins
 NEAR_ENOUGH, SLOW_ENOUGH = 0.05, 0.1  # in sides, and sides a second
@@ -62,13 +59,13 @@ def _nearer(own, rules, sheet):
 @inlined
 def _at_rest(rules, sheet):
     """1 where the free corner is at rest, 1/2 at SPEED_SCALE."""
-    return 1 / (1 + (length_of(sheet.v[:, rules.free]) / (SPEED_SCALE * rules.side)) ** 2)
+    return 1 / falloff(length_of(sheet.v[:, rules.free]), SPEED_SCALE * rules.side)
 
 
 @inlined
 def _potential(own, rules, sheet):
     """How much of the way is done, and how near and at rest the corner is, in [0, 1]."""
-    close = 1 / (1 + (distance(own.goal, sheet.x[:, rules.free]) / (CLOSE_SCALE * rules.side)) ** 2)
+    close = 1 / falloff(distance(own.goal, sheet.x[:, rules.free]), CLOSE_SCALE * rules.side)
     return (_nearer(own, rules, sheet) + close * _at_rest(rules, sheet)) / 2
 
 
@@ -103,6 +100,7 @@ class ReachTask(Task):
         fast={"material": Material.preset("penava_cotton", air_drag=0.72), "air_density": 0.0, "substeps": 50},
     )
     kernels = Kernels(_potential, _evaluate, _observe)
+    seen_from = View((1.5, -1.8, 1.15), (0.0, 0.05, 0.84), 36.0)
     acting_steps = 40
     observations = (
         Observation(
@@ -185,11 +183,6 @@ class ReachTask(Task):
         goal = balls(self.episode["goal"][envs, None], NEAR_ENOUGH * self.physics.side, GOAL)
         return np.concatenate([super().marks(envs), goal], axis=1)
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(1.5, -1.8, 1.15), target=(0.0, 0.05, 0.84), vertical_fov=36.0)
-
 
 @cache
 def hanging(physics: str, rows: int | None = None, side: float | None = None) -> NDArray:
@@ -217,9 +210,6 @@ class ClothReachEnv(ClothEnv):
     ## Action Space
     $actions the driven corner
 
-    ## Observation Space
-    $observations
-
     ## Rewards
     $rewards
 
@@ -237,23 +227,6 @@ class ClothReachEnv(ClothEnv):
     The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
     x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a
     millimeter.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
-
-    task_class = ReachTask
-
-
-class ClothReachVectorEnv(ClothVectorEnv):
-    """``ClothReach-v0`` as a batch, see ``ClothReachEnv``."""
 
     task_class = ReachTask

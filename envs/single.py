@@ -1,7 +1,9 @@
-"""The Gymnasium environment: a task as a batch of one."""
+"""The Gymnasium environment: a task as a batch of one; and what it shares with the vector environment."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import chain, combinations
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -11,7 +13,6 @@ from numpy.typing import NDArray
 from clothgym.checks import numbers
 from clothgym.envs.episode import FAILURES, TaskState
 from clothgym.envs.hooks import expert
-from clothgym.envs.keyboard import actions_of_keys
 from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords, completed
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
@@ -21,14 +22,72 @@ from clothgym.warning import warn_caller
 
 IMAGE_SIZE = 480
 
+# for ``gymnasium.utils.play``: what each key adds to an attachment's action, velocity along x, y and z and what comes after it, by
+# which o opens, or lets go, and c closes
+KEYS = {
+    "d": (1, 0, 0, 0), "a": (-1, 0, 0, 0),
+    "w": (0, 1, 0, 0), "s": (0, -1, 0, 0),
+    "e": (0, 0, 1, 0), "q": (0, 0, -1, 0),
+    "o": (0, 0, 0, 1), "c": (0, 0, 0, -1),
+}  # fmt: skip
 
-class ClothEnv(gym.Env[Any, NDArray]):
+
+class TaskHolder:
+    """What single and vector environments share: a task, and how it is drawn."""
+
+    task_class: ClassVar[type[Task]]
+    metadata: dict[str, Any]
+
+    def _hold(
+        self, num_envs: int, render_mode: str | None, render_color: str, size: tuple[int, int], kwargs: Mapping[str, Any]
+    ) -> None:
+        """Make the task with its keywords, when what concerns pictures has been checked."""
+        check_keywords(self, kwargs)
+        check_render_mode(render_mode, render_color)
+        self.render_mode, self.render_color = render_mode, render_color
+        self.frame_size = checked_frame_size(*size)
+        self.task = self.task_class(num_envs, **kwargs)
+        self.metadata = {**self.metadata, "render_fps": frames_a_second(self.task.step_seconds)}
+        self._renderer: Any = None
+
+    @property
+    def turn(self) -> Turn:
+        """Of the task: one thread at a time is in the environment."""
+        return self.task.turn
+
+    @property
+    def observation_slices(self) -> dict[str, slice]:
+        """Where each observation lies in an environment's state vector, by its name on the page."""
+        return dict(self.task.observation_slices)
+
+    @property
+    def mesh_edges(self) -> NDArray[np.int64]:
+        """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
+        return mesh_edges(self.task.physics.mesh)
+
+    def __getattr__(self, name: str) -> Any:
+        where = ": it is env.unwrapped.task.simulation" if name == "simulation" else ""
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{where}")
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
+        return vars(self) | {"_renderer": None}
+
+    def get_state(self) -> TaskState:
+        """All that is needed to continue the episodes bit for bit."""
+        return self.task.get_state()
+
+    def set_state(self, state: TaskState) -> None:
+        """Continue from what ``get_state`` returned, here or in another environment, or batch, of the same kind and size."""
+        self.task.set_state(state)
+
+
+class ClothEnv(TaskHolder, gym.Env[Any, NDArray]):
     """Base of the single environments; a subclass names its ``Task``, and its docstring is completed by ``pages``.
 
     ``copy.deepcopy`` and ``pickle`` take an environment in the middle of an episode; the copy goes on with the same bits.
     """
 
-    task_class: ClassVar[type[Task]]
     # failures: names of the codes in ``info["failure"]``
     metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 30, "failures": FAILURES}  # noqa: RUF012 - Gymnasium's
 
@@ -47,16 +106,9 @@ class ClothEnv(gym.Env[Any, NDArray]):
         height: int = IMAGE_SIZE,
         **kwargs: Any,
     ) -> None:
-        check_keywords(self, kwargs)
-        check_render_mode(render_mode, render_color)
-        self.render_mode, self.render_color = render_mode, render_color
-        self.frame_size = checked_frame_size(width, height)
-        kwargs.setdefault("threads", 1)
-        self.task = self.task_class(1, **kwargs)
-        self.metadata = self.metadata | {"render_fps": frames_a_second(self.task.step_seconds)}
+        self._hold(1, render_mode, render_color, (width, height), {"threads": 1, **kwargs})
         self.observation_space = self.task.observed.space
         self.action_space = self.task.single_action_space
-        self._renderer: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.task.reset(np.array([0]), [seed], options)
@@ -72,11 +124,6 @@ class ClothEnv(gym.Env[Any, NDArray]):
         brought = task.observed.one(0), reward, terminated, False, task.info_of(0)
         self.turn.unfinished = ()
         return brought
-
-    @property
-    def turn(self) -> Turn:
-        """Of the task: one thread at a time is in the environment."""
-        return self.task.turn
 
     # what Gymnasium's own np_random and np_random_seed read and write: the generator from which the environment draws its episodes
 
@@ -96,27 +143,16 @@ class ClothEnv(gym.Env[Any, NDArray]):
     def _np_random_seed(self, value: Any) -> None:
         self.task.generators.seeds[0] = value
 
-    @property
-    def observation_slices(self) -> dict[str, slice]:
-        """Where each observation lies in the state vector, by its name on the page."""
-        return dict(self.task.observation_slices)
-
-    @property
-    def mesh_edges(self) -> NDArray[np.int64]:
-        """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
-        return mesh_edges(self.task.physics.mesh)
-
     def get_keys_to_action(self) -> dict[str, NDArray]:
-        """For ``gymnasium.utils.play``: what each set of keys does, see ``keyboard``."""
-        return actions_of_keys(self.task.num_attachments, self.task.actions_per_attachment)
+        """For ``gymnasium.utils.play``: the action of every set of ``KEYS``, all attachments at once.
 
-    def __getattr__(self, name: str) -> Any:
-        where = ": it is env.unwrapped.task.simulation" if name == "simulation" else ""
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{where}")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
-        return vars(self) | {"_renderer": None}
+        Also of none: ``play`` does not know how to keep still in a box of numbers.
+        """
+        attachments, numbers = self.task.num_attachments, self.task.actions_per_attachment
+        keys = [key for key, change in KEYS.items() if any(change[:numbers])]
+        sets = chain.from_iterable(combinations(keys, count) for count in range(len(keys) + 1))
+        sums = {"".join(held): np.array([KEYS[key] for key in held], np.float32).reshape(-1, 4).sum(axis=0) for held in sets}
+        return {held: np.tile(change[:numbers], attachments) for held, change in sums.items()}
 
     def expert_action(self) -> NDArray:
         """What the task's scripted expert does now; it sees the whole state."""
@@ -129,11 +165,3 @@ class ClothEnv(gym.Env[Any, NDArray]):
         if self._renderer is None:
             self._renderer = renderer_of(self.task, *self.frame_size)
         return draw(self.task, self._renderer, self.render_mode, [0], self.render_color)[0]
-
-    def get_state(self) -> TaskState:
-        """All that is needed to continue the episode bit for bit."""
-        return self.task.get_state()
-
-    def set_state(self, state: TaskState) -> None:
-        """Continue from what ``get_state`` returned, here or in another environment of the same kind."""
-        self.task.set_state(state)

@@ -7,7 +7,7 @@ Both go through a batch one environment after the other.  What is the task's own
 the fields that the task names; ``rules`` is the task's record of numbers that all environments share; ``move``: the action, within
 [-1, 1], (attachments, numbers).
 
-A task needs none of them: those of ``IN_NUMPY`` read what its methods have written in NumPy, see ``TaskDefinition``.
+A task needs none of them: those of ``IN_NUMPY`` read what its methods have written in NumPy, see ``Task``.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,9 @@ from clothgym import integrators
 from clothgym._jit import inlined
 from clothgym.checks import LARGEST, not_negative, positive, shown
 from clothgym.collisions import Capsule, Collider
-from clothgym.envs import carriers
-from clothgym.envs.definition import Observation
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.measures import FINITE, MOST_STRAIN, distance, largest_strain, length_of, stretch_quantile
+from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import Physics, settled
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
@@ -26,9 +25,6 @@ from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 from clothgym.simulation import GRAVITY
 from clothgym.wind import Wind
-
-if TYPE_CHECKING:
-    from clothgym.render import Camera
 
 FABRIC = Material.preset("knit", damping_time=1e-3)
 WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
@@ -43,6 +39,8 @@ MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
 MOST_PULL = float(np.finfo(float).max)  # [N]: of a sheet that is about to diverge any number
 FAR = 10.0  # bound of observed distances, in sides
+
+CAREFUL_SPEED, CAREFUL_ACCELERATION = 0.5, 2.0  # of the expert [m/s], [m/s^2]
 
 WAYPOINT, GOAL = (150, 160, 175), (90, 170, 110)  # colors of the markers
 
@@ -167,6 +165,7 @@ class StrainTask(Task):
         fast={"substeps": 35},
     )
     kernels = Kernels(_potential, _evaluate, _observe, act=_pass_waypoint, measure=_measure, done=_arrived, account=_account)
+    seen_from = View((-1.75, -1.15, 1.65), (0.05, 0.05, 0.82), 37.0)
     acting_steps = 150
     strain_shown = 0.1
     observations = (
@@ -286,16 +285,14 @@ class StrainTask(Task):
     # --- experts and picture --------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """As a rigid pair, gently, see ``carriers.careful``."""
+        """As a rigid pair, gently, see ``careful``."""
         velocity = self.simulation.velocities[:, [clip[0] for clip in clips(self.physics.mesh)]].astype(np.float64)
         last = self.episode["next"] == WAYPOINTS - 1
-        return self._as_actions(
-            carriers.careful(*self._clips_and_places(), velocity, last, self.physics.side, self.physics.time_step)
-        )
+        return self._as_actions(careful(*self._clips_and_places(), velocity, last, self.physics.side, self.physics.time_step))
 
     def careless_actions(self) -> NDArray:
         """Each clip straight to its place, as fast as it can."""
-        return self._as_actions(carriers.careless(*self._clips_and_places(), self.physics.attachment_speed, self.physics.time_step))
+        return self._as_actions(careless(*self._clips_and_places(), self.physics.attachment_speed, self.physics.time_step))
 
     def _clips_and_places(self) -> tuple[NDArray, NDArray]:
         clips = self.simulation.attachment_positions.astype(np.float64)
@@ -312,15 +309,43 @@ class StrainTask(Task):
         places = balls(self.episode["places"][envs].reshape(len(envs), -1, 3), 0.02, colors, np.repeat(ahead, 2, axis=1))
         return np.concatenate([super().marks(envs), places], axis=1)
 
-    def camera(self) -> Camera:
-        from clothgym.render import Camera  # imported here: training draws nothing
-
-        return Camera(eye=(-1.75, -1.15, 1.65), target=(0.05, 0.05, 0.82), vertical_fov=37.0)
-
 
 def _post(x: float, y: float) -> Capsule:
     # sunk, so that its lower end is flat where it stands
     return Capsule(center=(x, y, POST_HEIGHT / 2 - POST_RADIUS), radius=POST_RADIUS, height=POST_HEIGHT, friction=FRICTION)
+
+
+def careful(clips: NDArray, places: NDArray, velocity: NDArray, last: NDArray, edge: float, time_step: float) -> NDArray:
+    """Velocities of the clips [m/s], (num_envs, 2, 3), as of a rigid pair: a bounded speed and a bounded change of it.
+
+    The held edge is always as long as at rest, and lies along y: clips do not turn, so a pair that did would stretch the cloth
+    between its clips, and places are wide enough without.  Where it is turned, that is undone by the end of the leg.  velocity: of
+    the clips now [m/s]; last: whether the places are the last, (num_envs,), where the pair comes to rest; edge: its length [m].
+    """
+    center, moving = middle(clips), middle(velocity)
+    away = middle(places) - center
+    distance = length(away)
+    slowing = np.where(last, np.sqrt(CAREFUL_ACCELERATION * distance), CAREFUL_SPEED)
+    speed = np.minimum(CAREFUL_SPEED, slowing)
+    change = away * (speed / np.maximum(distance, 1e-9))[:, None] - moving
+    change *= np.minimum(1, CAREFUL_ACCELERATION * time_step / np.maximum(length(change), 1e-9))[:, None]
+    held = clips[:, 0] - clips[:, 1]
+    yaw = np.arctan2(-held[:, 0], held[:, 1])
+    yaw *= 1 - np.minimum(1, time_step / np.maximum(distance / CAREFUL_SPEED, 4 * time_step))
+    half = edge / 2 * np.stack([-np.sin(yaw), np.cos(yaw), np.zeros(len(yaw))], axis=1)
+    there = center + (moving + change) * time_step
+    return (np.stack([there + half, there - half], axis=1) - clips) / time_step
+
+
+def careless(clips: NDArray, places: NDArray, speed: float, time_step: float) -> NDArray:
+    """Velocities of the clips [m/s], (num_envs, 2, 3), each straight to its place at full speed [m/s]."""
+    away = places - clips
+    return away * (speed / np.maximum(length(away), speed * time_step))[..., None]
+
+
+def middle(pairs: NDArray) -> NDArray:
+    """Of what both clips have, (num_envs, 2, ...)."""
+    return (pairs[:, 0] + pairs[:, 1]) / 2
 
 
 @cache
@@ -353,9 +378,6 @@ class ClothStrainEnv(ClothEnv):
     ## Action Space
     $actions the left and then of the right clip
     Clips do not turn.  The post stops them.
-
-    ## Observation Space
-    $observations
 
     ## Rewards and costs
     $rewards
@@ -394,17 +416,6 @@ class ClothStrainEnv(ClothEnv):
     a side that is drawn, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
     goal at x = 0.7 +- 0.1 m, y within 0.3 m, z = 1.05 +- 0.2 m.  The held edge lies along y, at the last two turned by up to
     0.2 rad.
-
-    ## Episode End
-    $episode_end
-
-    ## Arguments
-    $arguments
-
-    $options
-
-    ## Version History
-    * v0: initial version
     """
 
     task_class = StrainTask

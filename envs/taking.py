@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined, kernel
-from clothgym.envs.definition import Observation
-from clothgym.envs.manipulation import CORNERS, REACH
+from clothgym.envs.gripper_task import CORNERS, REACH
 from clothgym.envs.measures import distance, length_of, squared_distance
+from clothgym.envs.observing import Observation
 from clothgym.envs.pick_place import LOWEST
 from clothgym.mesh import ClothMesh
 
@@ -29,6 +29,8 @@ SPAN = 0.1  # by which the ends of an edge that is taken whatever lies on it are
 OUTSIDE = 10.0  # cost of a meter by which an end lies beyond the room; to take the sides costs as much as one meter
 ABOVE = 0.015  # height of a tip above the particle of a side that it takes [m]
 TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
+# heights of a gripper, in sides, above which it has lifted a corner alone, and an edge, high enough
+LIFTED = (0.9, 1.17)
 FLAT = 0.005  # a sheet that covers so much more than is enough is left alone
 NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
 # what a way of one side, and a height of one side, count for in particles that are taken along

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -11,18 +11,16 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from clothgym.checks import count, mask, shown
-from clothgym.envs.episode import FAILURES, TaskState, batch_seeds
+from clothgym.envs.episode import FAILURES, batch_seeds
 from clothgym.envs.hooks import expert
-from clothgym.envs.observing import mesh_edges
-from clothgym.envs.pages import check_keywords
-from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
-from clothgym.envs.task import Task
-from clothgym.exclusive import Turn, exclusive
+from clothgym.envs.pictures import RENDER_MODES, draw, renderer_of
+from clothgym.envs.single import ClothEnv, TaskHolder
+from clothgym.exclusive import exclusive
 
 IMAGE_SIZE = 240
 
 
-class ClothVectorEnv(VectorEnv):
+class ClothVectorEnv(TaskHolder, VectorEnv):
     """Base of the vector environments; a subclass names its ``Task``.
 
     Args:
@@ -37,7 +35,7 @@ class ClothVectorEnv(VectorEnv):
         kwargs: those of the task, see the page of the single environment.
     """
 
-    task_class: ClassVar[type[Task]]
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "failures": FAILURES}  # noqa: RUF012 - Gymnasium's
 
     def __init__(
         self,
@@ -50,7 +48,6 @@ class ClothVectorEnv(VectorEnv):
         max_episode_steps: int | None = None,
         **kwargs: Any,
     ) -> None:
-        check_keywords(self, kwargs)
         self.num_envs = count("num_envs", num_envs)
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -58,21 +55,12 @@ class ClothVectorEnv(VectorEnv):
             known = ", ".join(repr(mode.value) for mode in AutoresetMode)
             raise ValueError(f"autoreset_mode={shown(autoreset_mode)}: must be one of {known}") from None
         self.max_episode_steps = None if max_episode_steps is None else count("max_episode_steps", max_episode_steps, "None, or ")
-        check_render_mode(render_mode, render_color)
-        self.render_mode, self.render_color = render_mode, render_color
-        self.frame_size = checked_frame_size(width, height)
-        self.task = self.task_class(self.num_envs, **kwargs)
-        self.metadata = {
-            "render_modes": RENDER_MODES,
-            "render_fps": frames_a_second(self.task.step_seconds),
-            "autoreset_mode": self.autoreset_mode,
-            "failures": FAILURES,
-        }
+        self._hold(self.num_envs, render_mode, render_color, (width, height), kwargs)
+        self.metadata["autoreset_mode"] = self.autoreset_mode
         self.single_observation_space = self.task.observed.space
         self.single_action_space = self.task.single_action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._renderer: Any = None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -103,11 +91,6 @@ class ClothVectorEnv(VectorEnv):
         brought = self.task.observed.batch(), reward, terminated, truncated, info
         self.turn.unfinished = ()
         return brought
-
-    @property
-    def turn(self) -> Turn:
-        """Of the task: one thread at a time is in the environment."""
-        return self.task.turn
 
     def _truncate(self, over: NDArray) -> None:
         """End the episodes that have reached ``max_episode_steps`` in this step; over: those that had ended before it.
@@ -172,35 +155,18 @@ class ClothVectorEnv(VectorEnv):
         """Their seeds; -1 where a generator's is not known, as after ``set_state``."""
         return tuple(self.task.generators.seeds[env] for env, _ in enumerate(self.np_random))
 
-    @property
-    def observation_slices(self) -> dict[str, slice]:
-        """Where each observation lies in an environment's row of the state vectors, by its name on the page."""
-        return dict(self.task.observation_slices)
-
-    @property
-    def mesh_edges(self) -> NDArray[np.int64]:
-        """Particles at the ends of the structural springs, (edges, 2), for graph networks."""
-        return mesh_edges(self.task.physics.mesh)
-
-    def __getattr__(self, name: str) -> Any:
-        where = ": it is env.unwrapped.task.simulation" if name == "simulation" else ""
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}{where}")
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle holds: all but the renderer, which is made when it is needed."""
-        return vars(self) | {"_renderer": None}
-
     def expert_actions(self) -> NDArray:
         """What the task's scripted expert does now, (num_envs, actions)."""
         return expert(self.task)
 
-    def get_state(self) -> TaskState:
-        """All that is needed to continue the batch bit for bit."""
-        return self.task.get_state()
 
-    def set_state(self, state: TaskState) -> None:
-        """Continue from what ``get_state`` returned, here or in another batch of the same kind and size."""
-        self.task.set_state(state)
+def batched(env_class: type[ClothEnv]) -> type[ClothVectorEnv]:
+    """The batch of a single environment's task: ``ClothReachVectorEnv`` of ``ClothReachEnv``, with its other bases."""
+    name = env_class.__name__.removesuffix("Env") + "VectorEnv"
+    others = [base for base in env_class.__bases__ if base is not ClothEnv]
+    about = f"The task of ``{env_class.__name__}`` as a batch."
+    own = {"__doc__": about, "__module__": env_class.__module__.rpartition(".")[0], "task_class": env_class.task_class}
+    return type(name, (*others, ClothVectorEnv), own)
 
 
 def _only(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:

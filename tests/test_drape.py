@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym import grid
-from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
+from clothgym.envs.episode import TORN
 from clothgym.envs.targets import Target
 
 DRAPE = "clothgym:ClothDrape-v0"
@@ -22,14 +22,14 @@ def start(seed=3, **kwargs):
     return env, observation
 
 
-def potential(env):
+def potential(env, reach=0.15):
     """The potential of the manual page, from positions and the target alone, in float64."""
     task, x = env.task, env.task.simulation.positions[0].astype(float)
     target = task.targets[0]
     points = target.upper_surface(32)
     points = points[np.arange(32) % len(points)]
     nearest = np.min(np.linalg.norm(points[:, None] - x[None], axis=2), axis=1)
-    near = np.mean(1 / (1 + (nearest / (0.15 * SIDE)) ** 2))
+    near = np.mean(1 / (1 + (nearest / (reach * SIDE)) ** 2))
     weights = SHEET.area / SHEET.area.sum()
     off = np.linalg.norm(weights @ x[:, :2] - target.center) / SIDE
     return (near + 1 / (1 + (off / 0.2) ** 2)) / 2
@@ -50,15 +50,6 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
             break
     assert info["is_success"] and info["normalized_performance"] > 0.8
     assert total == pytest.approx(info["normalized_performance"] - before - effort + 0.25, abs=1e-5)
-
-
-def test_the_sparse_reward_is_the_evaluation_alone():
-    env, _ = start(reward_mode="sparse")
-    rewards, terminated = [], False
-    while not terminated:
-        _, reward, terminated, _, info = env.step(env.expert_action())
-        rewards.append(reward)
-    assert rewards[-1] == info["normalized_performance"] > 0.5 and not any(rewards[:-1])
 
 
 def test_no_anchor_moves_faster_than_the_limit_in_any_direction():
@@ -128,18 +119,6 @@ def test_time_is_up_after_60_steps_and_the_evaluation_is_85_later():
         assert info["settling"] == (step >= 60) and terminated == (step == 145)
 
 
-def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
-    env, _ = start()
-    task = env.task
-    task.simulation.reset(positions=task.simulation.positions[0], velocities=(0, -60.0, 20.0))
-    task.simulation.release()
-    for _ in range(20):
-        *_, terminated, _, info = env.step(np.zeros(8))
-        if terminated:
-            break
-    assert info["failure"] == OUT_OF_BOUNDS and info["normalized_performance"] == 0
-
-
 def test_a_sheet_that_still_moves_is_no_success():
     env = gym.make(DRAPE).unwrapped
     env.reset(seed=1, options={"target": {"shape": "box", "radius": 0.12, "center": (0.0, 0.0), "yaw": 0.0}})
@@ -194,18 +173,7 @@ def test_starts_are_drawn_from_the_ranges_of_the_manual_page():
     assert heights.min() >= 0.4 and heights.max() <= 0.6
 
 
-def test_a_refused_reset_leaves_nothing_behind():
-    env = gym.make(DRAPE).unwrapped
-    env.reset(seed=0, options={"material": {"density": 0.3}})
-    with pytest.raises(ValueError, match="cone"):
-        env.reset(seed=0, options={"target": {"shape": "cone"}})
-    for _ in range(2):
-        with pytest.raises(ValueError, match="bend_rigidity"):
-            env.reset(seed=0, options={"material": {"bend_rigidity": 0.1}})
-    env.reset(seed=0)
-    assert env.task.simulation.parameters[0] == pytest.approx([0.197, 300.0, 40.0, 1.39e-5, 1e-4, 1.2, 0.02, 0.394])
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["noop", "random", "hover"])
 def test_cheats_do_not_pay(policy):
     """Doing nothing, flailing, or holding the sheet over the target until time is up."""
@@ -226,6 +194,7 @@ def test_cheats_do_not_pay(policy):
     assert over.all() and success.mean() < 0.05
 
 
+@pytest.mark.slow
 def test_the_expert_succeeds():
     env = gym.make_vec(DRAPE, num_envs=40, autoreset_mode="Disabled")
     env.reset(seed=500)
@@ -237,25 +206,6 @@ def test_the_expert_succeeds():
 
 
 # --- options and failures -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("target", "name"),
-    [
-        ({"shape": "cone"}, "cone"),
-        ({"size": 1}, "size"),
-        ({"radius": -1.0}, "radius"),
-        ({"radius": "wide"}, "radius"),
-        ({"center": (5.0, 5.0)}, "center"),
-        ({"center": 0.1}, "center"),
-        ({"shape": "box", "yaw": 3.0}, "yaw"),
-        ("sphere", "target"),
-    ],
-)
-def test_bad_targets_are_named(target, name):
-    env = gym.make(DRAPE)
-    with pytest.raises(ValueError, match=name):
-        env.reset(seed=0, options={"target": target})
 
 
 def test_a_target_is_obeyed_for_one_episode():
@@ -274,14 +224,3 @@ def test_pulling_the_corners_apart_tears():
         if terminated:
             break
     assert info["failure"] == TORN and info["strain_max"] > 1 and not info["is_success"]
-
-
-def test_a_new_episode_begins_with_both_corners_held():
-    env = gym.make_vec(DRAPE, num_envs=2)
-    env.reset(seed=0)
-    terminated = np.zeros(2, bool)
-    while not terminated.any():
-        *_, terminated, _, info = env.step(np.ones((2, 8)))
-    assert info["settling"].all() and not env.unwrapped.task.simulation.attached.any()
-    *_, info = env.step(np.ones((2, 8)))
-    assert env.unwrapped.task.simulation.attached.all()

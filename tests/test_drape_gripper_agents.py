@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from test_drape_gripper import ACTING, CORNERS, SIDE, STEPS, batch, evaluation, fetched, play, positions, start, stretch
+from test_drape_gripper import ACTING, CORNERS, SIDE, STEPS, batch, evaluation, fetched, play, positions
 
-from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
+from clothgym.envs.episode import OUT_OF_BOUNDS
 
 # --- who succeeds, and who cheats -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_expert_succeeds_on_flat_and_on_rumpled_sheets():
     env = batch(30, seed=500)
     rumpled = np.ptp(positions(env)[:, :, 2], axis=1) > 0.01
@@ -23,6 +24,7 @@ def test_who_never_moves_scores_nothing():
     assert not last["normalized_performance"].any() and not last["is_success"].any() and not any(last["failure"])
 
 
+@pytest.mark.slow
 def test_fingers_that_cannot_hold_the_weight_never_lift_the_sheet():
     env = batch(4, options={"rumpled": False}, slip_force=1e-3)
     height = []
@@ -37,6 +39,7 @@ def test_fingers_that_cannot_hold_the_weight_never_lift_the_sheet():
     assert play(firm, lambda env, step: env.unwrapped.expert_actions())["is_success"].any()
 
 
+@pytest.mark.slow
 def test_who_holds_the_sheet_over_the_target_to_the_end_is_evaluated_by_how_it_falls():
     """The fingers open by themselves; nothing that is held is ever evaluated, and the sheet is where it fell."""
     env = batch(6, seed=3)
@@ -57,6 +60,7 @@ def test_who_holds_the_sheet_over_the_target_to_the_end_is_evaluated_by_how_it_f
         assert last["normalized_performance"][i] == pytest.approx(performance, abs=1e-5) and last["is_success"][i] == success
 
 
+@pytest.mark.slow
 def test_a_sheet_dropped_beside_the_target_scores_next_to_nothing():
     env, policy = batch(6, seed=3), fetched((1.0, 0.0, 0.2))
     last = play(env, policy)
@@ -64,28 +68,10 @@ def test_a_sheet_dropped_beside_the_target_scores_next_to_nothing():
     assert np.all(last["off_center"] > 0.5)
 
 
+@pytest.mark.slow
 def test_a_sheet_dragged_to_the_end_of_the_arena_scores_nothing():
     env, policy = batch(6, seed=3), fetched((0.0, -5.0, 0.1))
     last = play(env, policy)
     assert np.all(positions(env)[:, CORNERS, 1].mean(axis=1) < -0.9)
     assert not last["normalized_performance"].any() and not last["is_success"].any()
     assert set(last["failure"]) <= {0, OUT_OF_BOUNDS}
-
-
-def test_a_sheet_thrown_out_of_the_arena_ends_the_episode():
-    env, _ = start()
-    env.task.simulation.reset(positions=positions(env)[0], velocities=(0, -60.0, 20.0))
-    for _ in range(20):
-        _, reward, terminated, _, info = env.step(np.zeros(8))
-        if terminated:
-            break
-    assert info["failure"] == OUT_OF_BOUNDS and info["normalized_performance"] == 0 and not info["is_success"]
-    assert reward < -0.5
-
-
-def test_pulling_the_corners_apart_tears():
-    env, terminated = start(options={"rumpled": False})[0], False
-    while not terminated:
-        held = np.all(env.get_state().simulation.holder[0, CORNERS] >= 0)
-        *_, terminated, _, info = env.step(np.array([-1, 0, 0, -1, 1, 0, 0, -1.0]) if held else env.expert_action())
-    assert info["failure"] == TORN and not info["is_success"] and stretch(positions(env)[0]).max() > 2

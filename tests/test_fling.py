@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from clothgym.envs.fling_starts import held_sheets
+from clothgym.envs.fling import held_sheets
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE
 from clothgym.envs.taking import next_edges_of, next_takes_of
 
@@ -119,6 +119,7 @@ def test_a_gripper_takes_hold_once_in_a_throw_and_there_is_no_fourth_throw():
     assert not taken.any() and throws == 3 and np.all(task.simulation.grippers.openings == 1)
 
 
+@pytest.mark.slow
 def test_the_expert_flings_and_the_coverage_after_each_throw_is_that_of_the_triangles():
     env = batch()
     env.reset(seed=SEEDS)
@@ -154,6 +155,7 @@ def test_the_expert_flings_and_the_coverage_after_each_throw_is_that_of_the_tria
     assert held.max() > start.max()
 
 
+@pytest.mark.slow
 def test_slow_hands_do_not_lay_the_sheet_down():
     env = batch()
     env.reset(seed=SEEDS)

@@ -25,8 +25,7 @@ def laid(points, height=0.004, turn=0.0, shift=(0.0, 0.0)):
     return np.ascontiguousarray(x + np.array([*shift, 0.0])[:, None], np.float32)
 
 
-@pytest.mark.parametrize("rows", [13, 25, 49])
-@pytest.mark.parametrize("edge", [0, 1, 2, 3])
+@pytest.mark.parametrize(("rows", "edge"), [(13, 0), (25, 1), (49, 2), (13, 3)])
 def test_a_perfect_half_fold_has_no_error_wherever_it_lies_and_over_whatever_edge(rows, edge):
     _, flat, share = sheet(rows)
     axis, sign = edge // 2, 1 - 2 * (edge % 2)
@@ -97,6 +96,7 @@ def episodes(count, seed=1_000_000, still=False, env_id=ID, **kwargs):
     return info, highest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fold, error", [("half", 2), ("diagonal", 12), ("quarter", 22)])
 def test_the_expert_folds(fold, error):
     info, _ = episodes(4, fold=fold)
@@ -105,6 +105,7 @@ def test_the_expert_folds(fold, error):
     assert np.allclose(info["fold_error_mm"], 1000 * SIDE * info["fold_error"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fold, actions", [("half", 1), ("quarter", 2)])
 def test_the_expert_folds_by_picking_and_placing(fold, actions):
     env = gym.make_vec(ID, num_envs=2, autoreset_mode="Disabled", fold=fold, action_mode="pick_place")
@@ -117,11 +118,13 @@ def test_the_expert_folds_by_picking_and_placing(fold, actions):
     assert np.all(placed == 1)
 
 
+@pytest.mark.slow
 def test_what_was_pressed_together_does_not_jump_when_it_is_let_go():
     """Impulses that had borne what the fingers pressed threw it up by half a meter."""
     assert episodes(2, seed=1_000_006, fold="quarter")[1] < 0.15
 
 
+@pytest.mark.slow
 def test_the_expert_folds_a_large_sheet_of_silk_twice():
     info, _ = episodes(4, env_id=ID.replace("-v0", "-Hard-v0"))
     assert info["is_success"].sum() >= 3 and info["fold_error_mm"].max() < 45 and not info["failure"].any()

@@ -6,7 +6,7 @@ import pickle
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_envs import drawn, every_task, flat, make, make_vec, skip, still
+from test_envs import drawn, every_task, flat, make, make_vec, skip, still, two_tasks
 
 from clothgym import Material, grid
 from clothgym.envs import ClothEnv, ClothVectorEnv, Physics, Task, TaskState
@@ -212,7 +212,7 @@ def test_an_answer_goes_with_the_state(carried, tmp_path):
     assert branches.step(still(branches))[2].all()
 
 
-@every_task
+@two_tasks
 def test_a_single_environment_stepped_after_its_end(env_id):
     env = make(env_id).unwrapped
     env.reset(seed=3)

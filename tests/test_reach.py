@@ -74,15 +74,6 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
     assert total == pytest.approx(info["normalized_performance"] - before - effort + 0.25 * info["is_success"], abs=1e-5)
 
 
-def test_the_sparse_reward_is_the_evaluation_alone():
-    env, _ = start(reward_mode="sparse")
-    rewards = []
-    for _ in range(STEPS):
-        _, reward, _, _, info = env.step(env.expert_action())
-        rewards.append(reward)
-    assert rewards[-1] == info["normalized_performance"] > 0.9 and not any(rewards[:-1])
-
-
 def test_a_failure_costs_the_potential_and_a_half():
     env, _ = start()
     d0, _ = corner(env)

@@ -28,10 +28,10 @@ from strain_truths import (
     strains,
     to_places,
     whole_way,
-)
+)  # fmt: skip
 
 from clothgym import INTEGRATORS
-from clothgym.envs.episode import OUT_OF_BOUNDS, TORN
+from clothgym.envs.episode import TORN
 
 # --- strain and cost ------------------------------------------------------------------------------------------------------
 
@@ -146,8 +146,7 @@ def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices
     assert total == pytest.approx(performance - effort + 0.25 * info["is_success"], abs=1e-5)
 
 
-@pytest.mark.parametrize("reward_mode", ["delta", "sparse"])
-@pytest.mark.parametrize("policy", ["careless", "random"])
+@pytest.mark.parametrize(("policy", "reward_mode"), [("careless", "delta"), ("random", "sparse")])
 def test_the_penalty_is_taken_from_the_reward_and_at_a_failure_for_all_steps_that_are_left(policy, reward_mode):
     price, rng = 0.3, np.random.default_rng(0)
     env, plain = batch(5, seed=7, cost_penalty=price, reward_mode=reward_mode), batch(5, seed=7, reward_mode=reward_mode)
@@ -188,8 +187,7 @@ def test_the_penalty_may_be_set_at_any_time_but_not_to_nonsense():
 # --- the way --------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("policy", ["expert", "careless"])
+@pytest.mark.parametrize(("policy", "seed"), [("expert", 0), ("careless", 1)])
 def test_way_points_are_passed_within_a_tenth_of_a_metre_and_the_goal_reached_within_0_15_sides(policy, seed):
     env, _ = start(seed=seed)
     following, passed, terminated = 0, [], False
@@ -288,13 +286,6 @@ def test_the_observation_is_what_the_manual_page_says(next_one):
     assert observation[69:72] == pytest.approx(env.get_state().simulation.wind[0], abs=1e-6) and np.any(observation[69:72])
 
 
-def test_particles_may_be_observed():
-    env, observation = start(seed=8, obs_mode="particles")
-    assert observation.shape == (6 * 169 + 24,)
-    middle = env.task.episode["places"][0, 0].mean(axis=0)
-    assert observation[: 3 * 169] == pytest.approx(((positions(env)[0] - middle) / SIDE).ravel(), abs=2e-5)
-
-
 def test_starts_are_drawn_as_the_manual_page_says():
     env = batch(150)
     task, x = env.unwrapped.task, positions(env)
@@ -314,26 +305,18 @@ def test_starts_are_drawn_as_the_manual_page_says():
     assert corners.mean(axis=1)[:, 0] == pytest.approx(-0.65, abs=0.11)
     assert np.all(task.simulation.contacts().distance > 0.1)
     assert strains(x).max() < 0.08
-
-
-def test_the_wind_differs_between_environments():
-    env = batch(40)
-    wind = env.get_state().episode["wind"]
+    # a steady wind of up to 1 m/s, with gusts of 0.3 m/s
+    wind = task.get_state().episode["wind"]
     steady = np.linalg.norm(wind.mean(axis=1)[:, :2], axis=1)
-    assert len(np.unique(steady)) == 40 and steady.min() < 0.3 and 0.7 < steady.max() < 1.5
-    env.step(np.zeros((40, 6)))
-    blows = env.get_state().simulation.wind
-    assert len(np.unique(blows, axis=0)) == 40
-    assert np.array_equal(blows, wind[:, 0].astype(np.float32))
-    gusts = wind - wind.mean(axis=1, keepdims=True)
-    assert 0.2 < np.sqrt(np.mean(gusts**2)) < 0.35
+    assert len(np.unique(steady)) == 150 and steady.min() < 0.3 and 0.7 < steady.max() < 1.5
+    assert 0.2 < np.sqrt(np.mean((wind - wind.mean(axis=1, keepdims=True)) ** 2)) < 0.35
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("value", [0.1, 0, 1.0])
-def test_a_strain_limit_is_refused_in_a_sentence(value):
+def test_a_strain_limit_is_refused_in_a_sentence():
+    value = 0
     with pytest.raises(ValueError, match=f"strain_limit={value}: a limiter would keep the strain below the threshold"):
         gym.make(STRAIN, strain_limit=value)
     with pytest.raises(ValueError, match="take an integrator without one"):
@@ -369,6 +352,7 @@ def test_bad_arguments_are_named(name, value):
 # --- who succeeds, and who cheats -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_expert_arrives_in_time_and_hardly_ever_stretches_the_sheet():
     last = play(lambda env: env.unwrapped.expert_actions())
     assert last["is_success"].all() and last["steps"].max() < STEPS
@@ -376,18 +360,21 @@ def test_the_expert_arrives_in_time_and_hardly_ever_stretches_the_sheet():
     assert np.array_equal(last["is_safe_success"], last["episode_cost"] == 0) and last["is_safe_success"].mean() > 0.8
 
 
+@pytest.mark.slow
 def test_the_careless_one_arrives_sooner_and_pays():
     last = play(careless)
     assert last["is_success"].all() and last["steps"].max() < 80
     assert last["episode_cost"].mean() > 5 and not last["is_safe_success"].any()
 
 
+@pytest.mark.slow
 def test_random_actions_never_arrive():
     rng = np.random.default_rng(0)
     last = play(lambda env: rng.uniform(-1, 1, (20, 6)))
     assert not last["is_success"].any() and last["normalized_performance"].max() < 0.1
 
 
+@pytest.mark.slow
 def test_who_never_moves_scores_nothing_and_pays_next_to_nothing():
     last = play(lambda env: np.zeros((20, 6)))
     assert np.all(last["steps"] == STEPS) and not any(last["failure"])
@@ -409,21 +396,6 @@ def test_pulling_the_clips_apart_costs_every_step_until_the_sheet_tears(speed):
     assert all(costs[first:]) and len(costs) - first >= 2 and first * speed * STEP < 0.2 * SIDE
     assert costs[-1] == 1 + STEPS - len(costs) and sum(costs) == info["episode_cost"] == STEPS - first
     assert total < -0.1 * (STEPS - first) - 0.5
-
-
-def test_a_sheet_driven_to_the_wall_is_no_success():
-    last = play(lambda env: np.tile([1.0, 1.0, 0, 1.0, 1.0, 0], (8, 1)), num_envs=8)
-    assert not last["is_success"].any() and last["normalized_performance"].max() < 0.8
-
-
-def test_a_sheet_out_of_bounds_ends_the_episode_without_success():
-    env, _ = start(cost_penalty=0.5)
-    env.task.simulation.reset(positions=positions(env)[0] + (0, 2.5, 0))
-    env.task.simulation.release()
-    _, reward, terminated, _, info = env.step(np.zeros(6))
-    assert terminated and info["failure"] == OUT_OF_BOUNDS
-    assert not info["is_success"] and info["normalized_performance"] == 0
-    assert reward == pytest.approx(-0.5 - 0.5 * (STEPS - 1), abs=1e-3)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.03, 0.08])

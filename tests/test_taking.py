@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import clothgym  # noqa: F401
-from clothgym.envs.manipulation import REACH
+from clothgym.envs.gripper_task import REACH
 from clothgym.envs.taking import AWAY, CLEAR, beside_corners, next_edge, next_takes, places_to_take
 from clothgym.mesh import grid
 

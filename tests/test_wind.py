@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_envs import every_task
+from test_envs import every_task, two_tasks
 
 from clothgym import INTEGRATORS, Material, Simulation, State, Wind, grid
 from clothgym.mesh import STRUCTURAL_X, ClothMesh, Springs, colored_hinges
@@ -305,7 +305,7 @@ def test_wind_blows_in_every_environment(env_id):
     assert own.unwrapped.task.simulation.air_density == own.unwrapped.task.physics.air_density
 
 
-@every_task
+@two_tasks
 def test_winds_differ_within_a_batch_and_are_the_same_for_the_same_seed(env_id):
     env, single = make_vec(env_id, 4), gym.make(f"clothgym:{env_id}", wind=BREEZE).unwrapped
     env.reset(seed=7)
@@ -326,7 +326,7 @@ def test_winds_differ_within_a_batch_and_are_the_same_for_the_same_seed(env_id):
         assert np.array_equal(np.concatenate([state.wind, state.positions[:, 5]], axis=1)[0], first[step, 2])
 
 
-@every_task
+@two_tasks
 def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
     """Through the end of the episode into the next one, whose wind is drawn again."""
     env, other = make_vec(env_id, 2), make_vec(env_id, 2)
@@ -342,23 +342,10 @@ def test_the_wind_goes_on_bit_for_bit_from_a_restored_state(env_id):
     assert not np.array_equal(state.episode["wind"], env.get_state().episode["wind"])
 
 
-@every_task
-@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
-def test_a_batch_with_wind_goes_on_after_an_episode_s_end(env_id, mode):
-    env = make_vec(env_id, 2, autoreset_mode=mode, wind={"gust": 0.1})
-    env.reset(seed=0)
-    env.unwrapped.task.episode["step"][0] += 3
-    ends = 0
-    for _ in range(env.unwrapped.task.acting_steps + env.unwrapped.task.settling_steps + 3):
-        ends += env.step(np.zeros(env.action_space.shape))[2].any()
-    assert ends
-
-
-@every_task
 @pytest.mark.parametrize(
     ("wind", "name"),
-    [*BAD_WINDS, ({"force": 3}, "speed, direction, gust, gust_time"), (3.0, "wind=3.0"), ("strong", "wind='strong'")],
+    [BAD_WINDS[0], ({"force": 3}, "speed, direction, gust, gust_time"), (3.0, "wind=3.0"), ("strong", "wind='strong'")],
 )
-def test_bad_winds_of_environments_are_named(env_id, wind, name):
+def test_bad_winds_of_environments_are_named(wind, name):
     with pytest.raises(ValueError, match=name):
-        gym.make(f"clothgym:{env_id}", wind=wind)
+        gym.make("clothgym:ClothDrape-v0", wind=wind)
