@@ -15,26 +15,33 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 from clothgym import _jit
 
 PROCESSES = "CLOTHGYM_COMPILE_PROCESSES"
-_running: list[subprocess.Popen] = []
+_started: list[dict[str, Any]] = []  # scenes whose kernels this process has another compile
 
 
 def start(scene: dict[str, Any]) -> None:
     """Compile what a scene needs in another process, unless there is one processor or this is that process; see ``run``."""
     wanted = os.environ.get(PROCESSES, "2")
-    if wanted == "1" or _running or _jit.WITHOUT_JIT or not sys.executable or _jit.default_threads() < 2:
+    able = sys.executable and not getattr(sys, "frozen", False) and not _jit.WITHOUT_JIT and _jit.default_threads() > 1
+    if wanted == "1" or _started or not able:
         return
+    with _jit.cache_folder().only_one("ahead") as alone:
+        if not alone:
+            return
     paths = filter(None, [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")])
     surroundings = os.environ | {PROCESSES: "1", "PYTHONPATH": os.pathsep.join(paths)}
     command, quiet = [sys.executable, "-m", "clothgym.ahead", json.dumps(scene)], subprocess.DEVNULL
     # where no more processes are allowed the caller compiles all
     with contextlib.suppress(OSError):
-        _running.append(subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, env=surroundings))
+        child = subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, env=surroundings)
+        threading.Thread(target=child.wait, daemon=True).start()
+        _started.append(scene)
 
 
 def run(scene: dict[str, Any]) -> None:

@@ -128,6 +128,7 @@ class Attachments:
         self.x, self.targets = blocks(state.attachment_positions, dtype), blocks(state.attachment_targets, dtype)
         self.opening, self.wanted = blocks(state.openings, dtype), blocks(state.wanted_openings, dtype)
         self.holder = blocks(state.holder, np.dtype(np.int32))
+        self.blocked[:] = False
 
     def public(self) -> dict[str, NDArray]:
         """The attachments as fields of a ``State``; fresh copies."""
@@ -401,13 +402,12 @@ def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step
     it.
 
     If nothing is in its way this is its target.  tips, targets, allowed: [m], (blocks, attachments, 3, lanes).  blocked: (blocks,
-    attachments, lanes).  colliders, shapes: see ``collisions.Solids``.  (A part of ``steer`` would be compiled again with each of
-    its callers.)
+    attachments, lanes).  colliders, shapes: see ``collisions.Solids``.
     """
     # scratch: a point and a collider in a single lane; position and displacement of the attachment
     one = x.dtype.type(1)
     point, rows, scratch = np.empty((3, 1, 1), x.dtype), np.empty((COLLIDER_ROWS, 1), x.dtype), np.empty((SCRATCH_ROWS, 1), x.dtype)
-    tip, way = np.empty(3, x.dtype), np.empty(3, x.dtype)
+    tip, way, left = np.empty(3, x.dtype), np.empty(3, x.dtype), np.empty(3, x.dtype)
     for b in range(first, last):
         for k in range(tips.shape[1]):
             for l in range(x.shape[3]):
@@ -429,6 +429,19 @@ def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step
                         for c in range(3):
                             tip[c] = x[b, c, p, l]
                         changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, scratch)
+                # solids that push back in turn may push into each other, as in a sharp corner: then it stays
+                if changed:
+                    for c in range(3):
+                        tip[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
+                        left[c] = way[c]
+                    caught = keep_out(tip, left, colliders[b], shapes, l, time_step, point, rows, scratch)
+                    for p in range(x.shape[2]):
+                        if holder[b, p, l] == k and not caught:
+                            for c in range(3):
+                                tip[c] = x[b, c, p, l]
+                            caught = keep_out(tip, left, colliders[b], shapes, l, time_step, point, rows, scratch)
+                    if caught:
+                        way[:] = 0
                 # where it leads
                 blocked[b, k, l] = changed
                 if changed:

@@ -185,7 +185,7 @@ def _read_ply(path: str | Path) -> Polygons | None:
     header = [line.split() for line in data[: max(end, 0)].decode("latin-1").splitlines() if line.strip()]
     orders = [PLY_ORDERS.get(words[1]) for words in header[1:] if words[0] == "format" and len(words) > 1]
     if not header or header[0] != ["ply"] or len(orders) != 1 or orders[0] is None or not begin:
-        raise ValueError("its header is none of a ply file")
+        raise ValueError("it does not begin with the header of a ply file")
     # the elements with their properties: name, type of the number, and of the length of a list
     elements: list[tuple[str, int, list[tuple[str, str, str]]]] = []
     for words in header:

@@ -52,8 +52,7 @@ class Simulation:
         grippers: what can pick up the cloth; open and at home at first.  ``simulation.grippers`` moves them.
         bending: what resists it: "springs" (no rigidity in the flat state), "hinge" or "quadratic", see ``bending``.  One fabric
             drapes to about 60 % with the first, 25 % with the others.  "auto": springs, or hinges if it is not flat at rest.
-        contact: "sheet": solids touch the whole sheet, and stop attachments; or "particles": they touch particles only, and
-            attachments go through them.
+        contact: "sheet": solids touch the whole sheet; or "particles": they touch particles only.
         self_collision: False, "fast" or "strict", or a dict with mode, thickness [m] and friction, see ``collisions``.
         strain_limit: largest strain of yarns and diagonals, see ``limiting``; None for none.
         on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
@@ -205,10 +204,10 @@ class Simulation:
 
         def work(first: int, last: int) -> None:
             blocks = slice(first, last)
+            held = self._attachments.holder[blocks].copy() if len(self.grippers) else None
             if self._contact.strict:
                 memory = self._contact.sheet.memory
                 self._attachments.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
-            held = self._attachments.holder[blocks].copy() if len(self.grippers) else None
             self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
             if held is not None:
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)

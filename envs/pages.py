@@ -1,4 +1,4 @@
-"""An environment's manual page, and the refusal of keywords that there are not.
+"""An environment's manual page; refuses unknown keywords.
 
 A class's docstring is its page.  When the class is made, lines of it that begin with one of ``MARKS`` are replaced by what that
 function returns of the task, some by means of the words that follow; and a page with the mark ``$physics`` gets the sections of

@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from typing import ClassVar
 
 import pytest
 
@@ -16,16 +17,28 @@ SCENES = {
 }
 
 
+class Process:
+    """A process that is not started."""
+
+    scenes: ClassVar = []
+
+    def __init__(self, command, **how):
+        self.scenes.append(json.loads(command[-1]))
+
+    def wait(self):
+        pass
+
+
 @pytest.fixture
 def started(monkeypatch):
     """The scenes of processes that would be started on a machine of two processors, whose cache is empty."""
-    scenes = []
-    monkeypatch.setattr(ahead, "_running", [])
+    Process.scenes.clear()
+    monkeypatch.setattr(ahead, "_started", [])
     monkeypatch.setenv(ahead.PROCESSES, "2")
     monkeypatch.setattr(_jit, "default_threads", lambda: 2)
     monkeypatch.setattr(_jit, "is_kept", lambda kernel: False)
-    monkeypatch.setattr(subprocess, "Popen", lambda command, **how: scenes.append(json.loads(command[-1])))
-    return scenes
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    return Process.scenes
 
 
 @pytest.mark.skipif(_jit.WITHOUT_JIT, reason="nothing is compiled")
@@ -51,7 +64,7 @@ def test_one_process_is_started_and_only_where_it_helps(started, monkeypatch):
     for _ in range(2):
         Simulation(MESH, self_collision="fast")
     assert len(started) == 1
-    ahead._running.clear()
+    ahead._started.clear()
     monkeypatch.setenv(ahead.PROCESSES, "1")
     Simulation(MESH, self_collision="fast")
     monkeypatch.setenv(ahead.PROCESSES, "2")

@@ -435,3 +435,19 @@ def test_what_fingers_take_in_a_step_is_kept_out_of_the_floor_in_that_step():
     # and is still: what it pushes against the floor does not creep
     s.step(10)
     assert s.positions[0, 12, 2] == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("reach", [0.01, 0.2])
+@pytest.mark.parametrize("slope", [0.3, 0.6])
+def test_a_gripper_that_is_told_into_a_sharp_corner_stays_out_of_both_walls(slope, reach):
+    """Two planes that meet at less than a right angle; it holds one particle, or all of them."""
+    walls = [Plane(normal=(side, 0, slope), thickness=0.0) for side in (1, -1)]
+    s = simulation(grippers=[Gripper(position=(0, 0, 1), reach=reach, closing_time=1e-3)], colliders=walls)
+    s.reset(positions=REST - REST[12] + (0, 0, 1))
+    for _ in range(60):
+        s.grippers.move([[[0, 0, -1]]], [[0]])
+        s.step()
+        held = np.concatenate([s.positions[0, s.grippers.holder[0] == 0], s.grippers.positions[0]])
+        heights = (slope * held[:, 2] - np.abs(held[:, 0])) / np.hypot(1, slope)
+        assert heights.min() > -1e-4
+    assert heights.min() < 0.03

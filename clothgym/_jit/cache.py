@@ -93,7 +93,7 @@ class CacheFolder:
         # locks of kernels that this process compiles now, a caller before its callees: bare descriptors.  Guarded by numba's own
         # compiler lock.  Processes cannot wait for each other in a ring, as no kernel calls itself by way of others
         self.held: dict[str, int] = {}
-        self.compiled = 0
+        self.compiled, self._counting = 0, False
         self.writable = True
         self.path = self.core = NOWHERE
         self._key = b""
@@ -194,7 +194,6 @@ class CacheFolder:
     def announce(self, most: int) -> None:
         """Say that one more kernel is being compiled, of ``most`` at most: in a terminal each time, else once."""
         self.compiled += 1
-        live = sys.stderr.isatty()
         if self.compiled == 1:
             where = f", kept in {self.path.parent}" if self.writable else ""
             print(
@@ -202,12 +201,14 @@ class CacheFolder:
                 file=sys.stderr,
                 flush=True,
             )
-        if live:
+        if sys.stderr.isatty():
+            self._counting = True
             print(f"\rclothgym: compiling {self.compiled} of {max(most, self.compiled)} ", end="", file=sys.stderr, flush=True)
 
     def end_line(self) -> None:
         """End the line that a terminal shows while kernels are compiled."""
-        if self.compiled and sys.stderr.isatty():
+        if self._counting:
+            self._counting = False
             print("\r" + 40 * " " + "\r", end="", file=sys.stderr, flush=True)
 
 

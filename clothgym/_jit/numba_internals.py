@@ -86,7 +86,7 @@ def arrange(function: FunctionType, apart: bool, flags: Mapping[str, bool], opti
 def is_kept(dispatcher: Any) -> bool:
     """Whether the cache has some version of a kernel that is called from Python."""
     entry = getattr(dispatcher._compile_for_args, "args", (None, None))[1]
-    return entry is not None and Path(entry._cache._cache_file._index_path).exists()
+    return entry is None or Path(entry._cache._cache_file._index_path).exists()
 
 
 _most = 0  # kernels that this process may have compiled when the present call from Python is through

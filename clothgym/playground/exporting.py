@@ -222,7 +222,7 @@ def export(
         raise ImportError(f"out={str(out)!r}: a {path.suffix} needs {NEEDED[path.suffix]}: pip install 'clothgym[video]'")
     if seconds is not None:
         positive("seconds", seconds)
-    # a rate that there is not is said before anything is made
+    # an invalid rate is refused first
     stride_for(name, time_step_of(Gallery().checked(name)), fps)
     stage = stage_named(name, seed, policy, settings)
     rate = 1 / (stage.recording.time_step * stride_for(name, stage.recording.time_step, fps))

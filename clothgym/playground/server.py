@@ -134,7 +134,7 @@ def imported_viser() -> Any:
 
 
 def check_address(host: str, port: int) -> None:
-    """Refuse an address at which this machine cannot listen.  A port that is in use is none: the server takes the next.
+    """Refuse an address at which this machine cannot listen.  A port in use is not refused: the server takes the next.
 
     Raises:
         ValueError: an address that this machine does not have, or an invalid port.

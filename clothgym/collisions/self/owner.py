@@ -39,10 +39,8 @@ CONTACT = 0.5  # thicknesses beyond the thickness within which a pair becomes a 
 STOP = 0.125  # thicknesses at which gap constraints are held
 STANDOFF = 0.25  # thicknesses at which what is held stops
 USUAL = 0.28  # thickness where none is given, over the shortest distance at rest of what does not hang together
-NEAR_MOST, FAR_MOST = (
-    0.35,
-    0.45,
-)  # largest thickness over such a distance: of near pairs, which are thinner if need be, and of others
+# largest thickness over such a distance: of near pairs, which are thinner if need be, and of others
+NEAR_MOST, FAR_MOST = 0.35, 0.45
 FRICTION = 0.3
 THINNEST = 20 * MARGIN  # thickness that strict mode takes [m]: rounding takes a share of it
 WANTED = "must be False, 'fast' or 'strict', or a dict with mode, thickness and friction"
