@@ -150,8 +150,8 @@ class HangingTask(Task):
         super().check_episode(env, own)
         if abs(own["turn"] @ own["turn"] - 1) > 1e-9 or not self.stands(own):
             raise ValueError(
-                f"no episode of this task has a {self.stand} at {own[self.frame_at].tolist()} with that turn: give what get_state() "
-                "gave"
+                f"no episode of this task has a {self.stand} at {own[self.frame_at].tolist()} with that turn: give what "
+                "get_state() gave"
             )
 
     def check_options(self, options: Mapping[str, Any]) -> None:
