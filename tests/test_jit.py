@@ -5,13 +5,14 @@ import shutil
 import subprocess
 import sys
 import textwrap
+import threading
 from pathlib import Path
 
 import pytest
 from numba.core.errors import TypingError
 
 from clothgym import bending
-from clothgym._jit import inlined, kernel, placeholder, specialize
+from clothgym._jit import WITHOUT_JIT, inlined, kernel, placeholder, specialize
 from clothgym._jit.cache import ABOVE_CORE, WITHOUT_KERNELS, cache_folder, source_digest
 from clothgym.bending import add_bend_forces
 from clothgym.integrators import INTEGRATORS
@@ -233,3 +234,34 @@ def test_an_integrator_calls_forces_by_placeholders_alone(name):
 def test_a_name_that_is_not_used_cannot_be_bound():
     with pytest.raises(ValueError, match="one_on does not use nextof, .* it uses next_of"):
         specialize(one_on, "one_on", nextof=after)
+
+
+def add(x, y):
+    return x + y
+
+
+@pytest.mark.skipif(WITHOUT_JIT, reason="nothing is compiled")
+def test_threads_that_make_the_first_call_together_leave_one_entry(monkeypatch):
+    """With two that fit, numba would look for code, and add it, in every call."""
+    from clothgym._jit import numba_internals
+
+    one = kernel(add)
+    calls, compile_entry = [], one._compile_for_args
+    together = threading.Barrier(4, timeout=20)
+
+    def counted(*args):
+        calls.append(args)
+        if len(calls) <= 4:
+            together.wait()
+        return compile_entry(*args)
+
+    monkeypatch.setattr(one, "_compile_for_args", counted)
+    threads = [threading.Thread(target=one, args=(1.0, 2.0)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(calls) == 4
+    assert one(1.0, 2.0) == add(1.0, 2.0)
+    assert len(calls) == 4
+    assert numba_internals.is_kept(one)

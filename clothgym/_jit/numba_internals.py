@@ -75,6 +75,7 @@ def arrange(function: FunctionType, apart: bool, flags: Mapping[str, bool], opti
         wrappers = {"no_cpython_wrapper": not called_from_python, "no_cfunc_wrapper": True}
         one._compiler._customize_flags = partial(_set_flags, values={**flags, **wrappers})
         one.compile = partial(_compile_locked, one.compile, one._cache.lock_name)
+    entry.inserted = set()  # types of arguments with which Python finds its code
     entry._cache_hits, entry._cache_misses = dispatcher._cache_hits, dispatcher._cache_misses
     _dispatchers[dispatcher._cache.name] = dispatcher
     # compiled callers find kernels without wrappers in its table, and Python those with one
@@ -121,7 +122,12 @@ def _compile_entry(dispatcher: Any, entry: Any, *args: Any) -> Any:
         if outermost:
             _most = 0
             cache_folder().end_line()
-    dispatcher._insert([entry.typeof_pyval(value)._code for value in args], called, False)
+    types = tuple(entry.typeof_pyval(value) for value in args)
+    # once: threads may come here together, and numba takes a call that fits two entries for one that fits none
+    with global_compiler_lock:
+        if types not in entry.inserted:
+            entry.inserted.add(types)
+            dispatcher._insert([one._code for one in types], called, False)
     return called
 
 
