@@ -31,8 +31,11 @@ substep = placeholder("substep", "of an integrator: moves a block on by h [s] un
 restrain = placeholder("restrain", "of (x, v, w, weave, limit, limited): pulls springs beyond the strain limit back to it")
 remeasure = placeholder("remeasure", "of (x, weave, limited): writes the largest strain at the end of a control step")
 # of ``collisions.self.step``
-press = placeholder("press", "of (x, v, w, sheet, block, step, h, carried): applies the impulses of contacts with itself")
-keep_apart = placeholder("keep_apart", "of (x, v, w, sheet, block, h, carried): corrects them, and keeps vertices in their bounds")
+press = placeholder("press", "of (x, v, w, sheet, block, step, carried): applies the impulses of contacts with itself")
+keep_apart = placeholder(
+    "keep_apart", "of (x, v, w, sheet, room, block, h, carried): corrects them, and keeps vertices in their bounds"
+)
+room_for_self_contact = placeholder("room_for_self_contact", "of (x, sheet): makes the scratch of ``keep_apart``")
 # of ``collisions.solids.sheet_contact``
 resolve = placeholder(
     "resolve", "of (x, v, w, triangles, shapes, colliders, h, carried, look, room): moves solids on, and the sheet out of them"
@@ -88,18 +91,20 @@ class Outcome(NamedTuple):
     diverged: NDArray
 
 
-def room_for_block(x, offset, room, triangles, shapes):
-    """Scratch of ``advance``, which its blocks share one after the other: the integrator's, the air's force [N], and contact's.
+def room_for_block(x, offset, room, triangles, shapes, sheet):
+    """Scratch of ``advance``, which its blocks share one after the other: the integrator's, the air's force [N], and those of
+    contact with solids and of the sheet with itself.
 
     x: positions of a block.  offset: see ``elements.room_for_forces``.  room: see ``Integrator.room``.
     """
-    return room_for_work(x, offset, room), np.zeros(x.shape, x.dtype), room_for_contact(x, triangles, shapes)
+    solids, itself = room_for_contact(x, triangles, shapes), room_for_self_contact(x, sheet)
+    return room_for_work(x, offset, room), np.zeros(x.shape, x.dtype), solids, itself
 
 
 def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, room):
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
     h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
-    (fields, of_springs, of_bends, scratch), push, touches = room
+    (fields, of_springs, of_bends, scratch), push, touches, near = room
     shapes = solids.shapes
     for b in range(first, last):
         x, v, w, colliders, limited = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.limited[b]
@@ -118,11 +123,11 @@ def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome
             # springs that are stretched beyond the limit are pulled back to it
             restrain(x, v, w, weave, limit, limited)
             # contacts of the sheet with itself press as before, so that solids bear what lies on them
-            press(x, v, w, sheet, b, step, h, carried)
+            press(x, v, w, sheet, b, step, carried)
             # solids move on, and push out what is in them
             resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, step, look_every, touches)
             # the contacts' impulses are corrected, and no vertex leaves its displacement bound
-            keep_apart(x, v, w, sheet, b, h, carried)
+            keep_apart(x, v, w, sheet, near, b, h, carried)
         remeasure(x, weave, limited)
         mark_diverged(x, v, outcome.diverged[b])
 
@@ -141,7 +146,7 @@ class MainLoop:
     ) -> None:  # fmt: skip
         """One control step of blocks ``first`` to ``last``."""
         if not hasattr(self.rooms, "own"):
-            self.rooms.own = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes)
+            self.rooms.own = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes, sheet)
         self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms.own)
 
 
@@ -153,11 +158,9 @@ def compiled(
     contact of the sheet with itself or none, and with contact with solids (see ``sheet_contact.needed``); and its
     ``room_for_block``."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
-    touching = contact_kernels(contact, by_particle)
-    parts = (
-        limiting.kernels_of(limits, by_particle) | self_contact_kernels(collides, by_particle) | used(advance, forces | touching)
-    )
+    touching, itself = contact_kernels(contact, by_particle), self_contact_kernels(collides, by_particle)
+    parts = limiting.kernels_of(limits, by_particle) | used(advance, forces | touching | itself)
     parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **used(substep, forces))
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
-    room = specialize(room_for_block, f"room_for_block_{layout}", **used(room_for_block, touching))
+    room = specialize(room_for_block, f"room_for_block_{layout}", **used(room_for_block, touching | itself))
     return specialize(uncounted(advance), f"advance_{which}", apart=True, **parts), room

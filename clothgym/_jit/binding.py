@@ -17,7 +17,7 @@ from typing import Any
 from numba.extending import typeof_impl
 
 from clothgym._jit.cache import package_folders
-from clothgym._jit.policy import COUNTED, kernel
+from clothgym._jit.policy import COUNTED, inlined, kernel
 
 
 class _Placeholder:
@@ -53,11 +53,11 @@ def used(function: Any, callees: Mapping[str, Any]) -> dict[str, Any]:
     return {name: callee for name, callee in callees.items() if name in names}
 
 
-def specialize(function: Any, name: str, apart: bool = False, **callees: Any) -> Any:
+def specialize(function: Any, name: str, apart: bool = False, inline: bool = False, **callees: Any) -> Any:
     """A ``kernel`` with the code of ``function`` in which the global names ``callees`` stand for the given kernels.
 
     Its name is ``name`` and a digest of who the callees are, so that the cache keeps all combinations apart.  A ``function`` that
-    is a kernel already is made with its flags.
+    is a kernel already is made with its flags.  apart: see ``kernel``; inline: whether it is ``inlined``.
 
     Raises:
         ValueError: a name that the function does not use, by which nothing would change.
@@ -74,7 +74,7 @@ def specialize(function: Any, name: str, apart: bool = False, **callees: Any) ->
     bound = FunctionType(code, {**function.__globals__, **callees}, name)
     bound.__qualname__ = name
     bound.__module__ = function.__module__
-    return kernel(bound, apart, flags)
+    return inlined(bound) if inline else kernel(bound, apart, flags)
 
 
 def _globals_of(function: FunctionType) -> set[str]:

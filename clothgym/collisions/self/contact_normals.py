@@ -35,8 +35,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, kernel
-from clothgym.collisions.self.broad_phase import TINY
+from clothgym._jit import inlined, kernel, uncounted
+from clothgym.collisions.self.broad_phase import TINY, is_ridge
 from clothgym.collisions.self.topology import Real
 
 TOUCHING = 1e-5  # height up to which a neighbor counts as no closer, so that rounding drops no contact [m]
@@ -52,24 +52,23 @@ class SmoothSheet(NamedTuple):
     """What is known of the smooth sheet at a query.
 
     ahead: positions in the middle of the time until the next query [m]; normals: at each vertex, zero on creases, both (particles,
-    3); kinds: of vertices, (particles,).  ridges: edges that may be in contact, (edges,).
+    3); kinds: of vertices, (particles,).
     """
 
     ahead: Real
     normals: Real
     kinds: NDArray[np.uint8]
-    ridges: NDArray[np.bool_]
 
 
-@kernel
-def smooth_out(pairs, faces, smooth):
+@uncounted
+def smooth_out(parts, faces, smooth):
     """Find the normals and kinds of the vertices of ``smooth``.  faces: unit normals of now, (3, triangles).
 
     A face with the sides e and f at a vertex has the normal e x f / (|e|^2 |f|^2) there (Max 1999: their sum is exact where the
     vertices lie on a sphere).
     """
-    triangles, edges, edge_triangles = pairs.triangles, pairs.edges, pairs.edge_triangles
-    ahead, normals, kinds, ridges = smooth.ahead, smooth.normals, smooth.kinds, smooth.ridges
+    triangles, edges, edge_triangles = parts.triangles, parts.edges, parts.edge_triangles
+    ahead, normals, kinds = smooth.ahead, smooth.normals, smooth.kinds
     normals[:] = 0.0
     kinds[:] = SMOOTH
     for t in range(triangles.shape[0]):
@@ -88,7 +87,7 @@ def smooth_out(pairs, faces, smooth):
     # vertices on the border, and on creases
     least = np.cos(SHARP)
     for e in range(edges.shape[0]):
-        if not ridges[e]:
+        if not is_ridge(faces, edge_triangles, e):
             continue
         s, t = edge_triangles[e, 0], edge_triangles[e, 1]
         turn = faces[0, s] * faces[0, t] + faces[1, s] * faces[1, t] + faces[2, s] * faces[2, t]
@@ -113,7 +112,7 @@ def rises(p, v, nx, ny, nz, slope, triangles, around, around_triangles):
 
 
 @inlined
-def owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, kinds):
+def owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, parts, kinds):
     """Whether triangle t = ijk owns its contact with vertex v, whose closest point has the barycentric weights a, b and c; whether
     no neighbor of that point is closer along the direction n; and whether the sheet is smooth there.
 
@@ -126,16 +125,16 @@ def owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, kinds):
     # on a corner
     if (a == 0.0) + (b == 0.0) + (c == 0.0) == 2:
         corner = i if a != 0.0 else (j if b != 0.0 else k)
-        if pairs.vertex_owner[corner] != t or v > corner:
+        if parts.vertex_owner[corner] != t or v > corner:
             return False, False, False
-        rising = rises(p, corner, nx, ny, nz, 0.0, pairs.triangles, pairs.around, pairs.around_triangles)
+        rising = rises(p, corner, nx, ny, nz, 0.0, parts.triangles, parts.around, parts.around_triangles)
         return True, not rising, kinds[corner] == SMOOTH
     # on an edge
-    edge = pairs.triangle_edges[t, 0] if a == 0.0 else (pairs.triangle_edges[t, 1] if b == 0.0 else pairs.triangle_edges[t, 2])
-    if pairs.edge_owner[edge] != t:
+    edge = parts.triangle_edges[t, 0] if a == 0.0 else (parts.triangle_edges[t, 1] if b == 0.0 else parts.triangle_edges[t, 2])
+    if parts.edge_owner[edge] != t:
         return False, False, False
-    one, two, other = pairs.edges[edge, 0], pairs.edges[edge, 1], pairs.edge_triangles[edge, 1]
-    rising = height(p, opposite(pairs.triangles, other, one, two), one, nx, ny, nz) > TOUCHING
+    one, two, other = parts.edges[edge, 0], parts.edges[edge, 1], parts.edge_triangles[edge, 1]
+    rising = height(p, opposite(parts.triangles, other, one, two), one, nx, ny, nz) > TOUCHING
     return True, not rising, other != t and (kinds[one] != CREASED or kinds[two] != CREASED)
 
 
@@ -202,7 +201,7 @@ def rise_of_triangle(p, normals, i, j, k, a, b, c, nx, ny, nz):
 
 
 @inlined
-def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, pairs, smooth):
+def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, parts, smooth):
     """The contact of vertex v with the sheet about triangle ijk, from the closest point's weights, gap [m] and direction.
 
     is_smooth: see ``owns``.  Returns the weights of the point of the triangle's plane below v along the contact's
@@ -218,7 +217,7 @@ def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, pairs, smooth)
             return a, b, c, gap * abs(share), sx, sy, sz, rise_of_triangle(p, normals, i, j, k, a, b, c, sx, sy, sz)
         slipping = kinds[v] == SMOOTH
         if not slipping:
-            slipping = rises(p, v, -nx, -ny, -nz, SLOPE, pairs.triangles, pairs.around, pairs.around_triangles)
+            slipping = rises(p, v, -nx, -ny, -nz, SLOPE, parts.triangles, parts.around, parts.around_triangles)
         return a, b, c, 0.0 if slipping else gap, nx, ny, nz, 0.0
     # the triangle's sides and normal, and the point of its plane that is next to v
     ux, uy, uz = ahead[j, 0] - ahead[i, 0], ahead[j, 1] - ahead[i, 1], ahead[j, 2] - ahead[i, 2]
@@ -252,12 +251,12 @@ def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, pairs, smooth)
 
 
 @inlined
-def can_touch(p, e, i, j, nx, ny, nz, pairs):
+def can_touch(p, e, i, j, nx, ny, nz, parts):
     """Whether edge e = ij may be in contact towards n: no face beside it rises along n."""
-    first, second = pairs.edge_triangles[e, 0], pairs.edge_triangles[e, 1]
+    first, second = parts.edge_triangles[e, 0], parts.edge_triangles[e, 1]
     slope = SLOPE if first == second else RIDGE_SLOPE
     for t in (first, second):
-        v = opposite(pairs.triangles, t, i, j)
+        v = opposite(parts.triangles, t, i, j)
         dx, dy, dz = p[v, 0] - p[i, 0], p[v, 1] - p[i, 1], p[v, 2] - p[i, 2]
         if nx * dx + ny * dy + nz * dz > TOUCHING + slope * np.sqrt(dx * dx + dy * dy + dz * dz):
             return False
@@ -265,7 +264,7 @@ def can_touch(p, e, i, j, nx, ny, nz, pairs):
 
 
 @inlined
-def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, pairs, smooth):
+def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, parts, smooth):
     """The contact of edge e = ij with edge f = kl, from the parameters s and t of their closest points, gap [m] and direction n.
 
     Returns the parameters of the points that lie on each other along the contact's normal, the gap along it [m], which is 0 where
@@ -284,7 +283,7 @@ def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, pairs, smooth):
     cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
     steep = mx * cx + my * cy + mz * cz
     if not steep * steep >= CROSSING * CROSSING * (ux * ux + uy * uy + uz * uz) * (wx * wx + wy * wy + wz * wz):
-        touch = can_touch(p, e, i, j, -nx, -ny, -nz, pairs) and can_touch(p, f, k, l, nx, ny, nz, pairs)
+        touch = can_touch(p, e, i, j, -nx, -ny, -nz, parts) and can_touch(p, f, k, l, nx, ny, nz, parts)
         return s, t, gap if touch else 0.0, nx, ny, nz, 0.0
     dx, dy, dz = ahead[i, 0] - ahead[k, 0], ahead[i, 1] - ahead[k, 1], ahead[i, 2] - ahead[k, 2]
     down = (dx * cx + dy * cy + dz * cz) / steep

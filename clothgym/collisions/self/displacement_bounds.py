@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, disjoint, inlined, kernel
+from clothgym._jit import disjoint, kernel, uncounted
 from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
-from clothgym.collisions.self.narrow_phase import MARGIN, SHARE, query
+from clothgym.collisions.self.narrow_phase import MARGIN, SHARE
+from clothgym.collisions.self.query import query
+from clothgym.collisions.self.query_room import Found
 from clothgym.collisions.self.spread import least_stretch
 from clothgym.contact_memory import REPORT_CLAMPED, REPORT_CONTACTS, REPORT_QUERIES, REPORT_UNCERTAIN
 
@@ -24,49 +26,36 @@ AHEAD = 8  # substeps that a query should last: it looks farther around fast ver
 AHEAD_MOST = 1.0  # largest distance beyond the reach that it looks, as a share of the reach
 
 
-@inlined
-def confine(x, v, w, sheet, block, h, find_outside):
-    """Keep one block's sheets within their displacement bounds.
+@uncounted
+def confine(x, v, w, sheet, room, block, h):
+    """Keep those of one block's sheets in their displacement bounds that have left them, as ``memory.any_outside`` says.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  h: the substep [s].  find_outside: see
-    ``find_outside_in_lanes``.
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  room: a ``query_room.Room``.  h: the
+    substep [s].
     """
-    memory, setting, samples = sheet.memory, sheet.setting, sheet.pairs.samples
-    start, bounds, limits, old = memory.start[block], memory.bounds[block], memory.limits[block], memory.old[block]
-    # particles that lag behind their attachments catch up
+    memory, setting = sheet.memory, sheet.setting
     for l in range(memory.used[block]):
-        if memory.behind[block, l] > 0:
-            memory.behind[block, l] = _catch_up(x, w, memory.lag[block], l, h)
-    # which vertices have left their bounds, and in which lanes a query is due
-    outside, any_outside, query_due = memory.outside[block], memory.any_outside[block], memory.query_due[block]
-    any_outside[:] = False
-    query_due[:] = False
-    find_outside(x, start, bounds, limits, samples, outside, any_outside, query_due)
-    # what follows costs nothing in the other lanes
-    for l in range(memory.used[block]):
-        if not any_outside[l]:
+        if not memory.any_outside[block, l]:
             continue
-        due, own_outside = query_due[l], outside[:, l]
+        due, outside = memory.query_due[block, l], memory.outside[block, :, l]
         # within their limits, vertices are certified by their gap constraints: evaluate the active ones
         if not due and setting.strict:
             active = memory.active[block, l, : memory.constraints[block, l]]
-            number = list_active(memory.members[block, l], own_outside, active)
+            number = list_active(memory.members[block, l], outside, active)
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                hold_apart(x, v, w, sheet, block, l, own_outside, active, number)
+                hold_apart(x, v, w, memory, block, l, outside, active, number, room.halvings)
                 # vertices that stayed in place have left the common motion, and so perhaps their limits
-                _, due = _find_outside_in_lane(x, start, bounds, limits, samples, l, own_outside)
+                due = _any_beyond(x, memory.start[block], memory.limits[block], sheet.pairs.samples, l)
         # a query at the certified positions gives new bounds
         if due:
-            _query_again(x, v, w, sheet, block, l, h, own_outside)
-    # these positions are certified now
-    _copy(x.reshape(x.size), old.reshape(x.size))
+            _query_again(x, v, w, sheet, room, block, l, h, outside)
 
 
 @disjoint
-def _copy(row, out):
-    """A loop of its own, so that it is vectorized: lanes of one environment are the shortest of rows."""
+def keep(row, out):
+    """Note certified positions: a loop of its own, so that it is vectorized; both flat."""
     for e in range(row.shape[0]):
         out[e] = row[e]
 
@@ -76,9 +65,11 @@ def find_outside_in_lanes(x, start, bounds, limits, samples, outside, any_outsid
     """Find the vertices that have left their bounds since the last query, |x - start - m| > b, beside the common motion m.
 
     m, the mean displacement of the samples, changes no distance.  outside: becomes which vertices, (particles, lanes); any_outside:
-    in which lanes there are some; query_due: in which lanes one has left its limit, (lanes,).
+    in which lanes there are some; query_due: in which lanes one has left its limit, (lanes,).  Returns whether there are any.
     """
     lanes = x.shape[2]
+    any_outside[:] = False
+    query_due[:] = False
     # the common motion of each lane
     share = x.dtype.type(1 / samples.shape[0])
     mean = np.zeros((3, lanes), x.dtype)
@@ -99,6 +90,10 @@ def find_outside_in_lanes(x, start, bounds, limits, samples, outside, any_outsid
             outside_p[l] = not within_bound
             any_outside[l] |= not within_bound
             query_due[l] |= not within_limit
+    some = False
+    for l in range(lanes):
+        some |= any_outside[l]
+    return some
 
 
 @kernel
@@ -114,31 +109,44 @@ def _common_motion(x, start, samples, l):
     return mx, my, mz
 
 
-@kernel
-def _find_outside_in_lane(x, start, bounds, limits, samples, l, outside):
-    """The same for lane l alone, without loops over lanes; outside: (particles,).  Returns whether some are, and whether a query is
-    due.
-    """
-    mx, my, mz = _common_motion(x, start, samples, l)
-    any_outside, query_due = False, False
-    for p in range(x.shape[1]):
-        dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
-        square = dx * dx + dy * dy + dz * dz
-        within_bound, within_limit = square <= bounds[p, l], square <= limits[p, l]
-        outside[p] = not within_bound
-        any_outside |= not within_bound
-        query_due |= not within_limit
-    return any_outside, query_due
-
-
-@inlined
+@uncounted
 def find_outside_of_sheet(x, start, bounds, limits, samples, outside, any_outside, query_due):
     """The same for a block that is one sheet."""
-    any_outside[0], query_due[0] = _find_outside_in_lane(x, start, bounds, limits, samples, 0, outside[:, 0])
+    n, (mx, my, mz) = x.shape[1], _common_motion(x, start, samples, 0)
+    left, due = _find_outside(
+        x[0].reshape(n), x[1].reshape(n), x[2].reshape(n), start[0].reshape(n), start[1].reshape(n), start[2].reshape(n),
+        mx, my, mz, bounds.reshape(n), limits.reshape(n), outside.reshape(n),
+    )  # fmt: skip
+    any_outside[0], query_due[0] = left > 0, due > 0
+    return left > 0
+
+
+@disjoint
+def _find_outside(x, y, z, sx, sy, sz, mx, my, mz, bounds, limits, outside):
+    """How many vertices of one sheet have left their bounds, and their limits; all (particles,)."""
+    left, due = 0, 0
+    for p in range(outside.shape[0]):
+        dx, dy, dz = x[p] - sx[p] - mx, y[p] - sy[p] - my, z[p] - sz[p] - mz
+        square = dx * dx + dy * dy + dz * dz
+        outside[p] = not square <= bounds[p]
+        left += not square <= bounds[p]
+        due += not square <= limits[p]
+    return left, due
 
 
 @kernel
-def _catch_up(x, w, lag, l, h):
+def _any_beyond(x, start, limits, samples, l):
+    """Whether a vertex of lane l has left its limit."""
+    mx, my, mz = _common_motion(x, start, samples, l)
+    beyond = False
+    for p in range(x.shape[1]):
+        dx, dy, dz = x[0, p, l] - start[0, p, l] - mx, x[1, p, l] - start[1, p, l] - my, x[2, p, l] - start[2, p, l] - mz
+        beyond |= not dx * dx + dy * dy + dz * dz <= limits[p, l]
+    return beyond
+
+
+@uncounted
+def catch_up(x, w, lag, l, h):
     """Move lagging particles of lane l towards their attachments, at ``CATCH_UP`` at most.  A released particle lags no more.
     Returns the largest lag left [m].
     """
@@ -162,8 +170,8 @@ def _catch_up(x, w, lag, l, h):
     return largest
 
 
-@apart
-def _query_again(x, v, w, sheet, block, l, h, outside):
+@uncounted
+def _query_again(x, v, w, sheet, room, block, l, h, outside):
     """Query lane l at its certified positions, and in strict mode clamp the vertices to their new limits.
 
     Bounds are relative to the common motion, so that a sheet in flight keeps its speed.  They are relative to the positions
@@ -172,10 +180,8 @@ def _query_again(x, v, w, sheet, block, l, h, outside):
 
     outside: scratch, (particles,).
     """
-    memory, particles = sheet.memory, x.shape[1]
-    # query: its positions in float64, squared limits, and which particles are attached
-    p64, limits, held = np.empty((particles, 3)), np.empty(particles, x.dtype), np.empty(particles, np.bool_)
-    look_around(memory.old[block], v, w, sheet, block, l, h, p64, limits, held)
+    memory, particles, limits, held = sheet.memory, x.shape[1], room.squares, room.held
+    _look_around(memory.old[block], v, w, sheet, room, block, l, h)
     if sheet.setting.strict:
         # the common motion, unless a vertex may not move, or an attached one does not share it
         start, zero = memory.start[block], x.dtype.type(0)
@@ -189,21 +195,21 @@ def _query_again(x, v, w, sheet, block, l, h, outside):
         if not in_common:
             mx, my, mz = zero, zero, zero
         # clamp each vertex to its limit
-        _clamp(x, v, memory, block, l, h, p64, limits, held, mx, my, mz)
+        _clamp(x, v, memory, block, l, h, room.p, limits, held, mx, my, mz)
         # where that violates a gap constraint, clamp without the common motion, then enforce the constraints
         members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
         violated = False
         for t in range(constraints):
             violated |= is_violated(x, members, planes, t, l)
         if violated:
-            _clamp(x, v, memory, block, l, h, p64, limits, held, zero, zero, zero)
+            _clamp(x, v, memory, block, l, h, room.p, limits, held, zero, zero, zero)
             outside[:] = True
             active = memory.active[block, l, :constraints]
-            hold_apart(x, v, w, sheet, block, l, outside, active, list_active(members, outside, active))
+            hold_apart(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), room.halvings)
         note_lag(w, memory, block, l)
 
 
-@kernel
+@uncounted
 def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
     """Clamp the vertices of lane l to their limits: x <- s + m + (x - s - m) min(1, b / |x - s - m|).
 
@@ -230,54 +236,57 @@ def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
                 x[c, p, l] = goal
 
 
-@inlined
-def look_around(x, v, w, sheet, block, l, h, p, limits, held):
+@uncounted
+def _look_around(x, v, w, sheet, room, block, l, h):
     """Query lane l at positions x, and farther around fast vertices.
 
-    p, limits, held: become its positions in float64 [m], (particles, 3), the squares of how far each vertex may move before the
-    next query [m^2], (particles,), and which particles are attached, (particles,).  They are copies: the values of a lane lie far
-    apart.
+    Of ``room``, ``p``, ``squares`` and ``held`` become its positions in float64 [m], the squares of how far each vertex may move
+    before the next query [m^2], and which particles are attached.  They are copies: the values of a lane lie far apart.
     """
-    memory, setting = sheet.memory, sheet.setting
-    start, bounds = memory.start[block], memory.bounds[block]
+    memory, p, held = sheet.memory, room.p, room.held
+    start, bounds, limits, squares = memory.start[block], memory.bounds[block], memory.limits[block], room.squares
     particles = x.shape[1]
     # copies of what the query reads; contacts are laid out where each vertex is after half of its way since the last query again
-    new_bounds, new_limits, extra, ahead = np.empty(particles), np.empty(particles), np.zeros(particles), np.empty(p.shape)
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
             p[k, c] = x[c, k, l]
-            ahead[k, c] = p[k, c] + 0.5 * (p[k, c] - start[c, k, l])
+            room.ahead[k, c] = p[k, c] + 0.5 * (p[k, c] - start[c, k, l])
             start[c, k, l] = x[c, k, l]
     report = memory.report[block, l]
     report[REPORT_QUERIES] += 1
-    before = memory.contacts[block, l]
-    known, impulses = memory.particles[block, l, :before].copy(), memory.impulses[block, l, :before].copy()
+    contacts, rows, impulses = memory.contacts[block, l], memory.particles[block, l], memory.impulses[block, l]
+    for k in range(contacts):
+        for c in range(4):
+            room.known[k, c] = rows[k, c]
+        for c in range(3):
+            room.impulses[k, c] = impulses[k, c]
     # of a sheet that is spread out nothing is within reach, and until the next query nothing comes within the thickness
-    count, constraints, reach = 0, 0, sheet.reach
-    clear = least_stretch(p, sheet.pairs.triangles, sheet.pairs.to_rest) * reach.at_rest
+    reach, least = sheet.reach, min(sheet.reach.near, sheet.reach.far)
+    found = Found(rows, memory.coefficients[block, l], memory.members[block, l], memory.planes[block, l], room.counts, report)
+    clear = least_stretch(p, sheet.pairs.parts.triangles, sheet.pairs.to_rest, room.gradients, room.smallest) * reach.at_rest
     if clear >= max(reach.near, reach.far):
-        new_bounds[:] = SHARE * (max(clear - reach.far_thickness, min(reach.near, reach.far)) - MARGIN)
-        new_limits[:] = new_bounds
+        room.extra[:] = 0.0
+        room.bounds[:] = room.limits[:] = SHARE * (max(clear - reach.far_thickness, least) - MARGIN)
+        found.counts[:] = 0
     # else find contacts and gap constraints, and bounds
     else:
-        _look_ahead(v, sheet, l, h, extra)
-        count, constraints = query(
-            p, ahead, sheet.pairs, reach, extra, held, new_bounds, new_limits, memory.particles[block, l],
-            memory.coefficients[block, l], memory.members[block, l], memory.planes[block, l], report,
-        )  # fmt: skip
-    memory.constraints[block, l] = constraints
+        _look_ahead(v, sheet.pairs.samples, reach.far, l, h, room.extra)
+        query(sheet.pairs, reach, room, found)
+    count = found.counts[0]
+    memory.constraints[block, l] = found.counts[1]
     # fast mode takes no notice of distances: it queries when something may have come within reach
-    if not setting.strict:
-        new_bounds[:] = SHARE * min(reach.near, reach.far)
-        new_limits[:] = new_bounds + 2.0 * SHARE * extra
+    if not sheet.setting.strict:
+        for k in range(particles):
+            room.bounds[k] = SHARE * least
+            room.limits[k] = room.bounds[k] + 2.0 * SHARE * room.extra[k]
     # bounds are compared with squared displacements
     for k in range(particles):
-        bounds[k, l] = (INSIDE * new_bounds[k]) ** 2
-        limits[k] = (INSIDE * new_limits[k]) ** 2
-        memory.limits[block, k, l] = limits[k]
+        bounds[k, l] = (INSIDE * room.bounds[k]) ** 2
+        squares[k] = (INSIDE * room.limits[k]) ** 2
+        limits[k, l] = squares[k]
     # contacts found again keep their impulses
-    _keep_impulses(known, impulses, memory.particles[block, l], memory.impulses[block, l], count, particles)
+    _keep_impulses(room.known[:contacts], room.impulses, rows, impulses, count, room.last, room.before)
     memory.contacts[block, l] = count
     # a sweep is due at once
     memory.choices[block, l] = -1
@@ -301,14 +310,13 @@ def note_uncertain(x, report, used):
             report[l, REPORT_UNCERTAIN] = 1
 
 
-@kernel
-def _look_ahead(v, sheet, l, h, extra):
+@uncounted
+def _look_ahead(v, samples, far, l, h, extra):
     """How much farther than its reach a query of lane l looks around each vertex [m]: ``extra``, (particles,).
 
     It is enough to last ``AHEAD`` substeps at the vertex's speed relative to the whole sheet.  Few vertices are fast enough to need
-    any.
+    any.  samples: vertices that stand for the sheet.  far: the reach [m].
     """
-    samples, far = sheet.pairs.samples, sheet.reach.far
     # mean velocity of the samples
     mx, my, mz = 0.0, 0.0, 0.0
     for s in range(samples.shape[0]):
@@ -324,16 +332,16 @@ def _look_ahead(v, sheet, l, h, extra):
         extra[p] = min(max(ahead * np.sqrt(extra[p]) - 0.5 * far, 0.0), most)
 
 
-@kernel
-def _keep_impulses(known, impulses, particles, fresh, count, vertices):
+@uncounted
+def _keep_impulses(known, impulses, particles, fresh, count, last, before):
     """Give each contact found by a query the impulse that the same contact had before, so that stacks stay at rest.
 
     known, impulses: particles and impulses before, (contacts, 4), (contacts, 3).  particles, fresh: the same now, of which there
-    are ``count``.  vertices: how many the sheet has.
+    are ``count``.  last, before: scratch, (vertices,), (contacts,).
     """
     # the contacts of each first particle, as a linked list
-    last, before = np.full(vertices, -1, np.int32), np.empty(len(known), np.int32)
-    for k in range(len(known)):
+    last[:] = -1
+    for k in range(known.shape[0]):
         before[k] = last[known[k, 0]]
         last[known[k, 0]] = k
     # the same four particles in the same order

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel, uncounted
+from clothgym._jit import inlined, kernel, uncounted
 from clothgym.collisions.self.narrow_phase import GROUP_JAMMED
 from clothgym.contact_memory import G_GROUP, G_KEPT, G_NUMBER, G_OWN, G_VERTICES, REPORT_CLAMPED, REPORT_LAG
 
@@ -77,15 +77,14 @@ def evaluate_constraints(x, memory, block, l, active):
     return due or memory.looks[block, l] > PATIENCE * constraints, violated
 
 
-@apart
-def hold_apart(x, v, w, sheet, block, l, outside, active, number):
+@uncounted
+def hold_apart(x, v, w, memory, block, l, outside, active, number, halvings):
     """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
     positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.
 
     active: room for all gap constraints, (constraints,); the first ``number`` entries are the active ones.  outside: which vertices
-    are outside their bounds; becomes which have been moved, too, (particles,).
+    are outside their bounds; becomes which have been moved, too, (particles,).  halvings: scratch, (particles,).
     """
-    memory = sheet.memory
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
     members, planes, constraints = memory.members[block, l], memory.planes[block, l], active.shape[0]
     zero, half = x.dtype.type(0), x.dtype.type(0.5)
@@ -95,7 +94,7 @@ def hold_apart(x, v, w, sheet, block, l, outside, active, number):
         if is_violated(x, members, planes, active[c], l):
             members[active[c], G_GROUP] = GROUP_JAMMED
             again = True
-    halvings = np.zeros(x.shape[1], np.int64)
+    halvings[:] = 0
     while again:
         # rounds over the active constraints, in their order; when a move activates others, the round goes on over all of them
         again, spread, c, t = False, False, 0, -1
@@ -137,7 +136,7 @@ def hold_apart(x, v, w, sheet, block, l, outside, active, number):
     note_lag(w, memory, block, l)
 
 
-@kernel
+@uncounted
 def note_lag(w, memory, block, l):
     """Note the largest lag of lane l [m]."""
     lag = memory.lag[block]

@@ -73,13 +73,8 @@ def repel(x, v, w, sheet, block, h, carried):
     memory = sheet.memory
     for l in range(memory.used[block]):
         # lanes without contacts, and those whose contacts have converged, wait
-        if memory.contacts[block, l] == 0:
-            continue
-        memory.waited[block, l] += 1
-        memory.aged[block, l] += 1
-        if memory.waited[block, l] < memory.span[block, l]:
-            continue
-        sweep(x, v, w, sheet, block, l, h, carried)
+        if memory.contacts[block, l] > 0 and memory.waited[block, l] >= memory.span[block, l]:
+            sweep(x, v, w, sheet, block, l, h, carried)
 
 
 @uncounted

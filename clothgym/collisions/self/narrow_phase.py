@@ -30,9 +30,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, inlined, kernel, uncounted
-from clothgym.collisions.self.broad_phase import along, between, faces_of, far_pairs, far_sides, near_candidates, ridges_of
-from clothgym.collisions.self.contact_normals import SmoothSheet, on_edges, on_vertex, owns, smooth_out
+from clothgym._jit import inlined, kernel, uncounted
+from clothgym.collisions.self.broad_phase import along, between, is_ridge
+from clothgym.collisions.self.contact_normals import on_edges, on_vertex, owns
+from clothgym.collisions.self.lower_bounds import keep_edges, keep_vertices
 from clothgym.contact_memory import (
     C_NORMAL,
     C_THICKNESS,
@@ -43,9 +44,8 @@ from clothgym.contact_memory import (
     G_SIZE,
     G_VERTICES,
     REPORT_DROPPED,
-    REPORT_GAP,
 )
-from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle, segments_apart
+from clothgym.geometry.closest_points import closest_on_segments, closest_on_triangle
 
 LAYERED = 0.8  # share of the distance between two leaves' vertices that a plane between the leaves must certify to stand for all
 CLOSE = 0.8  # share of the reach within which a pair becomes a gap constraint
@@ -137,30 +137,49 @@ def thickness_of(gap, rise, thickness, least):
     return min(thickness + rise, max(least + rise, gap / (1.0 - SLOP)))
 
 
-@uncounted
-def vertex_contacts(
-    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
-    closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
-):  # fmt: skip
-    """Evaluate pairs of a vertex and a triangle: certify their distances, lower the bounds of their vertices, and write contacts
-    and gap constraints.  Returns the numbers of both.
+@inlined
+def distances_of(reach, far):
+    """Within which pairs matter, the thickness of the cloth between them, and the least distance that gap constraints serve [m]."""
+    return (
+        (reach.far if far else reach.near),
+        (reach.far_thickness if far else reach.near_thickness),
+        CLOSE * min(reach.near, reach.far),
+    )
 
-    candidates: vertex, triangle and group, (candidates, 3).  smooth: see ``contact_normals``; contacts between different pieces of
-    a mesh are those of smooth sheets.  reach: within which pairs matter; extra: how much farther around each vertex, which is also
-    how much more than its share it may move [m], (particles,).
-    thickness: of the cloth; least: the smallest thickness of a contact: a closer one is pushed apart only so far, and otherwise
-    only kept from approaching.  margin: beyond the thickness within which a pair is a contact.  close: distance, less the extra of
-    its vertices, within which a pair becomes a gap constraint [m].  stop, standoff: see ``distance_to_keep``.  bounds, limits:
-    become the smallest distances of each vertex, of all its pairs and of those without a constraint [m], (particles,).  closest:
-    becomes the smallest distance in each group [m] and its direction, (groups, 4).
+
+@uncounted
+def vertex_contacts(number, far, parts, reach, extent, smooth, room, found):
+    """Evaluate a batch of vertices and triangles: certify their distances, lower the bounds of their vertices, and write contacts
+    and gap constraints.
+
+    number: of the pairs in ``room.pairs``: vertex, triangle and pair of leaves, -1 for near pairs.  far: whether they are pairs
+    that do not hang together: those are pushed apart to the thickness, near ones are only kept from approaching.  reach: a
+    ``broad_phase.Reach``.  extent: of the sheet [m].  smooth: see ``contact_normals``; contacts between different pieces of a mesh
+    are those of smooth sheets.
+
+    ``room.extra``: how much farther than the reach pairs matter around each vertex, which is also how much more than its share it
+    may move [m].  ``room.bounds``, ``room.limits``: become the smallest distances of each vertex, of all its pairs and of those
+    without a constraint [m].  ``room.closest``: becomes the smallest distance in each pair of leaves [m] and its direction.
     """
-    for m in range(candidates.shape[0]):
+    p, extra, held, bounds, limits, batch, closest = (
+        room.p,
+        room.extra,
+        room.held,
+        room.bounds,
+        room.limits,
+        room.pairs,
+        room.closest,
+    )
+    particles, members, report, counts = found.particles, found.members, found.report, found.counts
+    within, thickness, close = distances_of(reach, far)
+    least, stop, standoff = thickness if far else -np.inf, reach.stop, reach.standoff
+    for m in range(keep_vertices(number, within, extent, parts.triangles, room.near, batch, room.ends, room.lower)):
         # the closest points, and whether they are within reach
-        v, t = candidates[m, 0], candidates[m, 1]
-        i, j, k = pairs.triangles[t, 0], pairs.triangles[t, 1], pairs.triangles[t, 2]
+        v, t, group = batch[0, m], batch[1, m], batch[2, m]
+        i, j, k = parts.triangles[t, 0], parts.triangles[t, 1], parts.triangles[t, 2]
         a, b, c, nx, ny, nz = gap_of_vertex(p, v, i, j, k)
         square, extras = nx * nx + ny * ny + nz * nz, extra[v] + max(extra[i], max(extra[j], extra[k]))
-        if not square < (reach + extras) * (reach + extras):
+        if not square < (within + extras) * (within + extras):
             continue
         # the certified distance along n
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
@@ -172,65 +191,59 @@ def vertex_contacts(
             min(bounds[v], certified), min(bounds[i], certified), min(bounds[j], certified), min(bounds[k], certified)
         )  # fmt: skip
         # a close pair becomes a gap constraint; any other, or one for which there is no room, limits its vertices, too
-        group = candidates[m, 2]
         left = certified - extras
-        if left < close and constraint_count < members.shape[0]:
-            write_constraint(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, constraint_count, members, planes)
-            constraint_count += 1
+        if left < close and counts[1] < members.shape[0]:
+            write_constraint(v, i, j, k, 1, group, nx, ny, nz, certified, held, stop, standoff, counts[1], members, found.planes)
+            counts[1] += 1
         else:
             lower_limits(v, i, j, k, certified, left, close, extra, limits)
             report[REPORT_DROPPED] += left < close
-        # the closest pair of each group
-        if certified < closest[group, 0]:
+        # the closest pair of two leaves
+        if far and certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
         # a contact, if it is certified and within the thickness, and belongs to this triangle
-        if certified <= 0.0 or certified > thickness + margin:
+        if certified <= 0.0 or certified > thickness + reach.margin:
             continue
-        owned, is_closest, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, pairs, smooth.kinds)
-        others = pairs.piece[v] != pairs.piece[i]
+        owned, is_closest, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, parts, smooth.kinds)
+        others = parts.piece[v] != parts.piece[i]
         if not (owned and (is_closest or not others)):
             continue
         sa, sb, sc, mx, my, mz, gap, rise = a, b, c, nx, ny, nz, certified, 0.0
         if others:
-            sa, sb, sc, gap, mx, my, mz, rise = on_vertex(p, v, i, j, k, a, b, c, certified, nx, ny, nz, is_smooth, pairs, smooth)
+            sa, sb, sc, gap, mx, my, mz, rise = on_vertex(p, v, i, j, k, a, b, c, certified, nx, ny, nz, is_smooth, parts, smooth)
         if gap > 0.0:
             a, b, c, nx, ny, nz, kept = sa, sb, sc, mx, my, mz, thickness_of(gap, rise, thickness, least)
         elif certified < DEEP * thickness:
             kept = thickness_of(certified, 0.0, thickness, least)
         else:
             continue
-        if contact_count < particles.shape[0]:
-            write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, kept, contact_count, particles, coefficients)
-            contact_count += 1
+        if counts[0] < particles.shape[0]:
+            write_contact(v, i, j, k, 1.0, -a, -b, -c, nx, ny, nz, kept, counts[0], particles, found.coefficients)
+            counts[0] += 1
         else:
             report[REPORT_DROPPED] += 1
-    return contact_count, constraint_count
 
 
 @uncounted
-def edge_contacts(
-    p, candidates, pairs, smooth, reach, extra, thickness, least, margin, close, stop, standoff, held, bounds, limits,
-    contact_count, particles, coefficients, constraint_count, members, planes, report,
-):  # fmt: skip
-    """Evaluate pairs of edges; arguments and results as in ``vertex_contacts``, candidates: (candidates, 2).
+def edge_contacts(number, far, parts, reach, extent, smooth, room, found):
+    """The same for a batch of two edges.
 
     Only ridges whose closest points both lie inside become contacts: elsewhere vertices and triangles cover the same contact.  Only
-    vertices and triangles that are not near pairs push each other apart, see ``least``.  Where cloth is pinched, near pairs
-    have no room for their thickness, and close edges become ridges and stop being ridges: what pushed them would never rest.
+    vertices and triangles that are not near pairs push each other apart.  Where cloth is pinched, near pairs have no room for their
+    thickness, and close edges become ridges and stop being ridges: what pushed them would never rest.
     """
-    for m in range(candidates.shape[0]):
+    p, extra, held, bounds, limits, batch = room.p, room.extra, room.held, room.bounds, room.limits, room.pairs
+    particles, members, report, counts = found.particles, found.members, found.report, found.counts
+    within, thickness, close = distances_of(reach, far)
+    least, stop, standoff = -np.inf, reach.stop, reach.standoff
+    for m in range(keep_edges(number, within, extent, parts.edges, room.near, batch, room.ends, room.lower)):
         # the closest points, and whether they are within reach
-        e, f = candidates[m, 0], candidates[m, 1]
-        i, j, k, l = pairs.edges[e, 0], pairs.edges[e, 1], pairs.edges[f, 0], pairs.edges[f, 1]
+        e, f = batch[0, m], batch[1, m]
+        i, j, k, l = parts.edges[e, 0], parts.edges[e, 1], parts.edges[f, 0], parts.edges[f, 1]
         extras = max(extra[i], extra[j]) + max(extra[k], extra[l])
-        if segments_apart(
-            p[i, 0], p[i, 1], p[i, 2], p[j, 0], p[j, 1], p[j, 2], p[k, 0], p[k, 1], p[k, 2], p[l, 0], p[l, 1], p[l, 2],
-            reach + extras,
-        ):  # fmt: skip
-            continue
         s, t, nx, ny, nz = gap_of_edges(p, i, j, k, l)
         square = nx * nx + ny * ny + nz * nz
-        if not square < (reach + extras) * (reach + extras):
+        if not square < (within + extras) * (within + extras):
             continue
         # the certified distance along n
         scale = 1.0 / np.sqrt(square) if square > 0.0 else 0.0
@@ -243,46 +256,50 @@ def edge_contacts(
         )  # fmt: skip
         # a close pair becomes a gap constraint; any other, or one for which there is no room, limits its vertices, too
         left = certified - extras
-        if left < close and constraint_count < members.shape[0]:
-            write_constraint(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, constraint_count, members, planes)
-            constraint_count += 1
+        if left < close and counts[1] < members.shape[0]:
+            write_constraint(i, j, k, l, 2, -1, nx, ny, nz, certified, held, stop, standoff, counts[1], members, found.planes)
+            counts[1] += 1
         else:
             lower_limits(i, j, k, l, certified, left, close, extra, limits)
             report[REPORT_DROPPED] += left < close
         # a contact, if it is certified and within the thickness
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
-        if inside and smooth.ridges[e] and smooth.ridges[f] and certified > 0.0 and certified <= thickness + margin:
-            so, to, mx, my, mz, gap, rise = s, t, nx, ny, nz, certified, 0.0
-            if pairs.piece[i] != pairs.piece[k]:
-                so, to, gap, mx, my, mz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, pairs, smooth)
-            if gap > 0.0:
-                s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, least)
-            elif certified < DEEP * thickness:
-                kept = thickness_of(certified, 0.0, thickness, least)
-            else:
-                continue
-            if contact_count < particles.shape[0]:
-                write_contact(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, kept, contact_count, particles, coefficients)
-                contact_count += 1
-            else:
-                report[REPORT_DROPPED] += 1
-    return contact_count, constraint_count
+        if not (inside and certified > 0.0 and certified <= thickness + reach.margin):
+            continue
+        if not (is_ridge(room.faces, parts.edge_triangles, e) and is_ridge(room.faces, parts.edge_triangles, f)):
+            continue
+        so, to, mx, my, mz, gap, rise = s, t, nx, ny, nz, certified, 0.0
+        if parts.piece[i] != parts.piece[k]:
+            so, to, gap, mx, my, mz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, parts, smooth)
+        if gap > 0.0:
+            s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, least)
+        elif certified < DEEP * thickness:
+            kept = thickness_of(certified, 0.0, thickness, least)
+        else:
+            continue
+        if counts[0] < particles.shape[0]:
+            write_contact(i, j, k, l, 1.0 - s, s, t - 1.0, -t, nx, ny, nz, kept, counts[0], particles, found.coefficients)
+            counts[0] += 1
+        else:
+            report[REPORT_DROPPED] += 1
 
 
-@apart
-def constrain_layers(
-    p, corners, leaves, gaps, closest, extra, close, stop, standoff, held, bounds, limits, layered, constraint_count, members,
-    planes, report,
-):  # fmt: skip
+@uncounted
+def constrain_layers(number, first, corners, reach, room, found):
     """Replace the gap constraints between the vertices and triangles of two leaves by one, where a plane between the leaves
-    certifies about the same distance.  Returns the number of gap constraints.
+    certifies about the same distance.
 
-    leaves: pairs of leaves, (pairs, 2).  gaps: the best distance certified by a plane of either leaf [m] and its normal, (pairs,
-    4); the plane normal to the closest pair of vertex and triangle, ``closest``, may certify more.  layered: becomes which pairs of
-    leaves have such a plane, (pairs,).  The rest as in ``vertex_contacts``.
+    number: of the pairs in ``room.leaves``.  first: the first gap constraint of their vertices and triangles.  corners: of leaves,
+    (leaves, 4).  ``room.gaps``: the best distance certified by a plane of either leaf [m] and its normal; the plane normal to the
+    closest pair of vertex and triangle, ``room.closest``, may certify more.  ``room.layered``: becomes which pairs of leaves have
+    such a plane.
     """
+    p, extra, held, bounds, limits = room.p, room.extra, room.held, room.bounds, room.limits
+    leaves, gaps, closest, layered = room.leaves, room.gaps, room.closest, room.layered
+    members, planes, report, counts = found.members, found.planes, found.report, found.counts
+    close, stop, standoff = CLOSE * min(reach.near, reach.far), reach.stop, reach.standoff
     # the pairs of leaves with such a plane
-    for pair in range(leaves.shape[0]):
+    for pair in range(number):
         leaf, other = leaves[pair, 0], leaves[pair, 1]
         layered[pair] = gaps[pair, 0] >= max(LAYERED * closest[pair, 0], stop)
         if not layered[pair]:
@@ -296,8 +313,8 @@ def constrain_layers(
                     closest[pair, 3],
                 )
     # drop the gap constraints of their vertices and triangles
-    kept = 0
-    for t in range(constraint_count):
+    kept = first
+    for t in range(first, counts[1]):
         if members[t, G_GROUP] >= 0 and layered[members[t, G_GROUP]]:
             continue
         if kept < t:
@@ -307,7 +324,7 @@ def constrain_layers(
                 planes[kept, c] = planes[t, c]
         kept += 1
     # one gap constraint for each, or limits where there is no room or need
-    for pair in range(leaves.shape[0]):
+    for pair in range(number):
         if not layered[pair]:
             continue
         leaf, other, gap = leaves[pair, 0], leaves[pair, 1], gaps[pair, 0]
@@ -337,77 +354,4 @@ def constrain_layers(
             planes[kept, 0], planes[kept, 1], planes[kept, 2] = sign * nx, sign * ny, sign * nz
             planes[kept, G_KEPT] = min(gap, standoff if any_held else stop)
             kept += 1
-    return kept
-
-
-@inlined
-def query(p, ahead, pairs, reach, extra, held, bounds, limits, particles, coefficients, members, planes, report):
-    """Find what is close in one environment.  Returns the numbers of contacts, which are in ``particles`` and ``coefficients``, and
-    of gap constraints, which are in ``members`` and ``planes``.
-
-    p: positions in float64 [m]; ahead: in the middle of the time that contacts last, see ``contact_normals``, both
-    (particles, 3).  extra: how much farther than the reach to look around each vertex [m], (particles,).
-    held: which particles are attached, (particles,).
-    bounds: becomes how far each vertex may move before its gap constraints are evaluated; limits: before a query is due [m],
-    (particles,).  report: (REPORT_SIZE,).
-    """
-    triangles, edges = pairs.triangles, pairs.edges
-    # the distances of the query; pairs that are not found are farther apart than the least reach
-    least_reach, margin, stop, standoff = min(reach.near, reach.far), reach.margin, reach.stop, reach.standoff
-    close = CLOSE * least_reach
-    bounds[:] = least_reach
-    limits[:] = least_reach
-    # unit normals, and the edges that may be in contact
-    faces, ridges = np.empty((3, triangles.shape[0])), np.empty(edges.shape[0], np.bool_)
-    faces_of(p, triangles, faces)
-    ridges_of(faces, pairs.edge_triangles, ridges)
-    smooth = SmoothSheet(ahead, np.empty(p.shape), np.zeros(p.shape[0], np.uint8), ridges)
-    several = False
-    for v in range(p.shape[0]):
-        several |= pairs.piece[v] != pairs.piece[0]
-    if several:
-        smooth_out(pairs, faces, smooth)
-    # near pairs: parts that share a leaf or whose leaves share a vertex
-    near, far, thin, thick = reach.near, reach.far, reach.near_thickness, reach.far_thickness
-    corners, sides = near_candidates(p, pairs, near, extra)
-    closest = np.zeros((1, 4))
-    closest[0, 0] = near
-    # an int64, since a literal has a type of its own and the kernel would be compiled twice
-    none = np.int64(0)
-    contact_count, constraint_count = vertex_contacts(
-        p, corners, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff,
-        held, bounds, limits, closest, none, particles, coefficients, none, members, planes, report,
-    )  # fmt: skip
-    # near pairs belong to no pair of leaves
-    members[:constraint_count, G_GROUP] = -1
-    contact_count, constraint_count = edge_contacts(
-        p, sides, pairs, smooth, near, extra, thin, -np.inf, margin, close, stop, standoff, held, bounds, limits,
-        contact_count, particles, coefficients, constraint_count, members, planes, report,
-    )  # fmt: skip
-    # all other pairs: vertices and triangles, layers, then edges
-    leaves, gaps, corners = far_pairs(p, pairs, far, extra, faces)
-    closest = np.zeros((leaves.shape[0], 4))
-    closest[:, 0] = far
-    contact_count, constraint_count = vertex_contacts(
-        p, corners, pairs, smooth, far, extra, thick, thick, margin, close, stop, standoff,
-        held, bounds, limits, closest, contact_count, particles, coefficients, constraint_count, members, planes, report,
-    )  # fmt: skip
-    layered = np.empty(leaves.shape[0], np.bool_)
-    constraint_count = constrain_layers(
-        p, pairs.corners, leaves, gaps, closest, extra, close, stop, standoff, held, bounds, limits, layered, constraint_count,
-        members, planes, report,
-    )  # fmt: skip
-    sides = far_sides(p, pairs, leaves, layered, ridges, far, extra)
-    contact_count, constraint_count = edge_contacts(
-        p, sides, pairs, smooth, far, extra, thick, -np.inf, margin, close, stop, standoff, held, bounds, limits,
-        contact_count, particles, coefficients, constraint_count, members, planes, report,
-    )  # fmt: skip
-    # bounds and limits: gamma_p times the smallest distances, less the margin
-    least = least_reach
-    for v in range(p.shape[0]):
-        least = min(least, bounds[v])
-        bounds[v] = SHARE * max(bounds[v] - MARGIN, 0.0)
-        limits[v] = SHARE * max(limits[v] - MARGIN + 2.0 * extra[v], 0.0)
-    if least < least_reach:
-        report[REPORT_GAP] = min(report[REPORT_GAP], max(least, 0.0))
-    return contact_count, constraint_count
+    counts[1] = kept

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from clothgym import contact_memory
 from clothgym._jit import kernel
 from clothgym.checks import not_negative, positive
-from clothgym.collisions.self.broad_phase import Reach, far_pairs, far_sides
+from clothgym.collisions.self.broad_phase import Reach, faces_of
 from clothgym.collisions.self.contact_normals import SmoothSheet
 from clothgym.collisions.self.displacement_bounds import FARTHEST
+from clothgym.collisions.self.far_pairs import far_contacts
 from clothgym.collisions.self.impulses import TOLERANCE
-from clothgym.collisions.self.narrow_phase import MARGIN, edge_contacts, gap_of_edges, gap_of_vertex, vertex_contacts
+from clothgym.collisions.self.lower_bounds import round_positions
+from clothgym.collisions.self.narrow_phase import MARGIN, gap_of_edges, gap_of_vertex
+from clothgym.collisions.self.query_room import Found, room_for_queries
 from clothgym.collisions.self.spread import spread_out
 from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
 from clothgym.collisions.self.topology import Pairs, pairs_of
@@ -165,8 +168,8 @@ class SelfCollision:
             return
         # most starts are spread out, which rules intersections out without the exact check
         x, pairs = np.asarray(positions, self.dtype).reshape(-1, *positions.shape[-2:]), self.sheet.pairs
-        near = np.flatnonzero(~spread_out(np.ascontiguousarray(x, np.float64), pairs.triangles, pairs.to_rest))
-        found = first_intersection(pairs.triangles, x[near]) if len(near) else None
+        near = np.flatnonzero(~spread_out(np.ascontiguousarray(x, np.float64), pairs.parts.triangles, pairs.to_rest))
+        found = first_intersection(pairs.parts.triangles, x[near]) if len(near) else None
         if found is not None:
             which, one, two = envs[near[found[0]]], *found[1:]
             raise ValueError(
@@ -258,11 +261,11 @@ def memory_of(layout: Layout, particles: int, dtype: np.dtype) -> Memory:
 
 
 @kernel
-def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
-    """Shortest distance of a near pair of primitives [m]."""
-    shortest = np.inf
-    for n in range(near_pairs.shape[0]):
-        i, j = near_pairs[n, 0], near_pairs[n, 1]
+def shortest_near(p, parts, primitives, vertex_triangles):
+    """Shortest distance of a near pair of primitives [m]; the first ``vertex_triangles`` are vertices and triangles."""
+    triangles, edges, shortest = parts.triangles, parts.edges, np.inf
+    for n in range(primitives.shape[0]):
+        i, j = primitives[n, 0], primitives[n, 1]
         if n < vertex_triangles:
             _, _, _, x, y, z = gap_of_vertex(p, i, triangles[j, 0], triangles[j, 1], triangles[j, 2])
         else:
@@ -273,25 +276,20 @@ def shortest_near(p, triangles, edges, near_pairs, vertex_triangles):
 
 @kernel
 def least_far(p, pairs, reach, particles, coefficients, members, planes, report):
-    """Shortest distance of primitives that do not hang together, or ``reach`` where none is within it [m].
+    """Shortest distance of primitives that do not hang together, or ``reach.far`` where none is within it [m].
 
-    particles, coefficients, members, planes: without rows, so that nothing is kept; report: scratch.
+    reach: a ``Reach`` without any thickness.  particles, coefficients, members, planes: without rows, so that nothing is kept;
+    report: scratch.
     """
-    count, zero, none = p.shape[0], 0.0, np.int64(0)
-    extra, room, limits = np.zeros(count), np.full(count, reach), np.full(count, reach)
-    held, flat = np.zeros(count, np.bool_), np.zeros(pairs.edges.shape[0], np.bool_)
-    leaves, _, corners = far_pairs(p, pairs, reach, extra, np.zeros((3, pairs.triangles.shape[0])))
-    sides = far_sides(p, pairs, leaves, np.zeros(leaves.shape[0], np.bool_), flat, reach, extra)
-    smooth = SmoothSheet(p, np.zeros(p.shape), np.zeros(count, np.uint8), flat)
-    vertex_contacts(
-        p, corners, pairs, smooth, reach, extra, zero, zero, zero, zero, zero, zero, held, room, limits,
-        np.zeros((leaves.shape[0], 4)), none, particles, coefficients, none, members, planes, report,
-    )  # fmt: skip
-    edge_contacts(
-        p, sides, pairs, smooth, reach, extra, zero, zero, zero, zero, zero, zero, held, room, limits, none, particles,
-        coefficients, none, members, planes, report,
-    )  # fmt: skip
-    return room.min()
+    room = room_for_queries(coefficients, pairs, 0)
+    room.p[:] = p
+    room.bounds[:] = reach.far
+    room.held[:] = False
+    faces_of(p, pairs.parts.triangles, room.faces)
+    extent = round_positions(p, room.extra, room.near)
+    found = Found(particles, coefficients, members, planes, room.counts, report)
+    far_contacts(pairs, reach, extent, SmoothSheet(room.p, room.normals, room.kinds), room, found)
+    return room.bounds.min()
 
 
 def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.dtype) -> Reach:
@@ -301,11 +299,13 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
         ValueError: the sheet is that close to itself at rest.
     """
     p = mesh.rest_positions.astype(np.float64)
-    near = float(shortest_near(p, pairs.triangles, pairs.edges, pairs.near_pairs, pairs.vertex_triangles))
+    near = float(shortest_near(p, pairs.parts, pairs.near.primitives, pairs.near.vertex_triangles))
     nothing = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype), np.empty((0, G_SIZE), np.int32), np.empty((0, 4))
-    apart = float(least_far(p, pairs, 2 * near, *nothing, np.empty(REPORT_SIZE)))
+    # without a thickness there are no contacts, and with an infinite stop no layers
+    bare = Reach(2 * near, 2 * near, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0)
+    apart = float(least_far(p, pairs, bare, *nothing, np.empty(REPORT_SIZE)))
     # of single triangles nothing is near, and of one alone nothing else
-    shortest = np.sqrt(1 / pairs.rest_edges.max())
+    shortest = np.sqrt(1 / pairs.parts.rest_edges.max())
     usual = USUAL * min(near, apart, shortest) if near == np.inf else USUAL * near
     own = usual if thickness is None else thickness
     if own > FAR_MOST * apart:

@@ -28,14 +28,24 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined, kernel, placeholder, specialize, uncounted
 from clothgym.collisions.self.broad_phase import Reach
-from clothgym.collisions.self.displacement_bounds import confine, find_outside_in_lanes, find_outside_of_sheet, note_uncertain
+from clothgym.collisions.self.displacement_bounds import (
+    catch_up,
+    confine,
+    find_outside_in_lanes,
+    find_outside_of_sheet,
+    keep,
+    note_uncertain,
+)
 from clothgym.collisions.self.impulses import press_again, repel, sweep_lane, sweep_sheet
+from clothgym.collisions.self.query_room import room_for_queries
 from clothgym.collisions.self.topology import Pairs
 from clothgym.contact_memory import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
 
 # of a layout
 correct = placeholder("correct", "``impulses.repel``")
-find_outside = placeholder("find_outside", "of (x, start, bounds, limits, samples, outside, any_outside, query_due)")
+find_outside = placeholder(
+    "find_outside", "of (x, start, bounds, limits, samples, outside, any_outside, query_due): whether a vertex has"
+)
 
 PUSH = 0.5  # largest speed at which what is too close is pushed apart [m/s]
 
@@ -112,63 +122,107 @@ class Sheet(NamedTuple):
     memory: Memory
 
 
-@uncounted
-def press(x, v, w, sheet, block, step, h, carried):
+@inlined
+def press(x, v, w, sheet, block, step, carried):
     """Stage 1, before the solids: the contacts of one block apply their impulses of the previous substep.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  step: of the control step.  h: the
-    substep [s].  carried: time for which a new velocity has already moved the positions at the end of a substep [s].
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  step: of the control step.  carried:
+    time for which a new velocity has already moved the positions at the end of a substep [s].
+
+    Like ``keep_apart`` it is part of the main loop: to give a kernel all arrays of ``sheet`` takes as long as a small sheet's
+    forces, so only those are called that have something to do.
     """
-    memory = sheet.memory
-    # each control step has its own report; contacts and lags from before go on
     if step == 0:
-        memory.choices[block] = -1
-        for l in range(memory.used[block]):
-            report = memory.report[block, l]
-            report[:] = 0
-            report[REPORT_GAP] = np.inf
-            report[REPORT_CONTACTS] = memory.contacts[block, l]
-            report[REPORT_LAG] = memory.behind[block, l]
-        # float32 certifies distances only near the origin
-        if sheet.setting.single:
-            note_uncertain(x, memory.report[block], memory.used[block])
-    if _any_contact(memory, block):
-        press_again(x, v, w, memory.pressed[block], carried)
+        _begin(x, sheet, block)
+    if _any_contact(sheet.memory.contacts, sheet.memory.used, block):
+        press_again(x, v, w, sheet.memory.pressed[block], carried)
 
 
-def keep_apart(x, v, w, sheet, block, h, carried):
-    """Stages 2 and 3, after the solids: impulses, then bounds.  Arguments as in ``press``."""
-    if _any_contact(sheet.memory, block):
+@uncounted
+def _begin(x, sheet, block):
+    """Each control step has its own report; contacts and lags from before go on."""
+    memory = sheet.memory
+    memory.choices[block] = -1
+    for l in range(memory.used[block]):
+        report = memory.report[block, l]
+        report[:] = 0
+        report[REPORT_GAP] = np.inf
+        report[REPORT_CONTACTS] = memory.contacts[block, l]
+        report[REPORT_LAG] = memory.behind[block, l]
+    # float32 certifies distances only near the origin
+    if sheet.setting.single:
+        note_uncertain(x, memory.report[block], memory.used[block])
+
+
+def keep_apart(x, v, w, sheet, room, block, h, carried):
+    """Stages 2 and 3, after the solids: impulses, then bounds.  room: a ``query_room.Room``.  The rest as in ``press``."""
+    memory = sheet.memory
+    if _any_sweep_due(memory.contacts, memory.waited, memory.span, memory.aged, memory.used, block):
         correct(x, v, w, sheet, block, h, carried)
-    confine(x, v, w, sheet, block, h, find_outside)
+    # particles that lag behind their attachments catch up
+    for l in range(memory.used[block]):
+        if memory.behind[block, l] > 0:
+            memory.behind[block, l] = catch_up(x, w, memory.lag[block], l, h)
+    if find_outside(
+        x, memory.start[block], memory.bounds[block], memory.limits[block], sheet.pairs.samples, memory.outside[block],
+        memory.any_outside[block], memory.query_due[block],
+    ):  # fmt: skip
+        confine(x, v, w, sheet, room, block, h)
+    # these positions are certified now
+    keep(x.reshape(x.size), memory.old[block].reshape(x.size))
 
 
 @inlined
-def _any_contact(memory, block):
+def _any_contact(contacts, used, block):
     """Whether a block has contacts."""
-    for l in range(memory.used[block]):
-        if memory.contacts[block, l] > 0:
-            return True
-    return False
+    some = False
+    for l in range(used[block]):
+        some |= contacts[block, l] > 0
+    return some
+
+
+@inlined
+def _any_sweep_due(contacts, waited, span, aged, used, block):
+    """Whether a sweep is due in a lane with contacts, in each of which a substep has passed."""
+    due = False
+    for l in range(used[block]):
+        if contacts[block, l] > 0:
+            waited[block, l] += 1
+            aged[block, l] += 1
+            due |= waited[block, l] >= span[block, l]
+    return due
 
 
 @kernel
-def press_nothing(x, v, w, sheet, block, step, h, carried):
+def press_nothing(x, v, w, sheet, block, step, carried):
     """Stage 1 of a simulation without self-collision."""
 
 
 @kernel
-def keep_nothing_apart(x, v, w, sheet, block, h, carried):
+def keep_nothing_apart(x, v, w, sheet, room, block, h, carried):
     """Stages 2 and 3 of a simulation without self-collision."""
+
+
+@kernel
+def room_for_nothing(x, sheet):
+    """Scratch of a simulation without self-collision."""
+    return (np.empty(0, x.dtype),)
+
+
+@kernel
+def room_for_sheet(x, sheet):
+    """Scratch of ``keep_apart``, a ``query_room.Room``."""
+    return room_for_queries(x, sheet.pairs, sheet.memory.particles.shape[2])
 
 
 def kernels_of(collides: bool, by_particle: bool) -> dict[str, Any]:
     """What the main loop calls by these names, with self-collision or without, where a block is one sheet or has many lanes."""
     if not collides:
-        return {"press": press_nothing, "keep_apart": keep_nothing_apart}
+        return {"press": press_nothing, "keep_apart": keep_nothing_apart, "room_for_self_contact": room_for_nothing}
     layout = "particles" if by_particle else "lanes"
     parts = {
         "correct": specialize(uncounted(repel), f"repel_{layout}", sweep=sweep_sheet if by_particle else sweep_lane),
         "find_outside": find_outside_of_sheet if by_particle else find_outside_in_lanes,
     }
-    return {"press": press, "keep_apart": specialize(uncounted(keep_apart), f"keep_apart_{layout}", apart=True, **parts)}
+    kept = specialize(keep_apart, f"keep_apart_{layout}", inline=True, **parts)
+    return {"press": press, "keep_apart": kept, "room_for_self_contact": room_for_sheet}

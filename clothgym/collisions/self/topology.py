@@ -32,14 +32,15 @@ NODE_BEGIN, NODE_END, NODE_NEXT = (
     1,
     2,
 )  # columns of a node: its first leaf, one past its last, and the node that follows its subtree
+MOST_OFFSETS = 32  # differences of near vertices' numbers: grids have 12
 SAMPLES = 16  # vertices whose mean displacement stands for that of the whole sheet
 
 Int = NDArray[np.int32]
 Real = NDArray[np.float64]
 
 
-class Pairs(NamedTuple):
-    """A mesh's primitives and pairs in the order of a query.  Ranges are given by where each begins, with the total at the end.
+class Parts(NamedTuple):
+    """Primitives of a mesh and their neighbors.
 
     triangles, edges: vertices of each, (triangles, 3), (edges, 2); triangle_edges: the edge opposite each corner, (triangles, 3).
     edge_triangles: both triangles of each edge, (edges, 2), the same twice on the border.
@@ -47,19 +48,6 @@ class Pairs(NamedTuple):
     vertex_owner, edge_owner: the triangle that owns each in contacts, (particles,), (edges,).
     piece: which piece of the mesh each vertex belongs to, (particles,).
     around: where the triangles around each vertex begin in ``around_triangles``, (particles + 1,).
-    corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
-    leaf_vertices, leaf_edges, leaf_triangles: where those of each leaf begin in ``own_*``, (leaves + 1,).
-    nodes: of the tree, each before its two children, the first of which follows it at once: see ``NODE_BEGIN``, (nodes, 3).
-    beside: where the list of adjacent nodes begins for each node without children, itself and later ones, (nodes + 1,).
-    beside_nodes: these lists; beside_leaves: for each entry the pairs of leaves not to be searched, as bits: leaf k of the first
-    node and m of the second, which share a vertex or are found in the other order, are bit ``NODE_LEAVES * k + m``.
-    partners: where near pairs of vertices begin for each first vertex, (particles + 1,); partner: the second vertex; slack: the
-    largest of their primitive pairs, at rest [m^2], (near,).
-    near: where the primitive pairs of each near pair of vertices begin in ``near_list``, which indexes ``near_pairs``, (near + 1,).
-    near_pairs: first and second primitive, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then
-    two edges.
-    samples: vertices that stand for the whole sheet, (SAMPLES,).
-    to_rest: see ``spread``.
     """
 
     triangles: Int
@@ -72,6 +60,19 @@ class Pairs(NamedTuple):
     piece: Int
     around: Int
     around_triangles: Int
+
+
+class Tree(NamedTuple):
+    """Leaves and nodes of a mesh.  Ranges are given by where each begins, with the total at the end.
+
+    corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
+    leaf_vertices, leaf_edges, leaf_triangles: where those of each leaf begin in ``own_*``, (leaves + 1,).
+    nodes: of the tree, each before its two children, the first of which follows it at once: see ``NODE_BEGIN``, (nodes, 3).
+    beside: where the list of adjacent nodes begins for each node without children, itself and later ones, (nodes + 1,).
+    beside_nodes: these lists; beside_leaves: for each entry the pairs of leaves not to be searched, as bits: leaf k of the first
+    node and m of the second, which share a vertex or are found in the other order, are bit ``NODE_LEAVES * k + m``.
+    """
+
     corners: Int
     leaf_vertices: Int
     own_vertices: Int
@@ -83,13 +84,41 @@ class Pairs(NamedTuple):
     beside: Int
     beside_nodes: Int
     beside_leaves: NDArray[np.int64]
-    partners: Int
-    partner: Int
-    slack: Real
-    near: Int
-    near_list: Int
-    near_pairs: Int
+
+
+class Near(NamedTuple):
+    """Near pairs of vertices, and the near pairs of primitives that have them.
+
+    first, second: vertices of each pair; slack: the largest of their primitive pairs, at rest [m^2], (near,).
+    offsets: where the vertices of a grid are numbered by rows, the few differences of second and first vertex, (offsets,).  Then
+    there is a row of pairs for each of them, with a pair for each first vertex, and a slack of -inf where there is none.
+    begin: where the near pairs of each begin in ``which``, with the total at the end, (near + 1,); which: indices of
+    ``primitives``, (list,).
+    primitives: first and second, (near primitive pairs, 2): vertex and triangle for the first ``vertex_triangles``, then two edges.
+    Both are filled up to multiples of eight with pairs that nothing refers to.
+    neighbors: triangles around each vertex, (most, particles), those of a vertex that has fewer repeated.
+    """
+
+    first: Int
+    second: Int
+    slack: NDArray[np.float32]
+    offsets: NDArray[np.int64]
+    begin: Int
+    which: Int
+    primitives: Int
     vertex_triangles: int
+    neighbors: Int
+
+
+class Pairs(NamedTuple):
+    """A mesh's primitives and pairs in the order of a query.
+
+    samples: vertices that stand for the whole sheet, (SAMPLES,).  to_rest: see ``spread``.
+    """
+
+    parts: Parts
+    tree: Tree
+    near: Near
     samples: Int
     to_rest: Real
 
@@ -123,43 +152,23 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     beside = [sorted({other for vertex in set(own.tolist()) for other in leaves_around[vertex]}) for own in corners]
     # near pairs
     vertex_triangle, edge_edge = _near_pairs(triangles, edges, leaves, beside, vertex_leaf, edge_leaf)
-    ends, slack, near, near_list = _near_vertices(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge)
     # what belongs to each leaf, and which leaves are not searched
     counted = [_ranges(np.bincount(of, minlength=len(leaves))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     begins, beside_nodes, beside_leaves = _adjacent_nodes(np.array(nodes), beside)
-    return Pairs(
-        triangles=_int(triangles),
-        edges=_int(edges),
-        triangle_edges=_int(triangle_edges),
-        edge_triangles=_int(np.stack([edge_owner, last], axis=1)),
-        rest_edges=1 / length2,
-        vertex_owner=_int(vertex_owner),
-        edge_owner=_int(edge_owner),
-        piece=_int(mesh.piece_of),
-        around=_ranges(np.bincount(triangles.ravel(), minlength=len(x))),
-        around_triangles=_int(np.argsort(triangles.ravel(), kind="stable") // 3),
-        corners=_int(corners),
-        leaf_vertices=counted[0],
-        own_vertices=_int(by_leaf[0]),
-        leaf_edges=counted[1],
-        own_edges=_int(by_leaf[1]),
-        leaf_triangles=counted[2],
-        own_triangles=_int(by_leaf[2]),
-        nodes=_int(np.array(nodes)),
-        beside=begins,
-        beside_nodes=beside_nodes,
-        beside_leaves=beside_leaves,
-        partners=_ranges(np.bincount(ends[:, 0], minlength=len(x))),
-        partner=_int(ends[:, 1]),
-        slack=slack,
-        near=near,
-        near_list=_int(near_list),
-        near_pairs=_int(np.concatenate([vertex_triangle, edge_edge])),
-        vertex_triangles=len(vertex_triangle),
-        samples=_int(np.linspace(0, len(x) - 1, SAMPLES).round()),
-        to_rest=to_rest(mesh),
-    )
+    around = _ranges(np.bincount(triangles.ravel(), minlength=len(x)))
+    around_triangles = np.argsort(triangles.ravel(), kind="stable") // 3
+    both = np.stack([edge_owner, last], axis=1)
+    parts = Parts(
+        *map(_int, (triangles, edges, triangle_edges, both)), 1 / length2, *map(_int, (vertex_owner, edge_owner, mesh.piece_of)),
+        around, _int(around_triangles),
+    )  # fmt: skip
+    tree = Tree(
+        _int(corners), counted[0], _int(by_leaf[0]), counted[1], _int(by_leaf[1]), counted[2], _int(by_leaf[2]),
+        _int(np.array(nodes)), begins, beside_nodes, beside_leaves,
+    )  # fmt: skip
+    near = _near(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge, around, around_triangles)
+    return Pairs(parts, tree, near, _int(np.linspace(0, len(x) - 1, SAMPLES).round()), to_rest(mesh))
 
 
 def _int(values: NDArray) -> Int:
@@ -267,15 +276,11 @@ def _near_pairs(
     return np.array(vertex_triangle, np.int64).reshape(-1, 2), np.array(edge_edge, np.int64).reshape(-1, 2)
 
 
-def _near_vertices(
-    triangles: NDArray,
-    edges: NDArray,
-    triangle_edges: NDArray,
-    length2: NDArray,
-    vertex_triangle: NDArray,
-    edge_edge: NDArray,
-) -> tuple[NDArray, Real, Int, NDArray]:
-    """Pairs of vertices of near pairs, their slack [m^2], and the near pairs that each is in: where they begin, and which."""
+def _near(
+    triangles: NDArray, edges: NDArray, triangle_edges: NDArray, length2: NDArray, vertex_triangle: NDArray, edge_edge: NDArray,
+    around: NDArray, around_triangles: NDArray,
+) -> Near:  # fmt: skip
+    """Pairs of vertices of near pairs, their slack [m^2], and the near pairs that each is in."""
     # squared radius of the smallest circle around each triangle: half its longest side if obtuse, else its circumcircle
     a, b, c = np.sort(length2[triangle_edges], axis=1).T
     doubled2 = (2 * (a * b + b * c + c * a) - a * a - b * b - c * c) / 4  # the square of twice the area (Heron)
@@ -290,7 +295,34 @@ def _near_vertices(
     # each pair of vertices once, with its largest slack, and its near pairs in order
     both = np.sort(np.stack([np.concatenate(first), np.concatenate(second)], axis=1), axis=1)
     ends, pair = np.unique(both, axis=0, return_inverse=True)
+    pair = pair.ravel()
     largest = np.zeros(len(ends))
-    np.maximum.at(largest, pair.ravel(), np.concatenate(slack))
-    order = np.argsort(pair.ravel(), kind="stable")
-    return ends, largest, _ranges(np.bincount(pair.ravel(), minlength=len(ends))), which[order]
+    np.maximum.at(largest, pair, np.concatenate(slack))
+    # of a grid they go by offset and first vertex
+    first_vertex, second_vertex, offsets = *ends.T, np.unique(ends[:, 1] - ends[:, 0])
+    if len(offsets) <= MOST_OFFSETS:
+        particles = len(around) - 1
+        place = np.searchsorted(offsets, second_vertex - first_vertex) * particles + first_vertex
+        first_vertex = np.tile(np.arange(particles), len(offsets))
+        second_vertex = np.minimum(first_vertex + np.repeat(offsets, particles), particles - 1)
+        pair, slacks = place[pair], np.full(len(first_vertex), -np.inf)
+        slacks[place] = largest
+        largest = slacks
+    else:
+        offsets = offsets[:0]
+    begin = _ranges(np.bincount(pair, minlength=len(first_vertex)))
+    # the triangles around each vertex in columns of one length; a vertex without any takes the first
+    counts = np.diff(around)
+    column = around[:-1] + np.minimum(np.arange(max(counts.max(), 1))[:, None], np.maximum(counts - 1, 0))
+    neighbors = np.where(counts > 0, np.append(around_triangles, 0)[column], 0)
+    vertex_triangle, edge_edge = _in_eights(vertex_triangle), _in_eights(edge_edge)
+    which = np.where(which < len(v), which, which + len(vertex_triangle) - len(v))[np.argsort(pair, kind="stable")]
+    return Near(
+        _int(first_vertex), _int(second_vertex), largest.astype(np.float32), offsets.astype(np.int64), begin, _int(which),
+        _int(np.concatenate([vertex_triangle, edge_edge])), len(vertex_triangle), _int(neighbors),
+    )  # fmt: skip
+
+
+def _in_eights(rows: NDArray) -> NDArray:
+    """Rows, the last repeated up to a multiple of eight."""
+    return np.concatenate([rows, np.repeat(rows[-1:], -len(rows) % 8, axis=0)])
