@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from clothgym._jit import disjoint, inlined, uncounted
+from clothgym._jit import disjoint, inlined, merged, uncounted
 from clothgym.bending import Bending, add_no_forces, add_no_products, hinge_angles, hinge_rates, hinge_rows
 from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products, most_air, set_lane_forces
 
@@ -28,7 +28,7 @@ from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane
 @inlined
 def rows_of(a):
     """The vectors of a single lane as (3, particles); a: (3, particles, 1)."""
-    return a.reshape((a.shape[0], a.shape[1]))
+    return merged(a)
 
 
 # --- springs, and the quadratic bending model ------------------------------------------------------------------------------

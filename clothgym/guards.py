@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import apart, kernel
+from clothgym._jit import apart, kernel, merged
 from clothgym.bending import BENDING, Bending, model_of
 from clothgym.checks import known, warn
 from clothgym.elements import BendArrays, Elements, SpringArrays
@@ -34,7 +34,7 @@ def mark_diverged(x, v, diverged):
     # one sheet: its arrays are flat
     limit = x.dtype.type(FASTEST)
     if diverged.shape[0] == 1:
-        diverged[0] |= not (_all_within(v.reshape(v.size), limit) and _all_within(x.reshape(x.size), x.dtype.type(np.inf)))
+        diverged[0] |= not (_all_within(merged(merged(v)), limit) and _all_within(merged(merged(x)), x.dtype.type(np.inf)))
         return
     # lane by lane
     for c in range(3):

@@ -4,6 +4,7 @@ One policy for the whole project, so that the promises made about bits and about
 
     policy             the sorts of kernels and their compiler's flags; plain numba where the rest does not fit numba
     binding            one kernel from the code of another with other callees: ``specialize``, ``placeholder``
+    merging            views that join the last two axes of an array
     cache              the folder of compiled kernels: its name, its locks
     numba_internals    all that touches what is private to numba and llvmlite
     threads            spans of blocks on Python threads
@@ -11,10 +12,11 @@ One policy for the whole project, so that the promises made about bits and about
 
 from clothgym._jit.binding import placeholder, specialize, used
 from clothgym._jit.cache import cache_folder
+from clothgym._jit.merging import merged
 from clothgym._jit.policy import WITHOUT_JIT, apart, disjoint, inlined, is_kept, kernel, uncounted
 from clothgym._jit.threads import default_threads, run_spans
 
 __all__ = [
-    "WITHOUT_JIT", "apart", "cache_folder", "default_threads", "disjoint", "inlined", "is_kept", "kernel", "placeholder",
+    "WITHOUT_JIT", "apart", "cache_folder", "default_threads", "disjoint", "inlined", "is_kept", "kernel", "merged", "placeholder",
     "run_spans", "specialize", "uncounted", "used",
 ]  # fmt: skip

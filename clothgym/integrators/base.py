@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.checks import count, number
 from clothgym.elements import Scratch, room_for_forces
 from clothgym.forces import Oscillators
@@ -216,8 +216,7 @@ def change_velocities(v, w, f, gravity, drag_rate, h, work, of_force, of_drag):
     for c in range(3):
         vc, fc, rc, gc = v[c], f[c], remainder[c], gravity[c]
         if lanes == 1:
-            flat = particles
-            _change(vc.reshape(flat), w.reshape(flat), fc.reshape(flat), rc.reshape(flat), gc[0], share[0], loss[0])
+            _change(merged(vc), merged(w), merged(fc), merged(rc), gc[0], share[0], loss[0])
             continue
         for p in range(particles):
             _change_in_lanes(vc[p], w[p], fc[p], rc[p], gc, share, loss)
@@ -286,7 +285,7 @@ def kick_and_drift(x, v, w, f, gravity, drag_rate, h, work, implicit, reach):
         xc, vc, fc, rx, rv, g = x[c], v[c], f[c], work.remainders[0, c], work.remainders[1, c], gravity[c]
         if lanes == 1:
             _kick_one(
-                xc.reshape(n), vc.reshape(n), w.reshape(n), fc.reshape(n), rx.reshape(n), rv.reshape(n), g[0], share[0], loss[0],
+                merged(xc), merged(vc), merged(w), merged(fc), merged(rx), merged(rv), g[0], share[0], loss[0],
                 reach,
             )  # fmt: skip
             continue
@@ -301,7 +300,7 @@ def advance(x, v, remainder, h):
     What the sum could not hold is in ``remainder``, exactly so where the change is not larger than x.  Serves for velocities and
     their rates, too.
     """
-    _advance(x.reshape(x.size), v.reshape(v.size), remainder.reshape(x.size), h)
+    _advance(merged(merged(x)), merged(merged(v)), merged(merged(remainder)), h)
 
 
 @disjoint
@@ -317,7 +316,7 @@ def _advance(x, v, remainder, h):
 @kernel
 def move_on(x, v, start, h):
     """``x <- start + h v``, for held particles too: where they would be at the end of a substep; (3, particles, lanes)."""
-    _move_on(x.reshape(x.size), v.reshape(v.size), start.reshape(start.size), h)
+    _move_on(merged(merged(x)), merged(merged(v)), merged(merged(start)), h)
 
 
 @disjoint
@@ -334,7 +333,7 @@ def weigh(w, total, r, h):
     r: on entry the elements' force [N]; total: the change of velocity so far [m/s]; both (3, particles, lanes).
     """
     for c in range(3):
-        _weigh(w.reshape(w.size), total[c].reshape(w.size), r[c].reshape(w.size), h)
+        _weigh(merged(w), merged(total[c]), merged(r[c]), h)
 
 
 @disjoint
@@ -349,7 +348,7 @@ def _weigh(w, total, r, h):
 @kernel
 def add_to(a, b):
     """``a <- a + b``, arrays of the same shape."""
-    _add_to(a.reshape(a.size), b.reshape(b.size))
+    _add_to(merged(merged(a)), merged(merged(b)))
 
 
 @disjoint
@@ -362,7 +361,7 @@ def _add_to(a, b):
 @uncounted
 def copy_to(a, b):
     """``a <- b``, arrays of the same shape."""
-    _copy_to(a.reshape(a.size), b.reshape(b.size))
+    _copy_to(merged(merged(a)), merged(merged(b)))
 
 
 @disjoint

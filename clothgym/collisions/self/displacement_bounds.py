@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
 from clothgym.collisions.self.narrow_phase import MARGIN, SHARE
 from clothgym.collisions.self.query import query
@@ -112,10 +112,10 @@ def _common_motion(x, start, samples, l):
 @uncounted
 def find_outside_of_sheet(x, start, bounds, limits, samples, outside, any_outside, query_due):
     """The same for a block that is one sheet."""
-    n, (mx, my, mz) = x.shape[1], _common_motion(x, start, samples, 0)
+    mx, my, mz = _common_motion(x, start, samples, 0)
     left, due = _find_outside(
-        x[0].reshape(n), x[1].reshape(n), x[2].reshape(n), start[0].reshape(n), start[1].reshape(n), start[2].reshape(n),
-        mx, my, mz, bounds.reshape(n), limits.reshape(n), outside.reshape(n),
+        merged(x[0]), merged(x[1]), merged(x[2]), merged(start[0]), merged(start[1]), merged(start[2]),
+        mx, my, mz, merged(bounds), merged(limits), merged(outside),
     )  # fmt: skip
     any_outside[0], query_due[0] = left > 0, due > 0
     return left > 0

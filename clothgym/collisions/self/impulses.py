@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import apart, disjoint, inlined, kernel, placeholder, uncounted
+from clothgym._jit import apart, disjoint, inlined, kernel, merged, placeholder, uncounted
 from clothgym.collisions.self.narrow_phase import SLOP
 from clothgym.contact_memory import C_NORMAL, C_THICKNESS, REPORT_TOUCHING
 
@@ -50,9 +50,7 @@ def press_again(x, v, w, pressed, carried):
     # adding -0 changes no bit; selecting x and v instead would keep the loop from being vectorized
     negative_zero = -x.dtype.type(0)
     for c in range(3):
-        _apply_impulses(
-            x[c].reshape(w.size), v[c].reshape(w.size), w.reshape(w.size), pressed[c].reshape(w.size), carried, negative_zero
-        )
+        _apply_impulses(merged(x[c]), merged(v[c]), merged(w), merged(pressed[c]), carried, negative_zero)
 
 
 @disjoint
@@ -80,8 +78,7 @@ def repel(x, v, w, sheet, block, h, carried):
 @uncounted
 def sweep_sheet(x, v, w, sheet, block, l, h, carried):
     """One sweep over the contacts of a block that is one sheet."""
-    number = x.shape[1]
-    _sweep_contacts(x.reshape(3, number), v.reshape(3, number), w.reshape(number), sheet, block, l, h, carried)
+    _sweep_contacts(merged(x), merged(v), merged(w), sheet, block, l, h, carried)
 
 
 @apart

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, kernel, placeholder, specialize, uncounted
+from clothgym._jit import inlined, kernel, merged, placeholder, specialize, uncounted
 from clothgym.collisions.self.broad_phase import Reach
 from clothgym.collisions.self.displacement_bounds import (
     catch_up,
@@ -169,7 +169,7 @@ def keep_apart(x, v, w, sheet, room, block, h, carried):
     ):  # fmt: skip
         confine(x, v, w, sheet, room, block, h)
     # these positions are certified now
-    keep(x.reshape(x.size), memory.old[block].reshape(x.size))
+    keep(merged(merged(x)), merged(merged(memory.old[block])))
 
 
 @inlined

@@ -39,10 +39,12 @@ NEAREST = 0.58
 def _bent(r, normals, i, j):
     """Whether a convex edge of the solid is between particles i and j: each is behind the solid's tangent at the other."""
     cosine = normals[0, i] * normals[0, j] + normals[1, i] * normals[1, j] + normals[2, i] * normals[2, j]
+    if not cosine < r.dtype.type(WIDE):
+        return False
     dx, dy, dz = r[0, j] - r[0, i], r[1, j] - r[1, i], r[2, j] - r[2, i]
     behind_i = dx * normals[0, i] + dy * normals[1, i] + dz * normals[2, i]
     behind_j = dx * normals[0, j] + dy * normals[1, j] + dz * normals[2, j]
-    return (cosine < r.dtype.type(WIDE)) & (behind_i <= 0) & (behind_j >= 0)
+    return (behind_i <= 0) & (behind_j >= 0)
 
 
 @inlined
@@ -116,21 +118,24 @@ def _turn_particle(rows, i, j):
 
 
 @uncounted
-def find_edges(r, triangles, rows, out, within, bent):
+def find_edges(r, triangles, near, rows, out, within, bent):
     """Find the triangles that lie across an edge of the solid, and the directions in which it pushes their corners.
 
-    r: positions [m], (3, particles).  rows: (EDGE_ROWS, particles) with the solid's normals at all particles; the rest is written.
+    r: positions [m], (3, particles).  near: triangles that may be near, (near,).  rows: (EDGE_ROWS, particles) with the solid's
+    normals at all particles; the rest is written.
     out: signed distances of the particles from the solid [m]; only triangles that may come closer than ``within`` count.
     bent: becomes these triangles, (triangles,).  Returns how many.
     """
     normals, number, nearest2 = rows[E_SOLID : E_SOLID + 3], 0, r.dtype.type(NEAREST * NEAREST)
-    for t in range(triangles.shape[0]):
+    for m in range(near.shape[0]):
+        t = near[m]
         i, j, k = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         # no point of the triangle is farther from all corners than NEAREST of its longest side
         beyond = min(out[i], min(out[j], out[k])) - within
-        longest = max(_square(r, i, j), max(_square(r, j, k), _square(r, k, i)))
-        if beyond > 0 and beyond * beyond > nearest2 * longest:
-            continue
+        if beyond > 0:
+            longest = max(_square(r, i, j), max(_square(r, j, k), _square(r, k, i)))
+            if beyond * beyond > nearest2 * longest:
+                continue
         if _bent(r, normals, i, j) or _bent(r, normals, j, k) or _bent(r, normals, k, i):
             bent[number] = t
             number += 1

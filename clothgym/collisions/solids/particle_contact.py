@@ -6,7 +6,7 @@ after each substep to the positions and velocities that the integrator left.
 
 from __future__ import annotations
 
-from clothgym._jit import disjoint, inlined, uncounted
+from clothgym._jit import disjoint, inlined, merged, uncounted
 from clothgym.collisions.solids.contact_law import TINY, contact_change, edge_change
 from clothgym.collisions.solids.edges import EDGE_DRAG, EDGE_ROWS, LEAST_COSINE
 from clothgym.collisions.solids.shapes import (
@@ -176,7 +176,7 @@ def resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, cou
     """
     kinds = shapes.kinds
     for k in range(kinds.shape[0]):
-        c = colliders[k].reshape(colliders.shape[1])
+        c = merged(colliders[k])
         px, py, pz = c[R_POINT], c[R_POINT + 1], c[R_POINT + 2]
         sx, sy, sz, friction = c[R_VELOCITY], c[R_VELOCITY + 1], c[R_VELOCITY + 2], c[R_FRICTION]
         # a plane: heights, then the particles from the first to the last below it

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel, placeholder, specialize, uncounted
+from clothgym._jit import kernel, merged, placeholder, specialize, uncounted
 from clothgym.collisions.solids.particle_contact import PARTICLE_ROWS, resolve_particles
 from clothgym.collisions.solids.shapes import COLLIDER_ROWS, KIND_PLANE, R_AXES, R_POINT, R_RADIUS, R_REACH2
 from clothgym.collisions.solids.signed_distance import SCRATCH_ROWS
@@ -134,11 +134,8 @@ def _resolve_particles_alone(r, s, m, triangles, shapes, colliders, h, carried, 
 
 def _resolve_where_it_lies(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
     """Move the solids on, and resolve the contacts of a block that is one sheet; x, v: (3, particles, 1)."""
-    n = x.shape[1]
     move_solids(colliders, h)
-    resolve_sheet(
-        x.reshape((3, n)), v.reshape((3, n)), w.reshape(n), triangles, shapes, colliders, h, carried, step, look_every, room, 0
-    )
+    resolve_sheet(merged(x), merged(v), merged(w), triangles, shapes, colliders, h, carried, step, look_every, room, 0)
 
 
 @uncounted

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
+from clothgym._jit import disjoint, inlined, kernel, merged, placeholder, uncounted
 from clothgym.collisions.solids.deepest_point import LYING, NO_CONTACT, find_deepest, turn_normal
 from clothgym.collisions.solids.edges import E_COSINE, E_PUSH, E_SOLID, NEAREST, UNBENT, find_edges, push_of_touch
 from clothgym.collisions.solids.particle_contact import (
@@ -218,21 +218,16 @@ def _keep_touching(rows, triangles, number, chosen, scratch):
 
 
 @inlined
-def _find_edges(r, triangles, shapes, k, collider, touching, edges, pushes, rows, bent, scratch):
+def _find_edges(r, triangles, shapes, k, collider, near, edges, pushes, rows, bent, scratch):
     """List the particles near an edge of solid k, and the directions in which it pushes them.  Returns how many they are, or -1
     where no edge is between any particles.
 
-    touching: whether triangles may touch.  edges: (particles,).  pushes: (particles, 3).  rows: positions in the solid's axes and
-    distances from its box.  bent: scratch, (triangles,).
+    near: triangles that may come closer than the thickness, (near,).  edges: (particles,).  pushes: (particles, 3).  rows: where the
+    particles are in the solid's axes, and distances from its box.  bent: scratch, (triangles,).
     """
-    n, c = r.shape[1], collider.reshape(collider.shape[0])
+    n, c = r.shape[1], merged(collider)
     # spheres and capsules have no edges
-    if shapes.kinds[k] == KIND_ROUNDED_BOX and c[R_RADIUS] > c[R_THICKNESS]:
-        return -1
-    near = touching
-    for p in range(n):
-        near |= rows[P_GAP, p] < c[R_RADIUS] + c[R_THICKNESS]
-    if not near:
+    if near.shape[0] == 0 or (shapes.kinds[k] == KIND_ROUNDED_BOX and c[R_RADIUS] > c[R_THICKNESS]):
         return -1
     # the distances and the solid's normals at all particles, in the world
     own = rows[P_EDGES:]
@@ -251,7 +246,7 @@ def _find_edges(r, triangles, shapes, k, collider, touching, edges, pushes, rows
         c[R_AXES + 5], c[R_AXES + 6], c[R_AXES + 7], c[R_AXES + 8],
     )  # fmt: skip
     # particles at corners of triangles that lie across an edge
-    if find_edges(r, triangles, own, rows[P_GAP], c[R_THICKNESS], bent) == 0:
+    if find_edges(r, triangles, near, own, rows[P_GAP], c[R_THICKNESS], bent) == 0:
         return -1
     number = 0
     for p in range(n):
@@ -272,26 +267,23 @@ def find_touches(r, triangles, shapes, k, collider, touches, which, count, edges
     edges, pushes, counts: as in ``particle_contact.resolve_particles``.  kept: impulses that triangles have had at each solid
     [N s], (colliders, triangles, 3).  rows, chosen, scratch: scratch.
     """
-    c = collider.reshape(collider.shape[0])
-    lay_out(collider, scratch)
+    c = merged(collider)
     # positions in the axes of the solid, and distances from its box
     for e in range(3):
         q = R_AXES + 3 * e
         to_axis(r[0], r[1], r[2], c[R_POINT], c[R_POINT + 1], c[R_POINT + 2], c[q], c[q + 1], c[q + 2], rows[P_LOCAL + e])
     _distances(rows[P_LOCAL], rows[P_LOCAL + 1], rows[P_LOCAL + 2], c[R_HALF], c[R_HALF + 1], c[R_HALF + 2], rows[P_GAP])
-    # triangles that may touch the solid without its thickness, and less the depth that they may sink in
-    inner = c[R_RADIUS] - (r.dtype.type(1 + SINK) * c[R_THICKNESS] + r.dtype.type(LEAST_SINK))
-    scratch[R_RADIUS] = inner
-    number = _keep_touching(rows, triangles, choose_near(rows, triangles, scratch[R_RADIUS, 0], chosen), chosen, scratch)
-    # edges; ``kept`` is not yet read, and ``chosen`` has room behind the triangles that are kept
+    # triangles that may come closer than the thickness, and edges among them; ``chosen`` has room behind the triangles
+    number = choose_near(rows, triangles, c[R_RADIUS] + c[R_THICKNESS], chosen)
     at_edges = _find_edges(
-        r, triangles, shapes, k, collider, number > 0, edges[k], pushes[k], rows, chosen[triangles.shape[0] :], scratch
+        r, triangles, shapes, k, collider, chosen[:number], edges[k], pushes[k], rows, chosen[triangles.shape[0] :], scratch
     )
-    counts[k] = max(at_edges, 0)
-    if number == 0:
-        return
+    # those that may touch the solid without its thickness, and less the depth that they may sink in
+    inner = c[R_RADIUS] - (r.dtype.type(1 + SINK) * c[R_THICKNESS] + r.dtype.type(LEAST_SINK))
     lay_out(collider, scratch)
     scratch[R_RADIUS] = inner
+    number = _keep_touching(rows, triangles, number, chosen, scratch)
+    counts[k] = max(at_edges, 0)
     # the deepest point of each, and the normal there
     for begin in range(0, number, scratch.shape[1]):
         filled = min(scratch.shape[1], number - begin)
