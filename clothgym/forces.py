@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, inlined, kernel, placeholder, uncounted
+from clothgym._jit import disjoint, inlined, kernel, merged, placeholder, uncounted
 from clothgym.bending import Bending
 from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
@@ -70,10 +70,7 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
     # a single environment has its own loop: loops over one lane are slow
     stiffness, damping_time = elastic.stiffness, elastic.damping_time
     if x.shape[2] == 1:
-        rows = (3, x.shape[1])
-        _add_lane_forces_of_one(
-            x.reshape(rows), v.reshape(rows), f.reshape(rows), elements.springs, stiffness[:, 0], damping_time[0]
-        )  # fmt: skip
+        _add_lane_forces_of_one(merged(x), merged(v), merged(f), elements.springs, stiffness[:, 0], damping_time[0])
         return
     # spring by spring, each in all lanes
     ends, rest_length, kind, weight = elements.springs
@@ -90,7 +87,7 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
 @uncounted
 def set_lane_forces(x, v, start, f, elements, elastic, scratch):
     """``f`` is ``start`` plus the forces of ``add_lane_forces`` [N]; start, f: (3, particles, lanes)."""
-    _copy(start.reshape(f.size), f.reshape(f.size))
+    _copy(merged(merged(start)), merged(merged(f)))
     add_lane_forces(x, v, f, elements, elastic, scratch)
 
 

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, placeholder, specialize
+from clothgym._jit import disjoint, kernel, merged, placeholder, specialize
 from clothgym.checks import positive
 from clothgym.mesh import SHEAR
 
@@ -109,7 +109,7 @@ def _largest_on_grid(x, weave, largest):
     offset, kind, rest_length, weight, _, _, _ = weave.elements
     # the largest squared stretch at each particle, kind by kind
     one, n = x.dtype.type(1), x.shape[1]
-    r, out = x.reshape((3, n)), np.zeros(n, x.dtype)
+    r, out = merged(x), np.zeros(n, x.dtype)
     for a in range(weight.shape[0]):
         if kind[a] <= SHEAR:
             _raise_to_stretch(r[0], r[1], r[2], offset[a], weight[a], one / (rest_length[a] * rest_length[a]), out)

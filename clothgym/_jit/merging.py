@@ -17,8 +17,10 @@ from numba.extending import intrinsic
 try:
     from numba.core.imputils import impl_ret_borrowed
     from numba.np.arrayobj import make_array, populate_array
+
+    KNOWN = True
 except ImportError:  # private to numba: plain reshaping does the same
-    make_array = None
+    KNOWN = False
 
 
 def _merged_in_python(a: Any) -> Any:
@@ -52,7 +54,7 @@ def _choose() -> Any:
     """``merged`` for kernels, or for plain Python."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return _merged_in_python
-    return numba.njit(inline="always")(_merged_in_python) if make_array is None else _merged
+    return numba.njit(inline="always")(_merged_in_python) if not KNOWN else _merged
 
 
 merged = _choose()

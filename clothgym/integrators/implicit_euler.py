@@ -25,7 +25,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import disjoint, kernel
+from clothgym._jit import disjoint, kernel, merged
 from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
 from clothgym.integrators.base import Integrator, add_to, advance, copy_to, move_on, predict_velocities, weigh
@@ -69,7 +69,7 @@ def _next_direction(w, r, p, q, share):
     particles, lanes = w.shape
     for c in range(3):
         if lanes == 1:
-            _turn_all(w.reshape(particles), r[c].reshape(particles), p[c].reshape(particles), q[c].reshape(particles), share[0])
+            _turn_all(merged(w), merged(r[c]), merged(p[c]), merged(q[c]), share[0])
             continue
         for i in range(particles):
             wi, rc, pc, qc = w[i], r[c, i], p[c, i], q[c, i]
@@ -92,7 +92,7 @@ def _sum_of_products(a, b, out):
     one, other, parts = a.reshape((size, lanes)), b.reshape((size, lanes)), np.zeros((PARTS, lanes), a.dtype)
     # the partial sums: of one sheet as vectors, else lane by lane
     if lanes == 1:
-        _add_in_parts(one[:whole].reshape(whole), other[:whole].reshape(whole), parts.reshape(PARTS))
+        _add_in_parts(merged(one[:whole]), merged(other[:whole]), merged(parts))
     for e in range(whole if lanes == 1 else 0, size):
         for l in range(lanes):
             parts[e % PARTS, l] += one[e, l] * other[e, l]
@@ -115,7 +115,7 @@ def _add_in_parts(a, b, parts):
 def _square(w, r, scaled, out):
     """``out <- r . M^-1 r`` for each lane, (lanes,), and ``scaled <- M^-1 r``; r, scaled: (3, particles, lanes)."""
     for c in range(3):
-        _scale(w.reshape(w.size), r[c].reshape(w.size), scaled[c].reshape(w.size))
+        _scale(merged(w), merged(r[c]), merged(scaled[c]))
     _sum_of_products(scaled, r, out)
 
 
@@ -139,7 +139,7 @@ def _advance(d, p, q, r, step):
     """``d <- d + step p`` and ``r <- r - step q``; d, p, q, r: (3, particles, lanes); step: (lanes,)."""
     lanes = step.shape[0]
     if lanes == 1:
-        _go(d.reshape(d.size), p.reshape(d.size), r.reshape(d.size), q.reshape(d.size), step[0])
+        _go(merged(merged(d)), merged(merged(p)), merged(merged(r)), merged(merged(q)), step[0])
         return
     for c in range(3):
         for i in range(p.shape[1]):

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
@@ -183,7 +183,7 @@ def solve(plan, r, y):
     n, lanes = r.shape[1], r.shape[2]
     # as bands
     if below.shape[0] > 0:
-        solve_bands(below, before, inverse_diagonal, r.reshape((3, n)))
+        solve_bands(below, before, inverse_diagonal, merged(r))
         return
     # sparse, forwards: L y = P r.  A particle's components and lanes are adjacent in y, so each entry of L is read once for all
     flat_y = y.reshape((n, 3 * lanes))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from clothgym._jit import disjoint, kernel, uncounted
+from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, frequency_bound, largest_frequency, set_spring_forces
 from clothgym.integrators.base import Integrator, advance, copy_to
@@ -73,9 +73,9 @@ def _stage(x, v, w, f, gravity, drag_rate, start_x, start_v, sum_x, sum_v, share
     for c in range(3):
         if lanes == 1:
             _stage_of(
-                x[c].reshape(particles), v[c].reshape(particles), w.reshape(particles), f[c].reshape(particles), gravity[c, 0],
-                drag_rate[0], start_x[c].reshape(particles), start_v[c].reshape(particles), sum_x[c].reshape(particles),
-                sum_v[c].reshape(particles), share, reach,
+                merged(x[c]), merged(v[c]), merged(w), merged(f[c]), gravity[c, 0],
+                drag_rate[0], merged(start_x[c]), merged(start_v[c]), merged(sum_x[c]),
+                merged(sum_v[c]), share, reach,
             )  # fmt: skip
             continue
         for p in range(particles):

@@ -30,7 +30,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from clothgym._jit import apart, disjoint, kernel
+from clothgym._jit import apart, disjoint, kernel, merged
 from clothgym.bending import project_bends
 from clothgym.forces import Oscillators
 from clothgym.integrators.base import Integrator, predict_velocities
@@ -83,8 +83,7 @@ def set_out(x, v, w, gravity, push, drag_rate, h, work):
     for c in range(3):
         xc, vc, rc, yc, uc = x[c], v[c], remainder[c], y[c], u[c]
         if lanes == 1:
-            n = particles
-            _set_out_one(xc.reshape(n), xc[m, 0], rc.reshape(n), vc.reshape(n), vc[m, 0], per_step, yc.reshape(n), uc.reshape(n))
+            _set_out_one(merged(xc), xc[m, 0], merged(rc), merged(vc), vc[m, 0], per_step, merged(yc), merged(uc))
             continue
         for p in range(particles):
             _set_out_lanes(xc[p], xc[m], rc[p], vc[p], vc[m], per_step, yc[p], uc[p])
@@ -130,8 +129,7 @@ def arrive(x, v, h, work):
         for l in range(lanes):
             middle[l] = v[c, m, l]
         if lanes == 1:
-            n = particles
-            _arrive_one(x[c].reshape(n), v[c].reshape(n), rx[c].reshape(n), rv[c].reshape(n), u[c].reshape(n), middle[0], h)
+            _arrive_one(merged(x[c]), merged(v[c]), merged(rx[c]), merged(rv[c]), merged(u[c]), middle[0], h)
             continue
         for p in range(particles):
             _arrive_lanes(x[c, p], v[c, p], rx[c, p], rv[c, p], u[c, p], middle, h)
@@ -173,8 +171,7 @@ def project_springs(y, u, w, springs, h, alpha_tilde, gamma):
     """
     # a single environment has its own loop: loops over one lane are slow
     if y.shape[2] == 1:
-        rows = (3, y.shape[1])
-        _project_springs_of_one(y.reshape(rows), u.reshape(rows), w[:, 0], springs, h, alpha_tilde[:, 0], gamma[0])
+        _project_springs_of_one(merged(y), merged(u), w[:, 0], springs, h, alpha_tilde[:, 0], gamma[0])
         return
     # spring by spring, each in all lanes
     ends, rest_length, kind, weight = springs

@@ -11,10 +11,10 @@ MOST_OF_A_PAIR = 32  # pairs of primitives of two leaves, at most: four vertices
 
 
 @uncounted
-def far_contacts(pairs, reach, extent, smooth, room, found):
+def far_contacts(pairs, distances, extent, smooth, room, found):
     """Contacts and gap constraints of far pairs: vertices and triangles, layers, and then edges; arguments as in
     ``narrow_phase.vertex_contacts``."""
-    tree, p, leaves, far = pairs.tree, room.p, room.leaves, reach.far
+    tree, p, leaves, far = pairs.tree, room.p, room.leaves, distances.within
     enclose(p, tree.corners, tree.nodes, room.extra, room.wide, room.box, room.ball, room.hulls)
     node, boxed = 0, False
     while node < tree.nodes.shape[0]:
@@ -27,26 +27,26 @@ def far_contacts(pairs, reach, extent, smooth, room, found):
         for pair in range(number):
             room.closest[pair, 0], room.closest[pair, 1], room.closest[pair, 2], room.closest[pair, 3] = far, 0.0, 0.0, 0.0
         first = found.counts[1]
-        _far_vertices(number, pairs, reach, extent, smooth, room, found)
-        constrain_layers(number, first, tree.corners, reach, room, found)
+        _far_vertices(number, pairs, distances, extent, smooth, room, found)
+        constrain_layers(number, first, tree.corners, distances, room, found)
         if not boxed:
             room.boxed[:] = False
             boxed = True
-        _far_edges(number, pairs, reach, extent, smooth, room, found)
+        _far_edges(number, pairs, distances, extent, smooth, room, found)
 
 
 @uncounted
-def _far_vertices(number, pairs, reach, extent, smooth, room, found):
+def _far_vertices(number, pairs, distances, extent, smooth, room, found):
     """Vertices and triangles of the first ``number`` pairs of leaves, where a vertex is in the box of the other leaf."""
     tree, p, box, batch, filled = pairs.tree, room.p, room.box, room.pairs, 0
     for pair in range(number):
         if filled > BATCH - MOST_OF_A_PAIR:
-            vertex_contacts(filled, True, pairs.parts, reach, extent, smooth, room, found)
+            vertex_contacts(filled, distances, pairs.parts, extent, smooth, room, found)
             filled = 0
         for way in range(2):
             leaf, other = room.leaves[pair, way], room.leaves[pair, 1 - way]
             # the box of the other leaf, within reach
-            r = reach.far + room.wide[leaf]
+            r = distances.within + room.wide[leaf]
             lx, ly, lz = box[0, other] - r, box[1, other] - r, box[2, other] - r
             hx, hy, hz = box[3, other] + r, box[4, other] + r, box[5, other] + r
             # each vertex in it, with all triangles of that leaf
@@ -57,7 +57,7 @@ def _far_vertices(number, pairs, reach, extent, smooth, room, found):
                     for n in range(tree.leaf_triangles[other], tree.leaf_triangles[other + 1]):
                         batch[0, filled], batch[1, filled], batch[2, filled] = v, tree.own_triangles[n], pair
                         filled += 1
-    vertex_contacts(filled, True, pairs.parts, reach, extent, smooth, room, found)
+    vertex_contacts(filled, distances, pairs.parts, extent, smooth, room, found)
 
 
 @inlined
@@ -75,15 +75,15 @@ def _box_edges(leaf, tree, parts, room):
 
 
 @uncounted
-def _far_edges(number, pairs, reach, extent, smooth, room, found):
+def _far_edges(number, pairs, distances, extent, smooth, room, found):
     """Edges of the first ``number`` pairs of leaves whose boxes are within reach; only ridges for a layered pair (see
     ``narrow_phase.constrain_layers``)."""
     tree, parts, box, ridges, batch, filled, far = (
-        pairs.tree, pairs.parts, room.edge_box, room.ridges, room.pairs, 0, reach.far
+        pairs.tree, pairs.parts, room.edge_box, room.ridges, room.pairs, 0, distances.within
     )  # fmt: skip
     for pair in range(number):
         if filled > BATCH - MOST_OF_A_PAIR:
-            edge_contacts(filled, True, parts, reach, extent, smooth, room, found)
+            edge_contacts(filled, distances, parts, extent, smooth, room, found)
             filled = 0
         leaf, other, any_edge = room.leaves[pair, 0], room.leaves[pair, 1], not room.layered[pair]
         for one in (leaf, other):
@@ -102,4 +102,4 @@ def _far_edges(number, pairs, reach, extent, smooth, room, found):
                 near = (lx <= box[3, n]) & (ly <= box[4, n]) & (lz <= box[5, n])
                 near &= (box[0, n] <= hx) & (box[1, n] <= hy) & (box[2, n] <= hz)
                 filled += near & (any_edge | ridges[n])
-    edge_contacts(filled, True, parts, reach, extent, smooth, room, found)
+    edge_contacts(filled, distances, parts, extent, smooth, room, found)

@@ -28,6 +28,8 @@ Contact, ACM Transactions on Graphics 44(4), 2025.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from clothgym._jit import inlined, kernel, uncounted
@@ -137,25 +139,47 @@ def thickness_of(gap, rise, thickness, least):
     return min(thickness + rise, max(least + rise, gap / (1.0 - SLOP)))
 
 
+class Distances(NamedTuple):
+    """Distances for one sort of pairs [m].
+
+    within: pairs that matter are closer, but for their extras.  thickness: of the cloth between them.  least: the smallest
+    thickness of a contact: a closer one is pushed apart only so far, and otherwise only kept from approaching.  margin: beyond the
+    thickness within which a pair is a contact.  close: less the extras, within which a pair becomes a gap constraint.  stop,
+    standoff: see ``distance_to_keep``.
+    """
+
+    within: float
+    thickness: float
+    least: float
+    margin: float
+    close: float
+    stop: float
+    standoff: float
+
+
 @inlined
-def distances_of(reach, far):
-    """Within which pairs matter, the thickness of the cloth between them, and the least distance that gap constraints serve [m]."""
-    return (
-        (reach.far if far else reach.near),
-        (reach.far_thickness if far else reach.near_thickness),
-        CLOSE * min(reach.near, reach.far),
-    )
+def near_distances(reach):
+    """``Distances`` of near pairs, which have no room for their thickness where cloth is pinched: nothing pushes them apart."""
+    close = CLOSE * min(reach.near, reach.far)
+    return Distances(reach.near, reach.near_thickness, -np.inf, reach.margin, close, reach.stop, reach.standoff)
+
+
+@inlined
+def far_distances(reach):
+    """``Distances`` of pairs that do not hang together."""
+    close = CLOSE * min(reach.near, reach.far)
+    return Distances(
+        reach.far, reach.far_thickness, reach.far_thickness, reach.margin, close, reach.stop, reach.standoff
+    )  # fmt: skip
 
 
 @uncounted
-def vertex_contacts(number, far, parts, reach, extent, smooth, room, found):
+def vertex_contacts(number, distances, parts, extent, smooth, room, found):
     """Evaluate a batch of vertices and triangles: certify their distances, lower the bounds of their vertices, and write contacts
     and gap constraints.
 
-    number: of the pairs in ``room.pairs``: vertex, triangle and pair of leaves, -1 for near pairs.  far: whether they are pairs
-    that do not hang together: those are pushed apart to the thickness, near ones are only kept from approaching.  reach: a
-    ``broad_phase.Reach``.  extent: of the sheet [m].  smooth: see ``contact_normals``; contacts between different pieces of a mesh
-    are those of smooth sheets.
+    number: of the pairs in ``room.pairs``: vertex, triangle and pair of leaves, -1 for near pairs.  extent: of the sheet [m].
+    smooth: see ``contact_normals``; contacts between different pieces of a mesh are those of smooth sheets.
 
     ``room.extra``: how much farther than the reach pairs matter around each vertex, which is also how much more than its share it
     may move [m].  ``room.bounds``, ``room.limits``: become the smallest distances of each vertex, of all its pairs and of those
@@ -171,8 +195,7 @@ def vertex_contacts(number, far, parts, reach, extent, smooth, room, found):
         room.closest,
     )
     particles, members, report, counts = found.particles, found.members, found.report, found.counts
-    within, thickness, close = distances_of(reach, far)
-    least, stop, standoff = thickness if far else -np.inf, reach.stop, reach.standoff
+    within, thickness, least, margin, close, stop, standoff = distances
     for m in range(keep_vertices(number, within, extent, parts.triangles, room.near, batch, room.ends, room.lower)):
         # the closest points, and whether they are within reach
         v, t, group = batch[0, m], batch[1, m], batch[2, m]
@@ -199,10 +222,10 @@ def vertex_contacts(number, far, parts, reach, extent, smooth, room, found):
             lower_limits(v, i, j, k, certified, left, close, extra, limits)
             report[REPORT_DROPPED] += left < close
         # the closest pair of two leaves
-        if far and certified < closest[group, 0]:
+        if group >= 0 and certified < closest[group, 0]:
             closest[group, 0], closest[group, 1], closest[group, 2], closest[group, 3] = certified, nx, ny, nz
         # a contact, if it is certified and within the thickness, and belongs to this triangle
-        if certified <= 0.0 or certified > thickness + reach.margin:
+        if certified <= 0.0 or certified > thickness + margin:
             continue
         owned, is_closest, is_smooth = owns(p, v, t, i, j, k, a, b, c, nx, ny, nz, parts, smooth.kinds)
         others = parts.piece[v] != parts.piece[i]
@@ -225,17 +248,16 @@ def vertex_contacts(number, far, parts, reach, extent, smooth, room, found):
 
 
 @uncounted
-def edge_contacts(number, far, parts, reach, extent, smooth, room, found):
+def edge_contacts(number, distances, parts, extent, smooth, room, found):
     """The same for a batch of two edges.
 
-    Only ridges whose closest points both lie inside become contacts: elsewhere vertices and triangles cover the same contact.  Only
-    vertices and triangles that are not near pairs push each other apart.  Where cloth is pinched, near pairs have no room for their
-    thickness, and close edges become ridges and stop being ridges: what pushed them would never rest.
+    Only ridges whose closest points both lie inside become contacts: elsewhere vertices and triangles cover the same contact.
+    Nothing pushes them apart.  Where cloth is pinched, close edges become ridges and stop being ridges: what pushed them would
+    never rest.
     """
     p, extra, held, bounds, limits, batch = room.p, room.extra, room.held, room.bounds, room.limits, room.pairs
     particles, members, report, counts = found.particles, found.members, found.report, found.counts
-    within, thickness, close = distances_of(reach, far)
-    least, stop, standoff = -np.inf, reach.stop, reach.standoff
+    within, thickness, _, margin, close, stop, standoff = distances
     for m in range(keep_edges(number, within, extent, parts.edges, room.near, batch, room.ends, room.lower)):
         # the closest points, and whether they are within reach
         e, f = batch[0, m], batch[1, m]
@@ -264,7 +286,7 @@ def edge_contacts(number, far, parts, reach, extent, smooth, room, found):
             report[REPORT_DROPPED] += left < close
         # a contact, if it is certified and within the thickness
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
-        if not (inside and certified > 0.0 and certified <= thickness + reach.margin):
+        if not (inside and certified > 0.0 and certified <= thickness + margin):
             continue
         if not (is_ridge(room.faces, parts.edge_triangles, e) and is_ridge(room.faces, parts.edge_triangles, f)):
             continue
@@ -272,9 +294,9 @@ def edge_contacts(number, far, parts, reach, extent, smooth, room, found):
         if parts.piece[i] != parts.piece[k]:
             so, to, gap, mx, my, mz, rise = on_edges(p, e, f, i, j, k, l, s, t, certified, nx, ny, nz, parts, smooth)
         if gap > 0.0:
-            s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, least)
+            s, t, nx, ny, nz, kept = so, to, mx, my, mz, thickness_of(gap, rise, thickness, -np.inf)
         elif certified < DEEP * thickness:
-            kept = thickness_of(certified, 0.0, thickness, least)
+            kept = thickness_of(certified, 0.0, thickness, -np.inf)
         else:
             continue
         if counts[0] < particles.shape[0]:
@@ -285,7 +307,7 @@ def edge_contacts(number, far, parts, reach, extent, smooth, room, found):
 
 
 @uncounted
-def constrain_layers(number, first, corners, reach, room, found):
+def constrain_layers(number, first, corners, distances, room, found):
     """Replace the gap constraints between the vertices and triangles of two leaves by one, where a plane between the leaves
     certifies about the same distance.
 
@@ -297,7 +319,7 @@ def constrain_layers(number, first, corners, reach, room, found):
     p, extra, held, bounds, limits = room.p, room.extra, room.held, room.bounds, room.limits
     leaves, gaps, closest, layered = room.leaves, room.gaps, room.closest, room.layered
     members, planes, report, counts = found.members, found.planes, found.report, found.counts
-    close, stop, standoff = CLOSE * min(reach.near, reach.far), reach.stop, reach.standoff
+    close, stop, standoff = distances.close, distances.stop, distances.standoff
     # the pairs of leaves with such a plane
     for pair in range(number):
         leaf, other = leaves[pair, 0], leaves[pair, 1]

@@ -93,11 +93,11 @@ def find_close(parts, near, reach, extent, room):
 
 
 @uncounted
-def near_contacts(pairs, reach, extent, smooth, room, found):
+def near_contacts(pairs, distances, extent, smooth, room, found):
     """Contacts and gap constraints of near pairs, first of vertices and triangles, then of edges, in their order; arguments as in
     ``narrow_phase.vertex_contacts``."""
     near, close, seen = pairs.near, room.close, room.seen
-    find_close(pairs.parts, near, reach.near, extent, room)
+    find_close(pairs.parts, near, distances.within, extent, room)
     # the primitives of all close vertices; eight pairs at a time, as in most places none is close
     seen[:] = False
     eights = close.view(np.uint64)
@@ -109,11 +109,11 @@ def near_contacts(pairs, reach, extent, smooth, room, found):
                         seen[near.which[m]] = True
     for edges in range(2):
         begin, end = (near.vertex_triangles, seen.shape[0]) if edges else (0, near.vertex_triangles)
-        _judge_seen(edges, begin, end, pairs, reach, extent, smooth, room, found)
+        _judge_seen(edges, begin, end, pairs, distances, extent, smooth, room, found)
 
 
 @uncounted
-def _judge_seen(edges, begin, end, pairs, reach, extent, smooth, room, found):
+def _judge_seen(edges, begin, end, pairs, distances, extent, smooth, room, found):
     """The near pairs that were seen, in batches: whether of edges, and the range of them, in multiples of eight."""
     batch, seen, primitives, number = room.pairs, room.seen, pairs.near.primitives, 0
     eights = seen.view(np.uint64)
@@ -121,19 +121,16 @@ def _judge_seen(edges, begin, end, pairs, reach, extent, smooth, room, found):
         if eights[eight] == 0:
             continue
         if number > BATCH - 9:
-            _judge(edges, number, pairs, reach, extent, smooth, room, found)
+            if edges:
+                edge_contacts(number, distances, pairs.parts, extent, smooth, room, found)
+            else:
+                vertex_contacts(number, distances, pairs.parts, extent, smooth, room, found)
             number = 0
         for n in range(8 * eight, 8 * eight + 8):
             # written without a branch: the next one takes the place of one that was not seen
             batch[0, number], batch[1, number], batch[2, number] = primitives[n, 0], primitives[n, 1], -1
             number += seen[n]
-    _judge(edges, number, pairs, reach, extent, smooth, room, found)
-
-
-@uncounted
-def _judge(edges, number, pairs, reach, extent, smooth, room, found):
-    """A batch of near pairs of edges, or of vertices and triangles."""
     if edges:
-        edge_contacts(number, False, pairs.parts, reach, extent, smooth, room, found)
+        edge_contacts(number, distances, pairs.parts, extent, smooth, room, found)
     else:
-        vertex_contacts(number, False, pairs.parts, reach, extent, smooth, room, found)
+        vertex_contacts(number, distances, pairs.parts, extent, smooth, room, found)

@@ -17,7 +17,7 @@ from clothgym.collisions.self.displacement_bounds import FARTHEST
 from clothgym.collisions.self.far_pairs import far_contacts
 from clothgym.collisions.self.impulses import TOLERANCE
 from clothgym.collisions.self.lower_bounds import round_positions
-from clothgym.collisions.self.narrow_phase import MARGIN, gap_of_edges, gap_of_vertex
+from clothgym.collisions.self.narrow_phase import MARGIN, Distances, gap_of_edges, gap_of_vertex
 from clothgym.collisions.self.query_room import Found, room_for_queries
 from clothgym.collisions.self.spread import spread_out
 from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
@@ -275,20 +275,20 @@ def shortest_near(p, parts, primitives, vertex_triangles):
 
 
 @kernel
-def least_far(p, pairs, reach, particles, coefficients, members, planes, report):
-    """Shortest distance of primitives that do not hang together, or ``reach.far`` where none is within it [m].
+def least_far(p, pairs, distances, particles, coefficients, members, planes, report):
+    """Shortest distance of primitives that do not hang together, or ``distances.within`` where none is within it [m].
 
-    reach: a ``Reach`` without any thickness.  particles, coefficients, members, planes: without rows, so that nothing is kept;
+    distances: without any thickness.  particles, coefficients, members, planes: without rows, so that nothing is kept;
     report: scratch.
     """
     room = room_for_queries(coefficients, pairs, 0)
     room.p[:] = p
-    room.bounds[:] = reach.far
+    room.bounds[:] = distances.within
     room.held[:] = False
     faces_of(p, pairs.parts.triangles, room.faces)
     extent = round_positions(p, room.extra, room.near)
     found = Found(particles, coefficients, members, planes, room.counts, report)
-    far_contacts(pairs, reach, extent, SmoothSheet(room.p, room.normals, room.kinds), room, found)
+    far_contacts(pairs, distances, extent, SmoothSheet(room.p, room.normals, room.kinds), room, found)
     return room.bounds.min()
 
 
@@ -302,7 +302,7 @@ def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.d
     near = float(shortest_near(p, pairs.parts, pairs.near.primitives, pairs.near.vertex_triangles))
     nothing = np.empty((0, 4), np.int32), np.empty((0, C_SIZE), dtype), np.empty((0, G_SIZE), np.int32), np.empty((0, 4))
     # without a thickness there are no contacts, and with an infinite stop no layers
-    bare = Reach(2 * near, 2 * near, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0)
+    bare = Distances(2 * near, 0.0, 0.0, 0.0, 0.0, np.inf, 0.0)
     apart = float(least_far(p, pairs, bare, *nothing, np.empty(REPORT_SIZE)))
     # of single triangles nothing is near, and of one alone nothing else
     shortest = np.sqrt(1 / pairs.parts.rest_edges.max())

@@ -7,7 +7,7 @@ from clothgym.collisions.self.broad_phase import faces_of
 from clothgym.collisions.self.contact_normals import SmoothSheet, smooth_out
 from clothgym.collisions.self.far_pairs import far_contacts
 from clothgym.collisions.self.lower_bounds import round_positions
-from clothgym.collisions.self.narrow_phase import MARGIN, SHARE
+from clothgym.collisions.self.narrow_phase import MARGIN, SHARE, far_distances, near_distances
 from clothgym.collisions.self.near_pairs import near_contacts
 from clothgym.contact_memory import REPORT_GAP
 
@@ -35,8 +35,8 @@ def query(pairs, reach, room, found):
         smooth_out(pairs.parts, room.faces, smooth)
     # near pairs: parts that share a leaf or whose leaves share a vertex; then all others
     extent = round_positions(room.p, extra, room.near)
-    near_contacts(pairs, reach, extent, smooth, room, found)
-    far_contacts(pairs, reach, extent, smooth, room, found)
+    near_contacts(pairs, near_distances(reach), extent, smooth, room, found)
+    far_contacts(pairs, far_distances(reach), extent, smooth, room, found)
     # bounds and limits: gamma_p times the smallest distances, less the margin
     least = least_reach
     for v in range(bounds.shape[0]):

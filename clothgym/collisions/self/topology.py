@@ -160,8 +160,8 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     around_triangles = np.argsort(triangles.ravel(), kind="stable") // 3
     both = np.stack([edge_owner, last], axis=1)
     parts = Parts(
-        *map(_int, (triangles, edges, triangle_edges, both)), 1 / length2, *map(_int, (vertex_owner, edge_owner, mesh.piece_of)),
-        around, _int(around_triangles),
+        _int(triangles), _int(edges), _int(triangle_edges), _int(both), 1 / length2, _int(vertex_owner), _int(edge_owner),
+        _int(mesh.piece_of), around, _int(around_triangles),
     )  # fmt: skip
     tree = Tree(
         _int(corners), counted[0], _int(by_leaf[0]), counted[1], _int(by_leaf[1]), counted[2], _int(by_leaf[2]),

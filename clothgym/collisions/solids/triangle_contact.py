@@ -222,8 +222,8 @@ def _find_edges(r, triangles, shapes, k, collider, near, edges, pushes, rows, be
     """List the particles near an edge of solid k, and the directions in which it pushes them.  Returns how many they are, or -1
     where no edge is between any particles.
 
-    near: triangles that may come closer than the thickness, (near,).  edges: (particles,).  pushes: (particles, 3).  rows: where the
-    particles are in the solid's axes, and distances from its box.  bent: scratch, (triangles,).
+    near: triangles that may come closer than the thickness, (near,).  edges: (particles,).  pushes: (particles, 3).
+    rows: positions in the solid's axes, and distances from its box.  bent: scratch, (triangles,).
     """
     n, c = r.shape[1], merged(collider)
     # spheres and capsules have no edges
