@@ -52,6 +52,7 @@ BY_VALUE = {
     "view --policy nothing": "no policy 'nothing' (there are: noop, random, expert, the folder of a training run)",
     "export patch": "required: --out",
     "export patch --out a.gif --seconds -1": "--seconds: '-1': must be a positive number",
+    "export patch --out a.gif --seconds inf": "--seconds: 'inf': must be a positive number",
     "export patch --out a.gif --set gravity": "must be NAME=VALUE",
     "export patch --out gone/a.gif": "there is no folder 'gone'",
     "bench --json gone/bench.json": "there is no folder 'gone'",

@@ -142,6 +142,29 @@ def test_what_lies_on_the_floor_counts_against_it():
     assert task.episode["lying"][0] == pytest.approx(area @ low.mean(axis=1) / area.sum(), abs=0.01)
 
 
+@pytest.mark.parametrize(("lowest", "success"), [(0.022, True), (0.012, False)])
+def test_success_asks_for_a_sheet_that_is_off_the_floor(lowest, success):
+    """A sheet in the arm, at rest, whose lower edge is that high above the floor [m]: a strip lies lower than three centimeters.
+
+    The arm rises by 30 degrees, so the flat sheet leans as much.  Both are put that low for the last step, without gravity.
+    """
+    env, _ = start(HOOK)
+    task, own, x = env.task, env.task.episode[0], on_arm(env, along=0.8)
+    env.step(np.tile([0, 0, 0, 1.0], 2))
+    down = x[:, 2].min() - lowest
+    own["root"][2] -= down
+    task._place_colliders(np.array([0]))
+    task.simulation.reset(positions=x - (0, 0, down))
+    task.simulation.release()
+    task.simulation.set_parameters(gravity=(0, 0, 0))
+    own["settling_since"], own["step"] = task.acting_steps, task.acting_steps + 149
+    *_, terminated, _, info = env.step(np.zeros(8))
+    strip = (0.03 - lowest) / np.cos(np.pi / 6) * SIDE / task.physics.mesh.area.sum()
+    assert terminated and info["threaded"] and info["rms_speed"] < 0.02
+    assert info["lying"] == pytest.approx(strip, abs=2e-3)
+    assert info["is_success"] == success
+
+
 # --- hands, observation, starts -------------------------------------------------------------------------------------------------
 
 

@@ -100,6 +100,10 @@ TAKEN = {
     "a star": (obj(STAR, [range(10)]), 10, 8, 10 * 0.4 * np.sin(np.pi / 5) / 2, 1, []),
     "corners on a straight side": (obj([(0, 0), (1, 0), (2, 0), (2, 1), (0, 1)], [range(5)]), 5, 3, 2.0, 1, []),
     "a quad out of its plane": (obj(BENT, [range(4)]), 4, 2, 0.5 + np.sqrt(1 + 2 * 0.3**2) / 2, 1, []),
+    "pieces of mixed winding": (
+        obj(*(lambda x, f: (x, turned(f, 1, 4, 7, 10)))(*sewn(gap=0.2, strip=False))), 24, 24, 0.12, 2,
+        ["the sheet has 2 pieces", "turned 8 triangles round"],
+    ),
     "pieces": (obj(*sewn(gap=0.2, strip=False)), 24, 24, 0.12, 2, ["the sheet has 2 pieces"]),
     "duplicate faces": (
         obj(panel()[0], [*panel()[1], panel()[1][0], panel()[1][3][::-1]]), 12, 12, 0.06, 1, ["dropped 4 triangles that were there"]

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from conftest import line_mesh
 
-from clothgym import INTEGRATORS
+from clothgym import INTEGRATORS, Material, Simulation
+from clothgym.triangles import triangle_mesh
 
 NAMES = list(INTEGRATORS)
 CONSISTENT = [name for name in NAMES if INTEGRATORS[name].order is not None]
@@ -91,6 +93,39 @@ def test_stated_order_is_measured(chain, name, damping_time):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.1)
 
 
+@pytest.mark.parametrize("name", CONSISTENT)
+def test_stated_order_is_that_of_linear_drag_too(chain, name):
+    """A free particle slows as exp(-b t); error of position and velocity at b t = 1, at h and h/2."""
+    errors = []
+    for steps in (20, 40):
+        simulation = chain(2, name, 1 / steps, 0.0, drag_rate=1.0, anchors=())
+        simulation.reset(positions=[[0, 0, 0], [1, 0, 0]], velocities=(0, 1, 0))
+        simulation.step(steps)
+        errors.append((simulation.velocities[0, :, 1] - np.exp(-1), simulation.positions[0, :, 1] - (1 - np.exp(-1))))
+    assert np.log2(np.abs(np.divide(*errors))) == pytest.approx(INTEGRATORS[name].order, abs=0.1)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_a_spring_and_its_damper_pull_with_the_stretch_and_its_rate(num_envs):
+    """``k (l - r + tau dl/dt)`` along a spring of 0.3 m that is 0.5 m long and turns while it grows, alone and in a batch: what one
+    tiny substep gives to its ends."""
+    h, k, tau, mass = 1e-7, 30.0, 0.02, 0.4
+    simulation = Simulation(
+        line_mesh(2, 0.3), Material(stretch_stiffness=1e-9, shear_stiffness=0, bend_rigidity=0), num_envs, "semi_implicit_euler",
+        time_step=h, substeps=1, gravity=(0, 0, 0), air_density=0, dtype="float64",
+    )  # fmt: skip
+    state = simulation.get_state()
+    state.stiffness[:], state.damping_time[:], state.drag_rate[:], state.free_inverse_mass[:] = k, tau, 0, 1 / mass
+    simulation.set_state(state)
+    velocities = np.array([[0.1, -0.2, 0.3], [1.0, 0.6, -0.4]])
+    simulation.reset(positions=[[0.2, 0, 0], [0.5, 0.4, 0]], velocities=velocities)
+    simulation.step()
+    direction = np.array([0.6, 0.8, 0])
+    pull = k * (0.5 - 0.3 + tau * direction @ (velocities[1] - velocities[0])) * direction
+    for one in simulation.velocities:
+        assert mass * (one - velocities) / h == pytest.approx(np.array([pull, -pull]), rel=1e-5, abs=1e-6)
+
+
 def test_pbd_does_not_converge(chain):
     """A hundredfold smaller step leaves as much error as the oscillator was let go with."""
     assert INTEGRATORS["pbd"].order is None
@@ -116,13 +151,17 @@ def test_damping_time_is_the_same_physics_for_all(chain, name, damping_time):
     assert np.max(np.abs(values - exact)) < TOLERANCE[INTEGRATORS[name].order]
 
 
-@pytest.mark.parametrize("damping_time", [0.0, 0.004])
+@pytest.mark.parametrize(("name", "iterations"), [("xpbd", 1), ("xpbd", 4), ("projective_dynamics", 1), ("projective_dynamics", 4)])
+@pytest.mark.parametrize("damping_time", [0.0, 0.004, 0.1])
 @pytest.mark.parametrize("q", [0.1, 0.8, 5.0])
-def test_one_xpbd_spring_is_implicit_euler_to_rounding(chain, damping_time, q):
-    """Trajectories along a spring of 100 m, beside which the 1e-12 m^2 that keep a projection from dividing by zero are nothing."""
+def test_one_spring_is_implicit_euler_to_rounding(chain, damping_time, q, name, iterations):
+    """Trajectories along a spring of 100 m, beside which the 1e-12 m^2 that keep a projection from dividing by zero are nothing.
+
+    The first iteration solves a lone spring's equation, and more change nothing.
+    """
     paths = []
-    for name in ("xpbd", "implicit_euler"):
-        simulation = chain(2, name, 0.01, (q / 0.01) ** 2, damping_time=damping_time, spacing=100.0)
+    for method in ({"name": name, "iterations": iterations}, "implicit_euler"):
+        simulation = chain(2, method, 0.01, (q / 0.01) ** 2, damping_time=damping_time, spacing=100.0)
         simulation.reset(positions=[[0, 0, 0], [100.3, 0, 0]], velocities=[[0, 0, 0], [-0.4, 0, 0]])
         path = []
         for _ in range(60):
@@ -131,3 +170,33 @@ def test_one_xpbd_spring_is_implicit_euler_to_rounding(chain, damping_time, q):
         paths.append(np.array(path))
     assert paths[0] == pytest.approx(paths[1], rel=0, abs=1e-12)
     assert np.max(np.abs(paths[0] - 100.3)) > 0.01
+
+
+@pytest.mark.parametrize("damping_time", [0.0, 0.004, 0.1])
+@pytest.mark.parametrize("bending", ["hinge", "quadratic"])
+@pytest.mark.parametrize(
+    "method", ["implicit_euler", "xpbd", {"name": "xpbd", "iterations": 4}], ids=["implicit_euler", "xpbd", "xpbd in 4 passes"]
+)
+def test_one_hinge_is_a_damped_oscillator_in_implicit_euler_s_steps(method, bending, damping_time):
+    """A square of two triangles, its ends up and its corners down by z: each side's height over the edge is 1/sqrt(2), so the angle
+    is 4 sqrt(2) z, and ``z'' = -8 B s/m (z + tau z')`` with the hinge's weight s."""
+    square = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [-0.5, 0.5, 0], [0.5, 0.5, 0]])
+    mesh, h, mass, rigidity = triangle_mesh(square, np.array([[0, 1, 3], [0, 3, 2]])), 0.01, 0.5, 5.0
+    method = {"name": method, "tolerance": 1e-13} if method == "implicit_euler" else method
+    simulation = Simulation(
+        mesh, Material(stretch_stiffness=1e-9, shear_stiffness=0, bend_rigidity=1e-9, damping_time=1e3), integrator=method,
+        time_step=h, substeps=1, gravity=(0, 0, 0), air_density=0, bending=bending, dtype="float64",
+    )  # fmt: skip
+    state = simulation.get_state()
+    state.stiffness[:], state.rigidity[:], state.damping_time[:], state.drag_rate[:] = 0, rigidity, damping_time, 0
+    state.free_inverse_mass[:] = 1 / mass
+    simulation.set_state(state)
+    (weight,), sign = mesh.hinges.weight, np.array([1, -1, -1, 1])
+    z, speed, k = 1e-5, 0.0, 8 * rigidity * weight / mass
+    simulation.reset(positions=square + z * sign[:, None] * np.array([0, 0, 1.0]))
+    for _ in range(60):
+        speed = (speed - h * k * z) / (1 + h * k * damping_time + h * h * k)
+        z += h * speed
+        simulation.step()
+        assert simulation.positions[0, :, 2] == pytest.approx(z * sign, abs=1e-12)
+    assert abs(z) < 0.9e-5

@@ -130,6 +130,26 @@ def test_limits_of_what_looks_farther_keep_apart_what_is_not_constrained(most):
     assert most == 0 or limits.max() > 0.05  # those that are fast gain by it
 
 
+def test_a_gap_constraint_keeps_more_where_something_is_held():
+    """The distance to keep, or with a held vertex the larger one for those, or the gap of now if that is smaller: for pairs and for
+    leaves alike, each gap worked out here along the constraint's normal."""
+    mesh, x = crumpled_strip(0)
+    stop, standoff = 0.012, 0.02
+    held = np.random.default_rng(2).random(len(x)) < 0.15
+    room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((4000, G_SIZE), np.int32), np.empty((4000, 4))
+    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT_SIZE)
+    reach = Reach(0.06, 0.06, 0.03, 0.03, 0.01, stop, standoff, 0.0)
+    _, count = query(x, x, pairs_of(mesh), reach, np.zeros(len(x)), held, bounds, limits, *room, report)
+    seen = set()
+    for row, (*normal, kept) in zip(room[2][:count], room[3][:count]):
+        own, number = row[:2]
+        along = x[row[3 : 3 + number]] @ normal
+        gap, most = along[:own].min() - along[own:].max(), standoff if held[row[3 : 3 + number]].any() else stop
+        assert kept == pytest.approx(min(gap, most), abs=1e-12)
+        seen.add((number, most, gap < most))
+    assert {(4, stop, False), (4, standoff, False), (4, standoff, True), (8, stop, False), (8, standoff, False)} <= seen
+
+
 # --- nothing passes through itself ------------------------------------------------------------------------------------------
 
 SHORT = {"z-fold": 60, "heap": 150, "wring": 400, "drag at 3 m/s": 200}
@@ -243,6 +263,29 @@ def test_a_thrown_sheet_keeps_its_speed():
     simulation.step(30)
     np.testing.assert_allclose(simulation.velocities[0].mean(axis=0), (8, 0, 3), atol=0.01)
     np.testing.assert_allclose(simulation.positions[0].mean(axis=0) - ripple.mean(axis=0), (4, 0, 1.5), atol=0.01)
+
+
+def test_what_is_clamped_in_flight_keeps_the_speed_of_the_flight():
+    """A thin folded sheet that spins at 20 rad/s, whose vertices leave their limits; thrown as well, it does the same."""
+    mesh, ended = sheet(9), {}
+    x = three_layers(mesh, 0.03)
+    x -= x.mean(axis=0)
+    option = {"mode": "strict", "thickness": 0.0005}
+    for flight in ((0.0, 0.0, 0.0), (8.0, 0.0, 3.0)):
+        simulation = clothgym.Simulation(mesh, gravity=(0, 0, 0), air_density=0.0, self_collision=option)
+        simulation.set_parameters(air_drag=0.0)
+        simulation.reset(positions=x, velocities=np.cross((0, 0, 20), x) + flight)
+        mass, clamped = 1 / simulation.get_state().free_inverse_mass[0], 0
+        before = mass @ simulation.velocities[0]
+        for _ in range(3):
+            simulation.step()
+            clamped += simulation.self_contacts.clamped[0]
+        assert clamped > 100
+        assert mass @ simulation.velocities[0] == pytest.approx(before, abs=1e-4 * float(mass.sum()))
+        ended[flight] = simulation.positions[0] - 0.05 * np.array(flight), simulation.velocities[0] - flight
+    still, thrown = ended.values()
+    assert thrown[0] == pytest.approx(still[0], abs=1e-5)
+    assert thrown[1] == pytest.approx(still[1], abs=1e-3)
 
 
 def test_momentum_is_conserved_in_contact():

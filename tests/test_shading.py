@@ -92,6 +92,23 @@ def test_a_touching_sheet_darkens_the_floor_at_its_edge_and_a_floating_one_does_
     assert kept[0.002][120, far] > 0.99
 
 
+@pytest.mark.parametrize("at", [(0.3, 0.2), (0.3, -0.2), (-0.3, 0.2)])
+def test_a_contact_shadow_lies_where_the_solid_stands(at):
+    """Beside a small box, on the side of the lamp; beside its mirror images, where nothing stands, the floor is as it was."""
+    draw = renderer(Camera(eye=(0, 0, 2.5), target=(0, 0, 0), up=(0, 1, 0)), width=240, height=240)
+    empty = linear(draw.rgb(FAR_AWAY)).sum(axis=2)
+    box = [Box(center=(*at, 0.05), half_sides=(0.1, 0.1, 0.05))]
+    kept = linear(draw.rgb(FAR_AWAY, box)).sum(axis=2) / empty
+    scale = 120 / (2.5 * math.tan(math.radians(35) / 2))  # pixels per meter on the floor
+
+    def beside(x, y):
+        return kept[int(120 - scale * y), int(120 + scale * (x - 0.125))]
+
+    assert beside(*at) < 0.8
+    for mirrored in ((1, -1), (-1, -1)):
+        assert beside(*np.multiply(at, mirrored)) > 0.98
+
+
 def test_a_shadow_is_softer_the_farther_above_the_floor_its_caster_is():
     draw = renderer(Camera(eye=(0, 0, 1.6), target=(0, 0, 0), up=(0, 1, 0)), width=400, height=400, antialias=2)
     empty = linear(draw.rgb(FAR_AWAY))[..., 0]

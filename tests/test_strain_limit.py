@@ -38,6 +38,15 @@ def test_a_spring_of_125_percent_comes_back_by_its_free_ends(w, ends):
     assert report[USED] == (1 if any(w) else 100)
 
 
+@pytest.mark.parametrize(("speed", "along"), [(0.5, (0.4, 0.4)), (-0.5, (0.0, -0.5))])
+def test_ends_of_a_long_spring_move_no_farther_apart_and_may_approach(speed, along):
+    """Masses of 1 and 4 kg that part go on together, with the momentum that they had; on their way back nothing stops them."""
+    v = np.array([[0, 0.2, 0], [speed, -0.3, 0.1]])
+    _, after, _ = limited(line_mesh(2), np.array([[0, 0, 0], [1.25, 0, 0]]), v, (1, 0.25))
+    assert after[:, 0] == pytest.approx(along, abs=1e-12)
+    assert after[:, 1:] == pytest.approx(v[:, 1:], abs=1e-12)
+
+
 def test_a_simulation_s_spring_comes_back_by_its_free_end():
     simulation = Simulation(
         line_mesh(2), Material(stretch_stiffness=1e-6, shear_stiffness=0, bend_rigidity=0), gravity=(0, 0, 0), air_density=0,

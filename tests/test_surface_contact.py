@@ -188,6 +188,21 @@ def test_rising_table_lifts_the_attachment():
     assert simulation.grippers.positions[0, 0, 2] == pytest.approx(0.15, abs=1e-4)
 
 
+def test_rising_table_lifts_what_hangs_below_the_tip():
+    """A particle that is held a centimeter below it meets the table first, and takes the gripper along."""
+    mesh = grid(3, 3, 0.1, 0.1)
+    tip = Gripper(position=(0, 0, 0.05), reach=0.015, closing_time=1e-3)
+    simulation = Simulation(mesh, colliders=[Plane(velocity=(0, 0, 0.3), thickness=0)], grippers=[tip])
+    simulation.reset(positions=mesh.rest_positions + (0, 0, 0.04))
+    for step in range(30):
+        simulation.grippers.move((0, 0, 0.05), 0.0)
+        simulation.step()
+        assert np.flatnonzero(simulation.grippers.holder[0] == 0).tolist() == [4]
+        assert simulation.positions[0, 4, 2] == pytest.approx(max(0.04, 0.005 * (step + 1)), abs=1e-4)
+    assert simulation.blocked.all()
+    assert simulation.grippers.positions[0, 0, 2] == pytest.approx(0.16, abs=1e-4)
+
+
 def test_a_sheet_that_its_triangles_bear_comes_to_rest():
     """On a ball whose arc over a triangle's diagonal is higher than the thickness.  Where touches stay as they were found, such a
     sheet trembles at 12 to 60 mm/s for ever."""
