@@ -77,7 +77,7 @@ def pairs_by_sampling(mesh, x, points=25):
 def looked_around(mesh, x, extra, most):
     """Bounds and limits of a query with a reach of 6 cm."""
     pairs, reach = pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0, 0.0)
-    room = room_for_queries(np.empty(0), pairs, 900)
+    room = room_for_queries(pairs, np.empty((900, 3)))
     room.p[:], room.ahead[:], room.extra[:], room.held[:] = x, x, extra, False
     members = np.empty((most, G_SIZE), np.int32)
     found = Found(

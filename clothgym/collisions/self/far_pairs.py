@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from clothgym._jit import inlined, uncounted
 from clothgym.collisions.self.broad_phase import enclose, far_leaves, gaps_of_leaves, is_ridge
 from clothgym.collisions.self.narrow_phase import constrain_layers, edge_contacts, vertex_contacts
@@ -16,7 +18,8 @@ def far_contacts(pairs, distances, extent, smooth, room, found):
     ``narrow_phase.vertex_contacts``."""
     tree, p, leaves, far = pairs.tree, room.p, room.leaves, distances.within
     enclose(p, tree.corners, tree.nodes, room.extra, room.wide, room.box, room.ball, room.hulls)
-    node, boxed = 0, False
+    # typed: a literal has a type of its own, for which what is called would be compiled again
+    node, boxed = np.int64(0), False
     while node < tree.nodes.shape[0]:
         number, node = far_leaves(tree, far, room.ball, room.box, room.hulls, node, leaves)
         number = gaps_of_leaves(
@@ -38,7 +41,7 @@ def far_contacts(pairs, distances, extent, smooth, room, found):
 @uncounted
 def _far_vertices(number, pairs, distances, extent, smooth, room, found):
     """Vertices and triangles of the first ``number`` pairs of leaves, where a vertex is in the box of the other leaf."""
-    tree, p, box, batch, filled = pairs.tree, room.p, room.box, room.pairs, 0
+    tree, p, box, batch, filled = pairs.tree, room.p, room.box, room.pairs, np.int64(0)
     for pair in range(number):
         if filled > BATCH - MOST_OF_A_PAIR:
             vertex_contacts(filled, distances, pairs.parts, extent, smooth, room, found)
@@ -79,7 +82,7 @@ def _far_edges(number, pairs, distances, extent, smooth, room, found):
     """Edges of the first ``number`` pairs of leaves whose boxes are within reach; only ridges for a layered pair (see
     ``narrow_phase.constrain_layers``)."""
     tree, parts, box, ridges, batch, filled, far = (
-        pairs.tree, pairs.parts, room.edge_box, room.ridges, room.pairs, 0, distances.within
+        pairs.tree, pairs.parts, room.edge_box, room.ridges, room.pairs, np.int64(0), distances.within
     )  # fmt: skip
     for pair in range(number):
         if filled > BATCH - MOST_OF_A_PAIR:

@@ -115,7 +115,7 @@ def near_contacts(pairs, distances, extent, smooth, room, found):
 @uncounted
 def _judge_seen(edges, begin, end, pairs, distances, extent, smooth, room, found):
     """The near pairs that were seen, in batches: whether of edges, and the range of them, in multiples of eight."""
-    batch, seen, primitives, number = room.pairs, room.seen, pairs.near.primitives, 0
+    batch, seen, primitives, number = room.pairs, room.seen, pairs.near.primitives, np.int64(0)
     eights = seen.view(np.uint64)
     for eight in range(begin // 8, end // 8):
         if eights[eight] == 0:

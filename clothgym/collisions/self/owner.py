@@ -281,7 +281,7 @@ def least_far(p, pairs, distances, particles, coefficients, members, planes, rep
     distances: without any thickness.  particles, coefficients, members, planes: without rows, so that nothing is kept;
     report: scratch.
     """
-    room = room_for_queries(coefficients, pairs, 0)
+    room = room_for_queries(pairs, coefficients)
     room.p[:] = p
     room.bounds[:] = distances.within
     room.held[:] = False

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import kernel
+from clothgym._jit import apart
 from clothgym.collisions.self.topology import NODE_LEAVES
 
 BATCH = 256  # pairs of primitives that are judged at a time
@@ -89,13 +89,13 @@ class Room(NamedTuple):
     counts: NDArray
 
 
-@kernel
-def room_for_queries(x, pairs, most):
-    """The ``Room`` for sheets with positions x, of whatever shape [m]; most: contacts that are kept of a sheet."""
+@apart
+def room_for_queries(pairs, contacts):
+    """The ``Room`` for a sheet; contacts: an array with a row for each contact that is kept, of the simulation's dtype."""
     n, edges, triangles = pairs.parts.around.shape[0] - 1, pairs.parts.edges.shape[0], pairs.parts.triangles.shape[0]
     leaves, near = pairs.tree.corners.shape[0], pairs.near.first.shape[0]
     room = LEAF_PAIRS * leaves
-    real, single, whole = x.dtype, np.float32, np.int32
+    real, single, whole, most = contacts.dtype, np.float32, np.int32, contacts.shape[0]
     return Room(
         np.empty((n, 3)), np.empty((n, 3)), np.zeros(n), np.empty(n), np.empty(n), np.empty(n, real), np.empty(n, np.bool_),
         np.empty(n, np.int64), np.empty((n, 3)), np.zeros(n, np.uint8), np.empty((3, triangles)), np.empty((6, triangles)),

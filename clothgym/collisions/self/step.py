@@ -212,7 +212,7 @@ def room_for_nothing(x, sheet):
 @kernel
 def room_for_sheet(x, sheet):
     """Scratch of ``keep_apart``, a ``query_room.Room``."""
-    return room_for_queries(x, sheet.pairs, sheet.memory.particles.shape[2])
+    return room_for_queries(sheet.pairs, sheet.memory.impulses[0, 0])
 
 
 def kernels_of(collides: bool, by_particle: bool) -> dict[str, Any]:
