@@ -71,22 +71,3 @@ def closest_on_segments(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz):
         t = 1.0
         s = min(max((b - c) / a, 0.0), 1.0) if a > 0.0 else 0.0
     return s, t
-
-
-@kernel
-def segments_apart(ax, ay, az, bx, by, bz, cx, cy, cz, dx, dy, dz, reach):
-    """Whether a plane certifies that segments ab and cd are farther apart than ``reach`` [m], without a division.
-
-    The plane is parallel to ab and perpendicular to the vector from its line to the middle of cd.  With u = b - a, c and d taken
-    from a, and w = u.u (c + d) - u u.(c + d), which is perpendicular to u: w.w = u.u (w.c + w.d), and cd is farther away if the
-    smaller of w.c and w.d is positive and its square above reach^2 w.w.
-    """
-    ux, uy, uz = bx - ax, by - ay, bz - az
-    cx, cy, cz, dx, dy, dz = cx - ax, cy - ay, cz - az, dx - ax, dy - ay, dz - az
-    uu = ux * ux + uy * uy + uz * uz
-    uc, ud = ux * cx + uy * cy + uz * cz, ux * dx + uy * dy + uz * dz
-    cd = cx * dx + cy * dy + cz * dz
-    wc = uu * (cx * cx + cy * cy + cz * cz + cd) - uc * (uc + ud)
-    wd = uu * (dx * dx + dy * dy + dz * dz + cd) - ud * (uc + ud)
-    least = min(wc, wd)
-    return (least > 0.0) & (least * least > reach * reach * uu * (wc + wd))
