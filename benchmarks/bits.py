@@ -49,7 +49,7 @@ LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a h
 
 
 class Episodes:
-    """A batch of an id: the expert acts in even environments, and odd ones get random actions, and what is over begins again."""
+    """A batch of an id: the expert acts in even environments, odd ones get random actions, and ended episodes are reset."""
 
     def __init__(self, env_id: str, num_envs: int, threads: int, **kwargs: Any) -> None:
         self.env: Any = gym.make_vec(
@@ -143,7 +143,7 @@ def batches(select: list[str]) -> bool:
 
 
 def tell(name: str, found: list[list[str]], reference: list[list[str]]) -> bool:
-    """Print whether the environments of a batch do what they do in the first; halves of the run by environment."""
+    """Print whether the environments of a batch behave as in the first run; halves of the run by environment."""
     differ = [[i for i, (a, b) in enumerate(zip(ours, theirs)) if a != b] for ours, theirs in zip(found, reference)]
     brought = "; ".join(f"part {k + 1}: {len(d)} of {len(found[0])} differ, {d[:5]}" for k, d in enumerate(differ) if d)
     print(f"{name:<66} {brought or 'same bits'}", flush=True)

@@ -1,4 +1,4 @@
-"""Floor 0: one thread at a time in an object, and what it knows of a call that was interrupted."""
+"""Floor 0: a guard that admits one thread at a time to an object, and records interrupted calls."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Turn:
     """Whose turn it is in an object with a batch of environments.
 
     Attributes:
-        what, error: the object, for messages, and what is raised where environments are unfinished.
+        what, error: the object's name, for messages, and the exception for unfinished environments.
         unfinished: environments that a call is changing.  After an interruption they are still here: only a reset or a restored
             state takes them out.
     """

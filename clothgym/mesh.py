@@ -132,10 +132,10 @@ class ClothMesh:
         return 0, columns - 1, (rows - 1) * columns, rows * columns - 1
 
     def with_rest_angles(self, angle: float = 0.0, edges: ArrayLike | None = None, above: float = 0.0) -> ClothMesh:
-        """The same sheet with another angle at rest between the triangles beside some of its edges.
+        """The same sheet with another rest angle between the two triangles at some of its edges.
 
-        A garment that was modeled folded, or sewn along sharp seams, opens there when it is left alone.  Edges keep their lengths.
-        Skip springs between opposite corners get the length that they have at this angle.
+        A garment that was modeled folded, or sewn along sharp seams, then opens there.  Edges keep their lengths.
+        Skip springs between opposite corners get their length at this angle.
 
         Args:
             angle: [rad], 0 for flat, positive and negative to the two sides.
@@ -192,7 +192,7 @@ def _refolded(mesh: ClothMesh, chosen: NDArray, angle: float) -> Springs:
     span = np.sqrt(
         (feet[1] - feet[0]) ** 2 + heights[0] ** 2 + heights[1] ** 2 + 2 * heights[0] * heights[1] * np.cos(angle)
     )  # fmt: skip
-    # what they store at a curvature depends on their length
+    # their energy at a curvature depends on their length
     weight, rest_length = weight.copy(), rest_length.copy()
     weight[own] *= (rest_length[own] / span) ** 4
     rest_length[own] = span

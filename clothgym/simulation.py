@@ -29,8 +29,8 @@ from clothgym.parameters import AIR_DENSITY, changed, check_properties, fabric_r
 from clothgym.state import Fabric, Orders, State, View, at_rest, check_fits
 
 GRAVITY = 9.81
-SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
-AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is computed again at most this often [s]
+SURFACE_INTERVAL = 3e-3  # longest interval between searches for contacts of triangles with solids [s]
+AIR_INTERVAL = 2e-3  # shortest interval between updates of the air's force, which is slow compared with the springs' [s]
 
 
 class Simulation:
@@ -122,7 +122,7 @@ class Simulation:
         )
         self.anchors = self._attachments.anchors
         self.grippers = Grippers(self._attachments)
-        # what it touches: solids, and itself
+        # contact: with solids, and self-collision
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self.colliders = self._solids.colliders
         self._compile(options_of(self_collision) is not None)
@@ -161,11 +161,11 @@ class Simulation:
         self._warn_if_beyond_bound(np.arange(1))
 
     def _compile(self, collides: bool) -> None:
-        """The main loop with the kernels of all that there is; collides: whether the sheet collides with itself."""
+        """Compose the main loop from the kernels of the present options; collides: whether the sheet collides with itself."""
         touched, method, dtype = needed(self.contact, self._solids.shapes.kinds), self.integrator, self.dtype.name
         parts = self.bending, self.layout.by_particle, self.strain_limit is not None, collides, touched
         self._advance = MainLoop(*compiled(method.substep, method.name, *parts))
-        # on a cold start another process compiles what is not of self-contact, which takes about as long
+        # on a cold start another process compiles everything except self-contact, which takes about as long
         if collides and method == integrators.INTEGRATORS.get(method.name) and not _jit.is_kept(self._advance.kernel):
             kinds = self._solids.shapes.kinds
             ahead.start(

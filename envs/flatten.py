@@ -21,7 +21,7 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, beside_corners, observe_next
+from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, corner_neighbors, observe_next
 from clothgym.mesh import grid
 
 HOLDING = 0.1  # share of the potential for holding the sheet
@@ -164,7 +164,7 @@ class SpreadingTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        taken = {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh), "columns": mesh.grid_shape[1]}
+        taken = {"corners": np.array(mesh.corners), "corner_neighbors": corner_neighbors(mesh), "columns": mesh.grid_shape[1]}
         return super().constants() | own | taken
 
 

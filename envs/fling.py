@@ -30,7 +30,7 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import CLEAR, EDGES, NEXT, beside_corners, observe_next, places_to_take
+from clothgym.envs.taking import CLEAR, EDGES, NEXT, corner_neighbors, observe_next, places_to_take
 from clothgym.mesh import grid
 
 SPEED = 2.0  # of the grippers [m/s]
@@ -135,7 +135,7 @@ def held_sheets(rows: int, columns: int, side: float, bank: Bank) -> tuple[NDArr
     If there are no such edges, those with the least other cloth.
     """
     sheets, mesh = rumpled_sheets(rows, columns, side, bank), grid(rows, columns, side, side)
-    near, at = beside_corners(mesh) > 0, sheets[:, list(mesh.corners)]
+    near, at = corner_neighbors(mesh) > 0, sheets[:, list(mesh.corners)]
     takes = at + NEARER * (places_to_take(sheets, mesh)[0] - at)
     takes[..., 2] = np.maximum(takes[..., 2], LOWEST)
     # number of other particles in each grasp, (sheets, 4)

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: a task as a batch of one; and what it shares with the vector environment."""
+"""The Gymnasium environment, a task as a batch of one; and the common base of it and the vector environment."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def test_slow_hands_do_not_lay_the_sheet_down():
 
 
 def test_macro_actions_are_refused_and_the_hard_tier_is_larger():
-    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity': what is picked and placed is not thrown"):
+    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity': picking and placing cannot throw a sheet"):
         gym.make(ID, action_mode="pick_place")
     hard = gym.make("clothgym:ClothFling-Hard-v0").unwrapped
     hard.reset(seed=0)

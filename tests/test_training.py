@@ -232,8 +232,8 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
     nan = state["policy"] | {name: state["policy"][name] * torch.nan}
     for other, said in (
         ({"policy": state["policy"]}, "does not hold policy, optimizer"),
-        (state | {"policy": nan}, "no finite number"),
-        (state | {"num_timesteps": -3}, "fewer than no steps"),
+        (state | {"policy": nan}, "a value that is not finite"),
+        (state | {"num_timesteps": -3}, "number of steps is negative"),
     ):
         runs.save_tensors(broken / "checkpoint.pt", other)
         with pytest.raises(ValueError, match=f"checkpoint.pt' is no checkpoint .*{said}"):

@@ -123,7 +123,7 @@ def test_without_trimesh_the_extra_is_named_where_it_is_needed(tmp_path, monkeyp
     [
         (np.vstack([SQUARE, [[2.0, 0.0, 0.0]]]), [*PAIR, [0, 1, 4]], r"triangle 2, \[0, 1, 4\].*remove it"),
         (SQUARE, [[0, 1, 2], [0, 1, 2], [1, 3, 2]], r"\[0, 1, 2\] is there 2 times.*remove"),
-        (SQUARE, [[0, 1, 2], [1, 2, 3]], "edge 1-2 disagree.*reverse one"),
+        (SQUARE, [[0, 1, 2], [1, 2, 3]], "edge 1-2 have opposite orientations: flip one"),
         (ABOVE, [[0, 1, 2], [1, 0, 3], [0, 1, 4]], "edge 0-1 belongs to 3 triangles.*remove"),
         (np.vstack([SQUARE, [[9.0, 9.0, 9.0]]]), PAIR, "vertex 4 belongs to no triangle.*remove it"),
         (SQUARE[:, :2], PAIR, r"shape \(4, 2\).*\(particles, 3\)"),
