@@ -41,7 +41,7 @@ def toward(task, goals, grip, speed=2.0):
     return np.concatenate([way / 2, np.full((*way.shape[:2], 1), grip)], axis=2).reshape(len(way), -1)
 
 
-def test_two_corners_are_held_after_four_steps_whatever_the_actions_and_nothing_else():
+def test_two_corners_are_held_after_four_steps_for_any_actions():
     env, rng = batch(), np.random.default_rng(0)
     env.reset(seed=SEEDS)
     task = env.task

@@ -143,7 +143,7 @@ def test_what_the_other_gripper_holds_is_not_taken():
     assert taken_next(x, [x[0], x[MESH.corners[1]] + (0, 0, 0.1)], holder)[1] == [-1, -1]
 
 
-def test_nothing_is_taken_beside_what_is_held_by_mistake():
+def test_no_grasp_point_while_other_cloth_is_held():
     x, holder = lying_flat(), np.full(MESH.num_particles, -1)
     holder[8 * 17 + 8] = 0
     assert taken_next(x, [x[144], (0, 0, 0.3)], holder)[1] == [-1, -1]

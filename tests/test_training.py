@@ -77,7 +77,7 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
 
 
 @pytest.mark.slow
-def test_the_learned_policy_is_evaluated_beside_the_references(trained):
+def test_the_learned_policy_is_compared_with_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
     reach = ("--env", "ClothReach-v0")
@@ -139,7 +139,7 @@ def test_wrong_names_are_refused_as_wrong_flags_are_before_anything_slow(command
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_hyperparameters_of_one_s_own_do_not_drop_our_curriculum_in_silence(wrong, capsys):
+def test_custom_hyperparameters_warn_before_dropping_the_curriculum(wrong, capsys):
     import train
 
     Path("short.yml").write_text(SHORT.replace("ClothReach", "ClothDrape"))
@@ -248,7 +248,7 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
 
 
 @pytest.mark.slow
-def test_a_resumed_run_says_what_it_drops(broken, trained):
+def test_a_resumed_run_reports_dropped_lines(broken, trained):
     """A broken line and one from after the checkpoint, and a checkpoint that is gone."""
     _, options = trained
     lines = (broken / "progress.jsonl").read_text().splitlines()
