@@ -42,7 +42,7 @@ VARIANTS: tuple[tuple[str, Row], ...] = (
     ("ClothDrape-v0", {"randomize": {"density": [0.15, 0.2]}, "obs_mode": "particles"}),
     ("ClothDrapeGripper-v0", {"slip_force": 0.3}),
 )
-LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a hundred
+RELEASE_ABOVE = 0.81  # random actions are below this, and so lets go in a step of a hundred
 
 
 # --- environments -------------------------------------------------------------------------------------------------------------
@@ -62,7 +62,7 @@ class Episodes:
         return self._brought(observations=observation, infos=info)
 
     def step(self) -> Row:
-        actions = np.array([random.uniform(-1, LETS_GO, self.env.single_action_space.shape) for random in self.random])
+        actions = np.array([random.uniform(-1, RELEASE_ABOVE, self.env.single_action_space.shape) for random in self.random])
         actions[::2] = self.env.expert_actions()[::2]
         observation, reward, terminated, truncated, info = self.env.step(actions)
         brought = self._brought(observations=observation, rewards=reward, infos={**info, "ends": terminated | 2 * truncated})

@@ -62,7 +62,7 @@ def count(name: str, value: Any, what: str = "", least: int = 1, most: int = MOS
     return int(value)
 
 
-def room(what: str, particles: int) -> None:
+def check_memory(what: str, particles: int) -> None:
     """Check that so many particles fit into memory; what: names the arguments that ask for them, with their values."""
     if particles > MOST_PARTICLES:
         raise ValueError(

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, indices, not_negative, number, positive, room, shown
+from clothgym.checks import check_memory, count, indices, not_negative, number, positive, shown
 from clothgym.mesh_repair import Repairs
 
 Int = NDArray[np.int32]
@@ -211,7 +211,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     # bad arguments
     rows, cols = count("rows", rows, least=2), count("cols", cols, least=2)
     width, height = positive("width", width), positive("height", height)
-    room(f"rows={rows}, cols={cols}", rows * cols)
+    check_memory(f"rows={rows}, cols={cols}", rows * cols)
     # particles, row by row
     dx, dy = width / (cols - 1), height / (rows - 1)
     index = np.arange(rows * cols).reshape(rows, cols)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import as_array, count, finite, not_negative, positive, room, shown, warn
+from clothgym.checks import as_array, check_memory, count, finite, not_negative, positive, shown, warn
 from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
 from clothgym.mesh_files import read_polygons
 from clothgym.mesh_repair import Repairs, directed_edges, flat_triangles, repaired
@@ -64,7 +64,7 @@ def disc(radius: float, rings: int) -> ClothMesh:
         ValueError: a radius that is not positive, or fewer than one ring.
     """
     radius, rings = positive("radius", radius), count("rings", rings)
-    room(f"rings={rings}", 1 + 3 * rings * (rings + 1))
+    check_memory(f"rings={rings}", 1 + 3 * rings * (rings + 1))
     # ring by ring: its particles, and the triangles between it and the ring within, in six sectors
     points, triangles = [np.zeros((1, 3))], []
     for ring in range(1, rings + 1):

@@ -41,7 +41,7 @@ CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
 # of the reference's coverage; of the covered points under one layer; in sides
 ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING = 0.9, 0.9, 0.1
 
-LETS_GO = 0.8  # an action above this opens the anchor; high, so that random actions seldom release the sheet early
+RELEASE_ABOVE = 0.8  # an action above this opens the anchor; high, so that random actions seldom release the sheet early
 BOX = SHAPES.index("box")
 TARGET_SLOT = 1  # the target's place among ``colliders``
 
@@ -76,7 +76,7 @@ def upper_corners(mesh: ClothMesh) -> tuple[int, ...]:
 def let_go(own, rules, sheet, move, free):
     """Open the anchors that the action opens, or all when time is up."""
     for k in range(free.shape[0]):
-        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
+        if sheet.holds[k] > 0 and (move[k, 3] > RELEASE_ABOVE or own.step >= rules.acting_steps):
             free[k], sheet.holds[k] = 1, 0
 
 

@@ -27,7 +27,7 @@ from clothgym.mesh import grid
 HOLDING = 0.1  # share of the potential for holding the sheet
 HOLD_SCALE = 0.15  # in sides: length scale of that share as a gripper approaches the sheet
 FLAT_ALREADY = 0.99  # coverage from which on a sheet counts as flat
-SANE_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
+TORN_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
 SHORTEST = 1e-9  # least distance of tips in divisions [m]
 
 
@@ -48,7 +48,7 @@ def measure_coverage(own, rules, sheet):
     for k in range(sheet.holds.shape[0]):
         own.raised[k] = max(own.raised[k], sheet.attachments[k, 2]) if sheet.holds[k] > 0 else 0.0
     # a sheet that has failed keeps the last one
-    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= SANE_STRETCH2 and not own.over:
+    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= TORN_STRETCH2 and not own.over:
         cell = FINE_CELL if own.step == 0 else CELL
         own.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, cell) / rules.flat_area, 1.0)
         if own.step == 0:

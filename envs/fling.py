@@ -37,7 +37,7 @@ SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
 CLOSING = 4  # steps in which the fingers close on the corners at the start of an episode
 PERIODS = (12, 36, 108)  # of the observed waves [steps]
-NOT_MADE = -1.0  # coverage after a throw that has not been made
+NO_THROW = -1.0  # coverage after a throw that has not been made
 APART = 0.15  # least distance of the tips as an episode begins, in sides
 NEARER = 0.75  # share of the distance at which tips take a corner otherwise: a sheet may stir as it is taken
 # the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
@@ -55,7 +55,7 @@ def _measure_throws(own, rules, sheet):
     if own.step == 0:
         own.throws, own.throwing = 0, 0
         for i in range(THROWS):
-            own.after[i] = NOT_MADE
+            own.after[i] = NO_THROW
         for k in range(count):
             own.took[k], own.barred[k] = 0, 0
             for c in range(3):
@@ -179,7 +179,7 @@ class FlingTask(SpreadingTask):
         Observation("clock", f"triangle waves of {PERIODS} steps, each also a quarter period earlier", (len(PERIODS), 2)),
     )
     ranges: ClassVar = {
-        **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
+        **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NO_THROW, 1.0), "took": (0, 1),
         "barred": (0, 1),
     }  # fmt: skip
     no_picks = "picking and placing cannot throw a sheet"
@@ -203,7 +203,7 @@ class FlingTask(SpreadingTask):
 
     def check_episode(self, env: int, own: Any) -> None:
         super().check_episode(env, own)
-        if not np.array_equal(own["after"] > NOT_MADE, np.arange(THROWS) < own["throws"]):
+        if not np.array_equal(own["after"] > NO_THROW, np.arange(THROWS) < own["throws"]):
             raise ValueError(
                 f"the state's episode {env} has {int(own['throws'])} throws and coverages {own['after'].tolist()} after them: give "
                 "what get_state() gave"

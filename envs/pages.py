@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.collisions import Plane
-from clothgym.envs.draping import LETS_GO, let_go
+from clothgym.envs.draping import RELEASE_ABOVE, let_go
 from clothgym.envs.episode import BEYOND, EFFORT_PRICE, FAILURE_PENALTY, FAILURES, SUCCESS_BONUS, TWICE
 from clothgym.envs.gripper_task import CLOSES, OPENS, GripperTask
 from clothgym.envs.observing import Observation, points_observed
@@ -316,7 +316,7 @@ def actions_of(task_class: type[Task], whom: str = "") -> list[str]:
     """The action space; whom: the name of one attachment, such as "corner"; if actions are only velocities, of all of them."""
     physics, each = task_class.physics, task_class.actions_per_attachment
     count = len(physics.held) + len(physics.grippers)
-    fourth = f"release for good, if above {LETS_GO:g}" if task_class.kernels.act is let_go else "its own"
+    fourth = f"release for good, if above {RELEASE_ABOVE:g}" if task_class.kernels.act is let_go else "its own"
     if issubclass(task_class, GripperTask):
         seconds = f"the fingers take {physics.grippers[0].closing_time:g} s"
         fourth, whom = f"close if below {CLOSES:g}, open if above {OPENS:g}, else continue; {seconds}", whom or "gripper"

@@ -49,7 +49,7 @@ def settle(task: Task) -> None:
 
 
 @contextmanager
-def only(task: Task, envs: NDArray | None) -> Iterator[None]:
+def restricted_to(task: Task, envs: NDArray | None) -> Iterator[None]:
     """Within it only these environments take a step, if any are named.
 
     A task's own methods process the whole batch: their changes to the other environments are undone.

@@ -35,9 +35,9 @@ from clothgym.envs.physics import (
     most_demanding,
 )  # fmt: skip
 from clothgym.envs.settling import check as check_settling
-from clothgym.envs.settling import only, settle
+from clothgym.envs.settling import restricted_to, settle
 from clothgym.envs.stepping import IN_NUMPY, Kernels, compiled, mesh_arrays
-from clothgym.exclusive import Turn, exclusive
+from clothgym.exclusive import CallGuard, exclusive
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
@@ -207,7 +207,7 @@ class Task:
         self._prepare_records()
         self.generators = Generators(num_envs)
         self._begun = np.zeros(num_envs, bool)
-        self.turn = Turn("environment", error=gym.error.ResetNeeded)
+        self.turn = CallGuard("environment", error=gym.error.ResetNeeded)
         self.state_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
         self.observed = Observer(self, obs_mode, image_size, camera, num_points, privileged)
 
@@ -526,8 +526,8 @@ class Task:
         """Refuse a step of a batch that has not been reset, or was interrupted."""
         if not self._begun.all():
             raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._begun))} has not been reset yet: call reset() first")
-        self.turn.check_whole()
-        self.simulation.turn.check_whole()
+        self.turn.check_consistent()
+        self.simulation.turn.check_consistent()
 
     def move(self, actions: NDArray, envs: NDArray | None = None) -> None:
         """One control step of all environments, or of some while the others stand still.
@@ -544,7 +544,7 @@ class Task:
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         with answers.standing(self):
-            with only(self, envs):
+            with restricted_to(self, envs):
                 self.before_step(actions)
                 simulation.step(envs=envs)
                 self.info[chosen] = np.zeros((), self.info.dtype)
@@ -613,7 +613,7 @@ class Task:
         Raises:
             RuntimeError, gymnasium.error.ResetNeeded: another thread is in a call, or one was interrupted.
         """
-        self.turn.check_whole()
+        self.turn.check_consistent()
         return TaskState(
             simulation=self.simulation.get_state(),
             episode={name: value.copy() for name, value in self._memory().items()},

@@ -6,7 +6,7 @@ import pytest
 
 HANG, HANG_HARD = "clothgym:ClothHang-v0", "clothgym:ClothHang-Hard-v0"
 HOOK, HOOK_HARD = "clothgym:ClothHook-v0", "clothgym:ClothHook-Hard-v0"
-SIDE, LETS_GO = 0.6, np.tile([0, 0, 0, 1.0], 2)
+SIDE, RELEASE = 0.6, np.tile([0, 0, 0, 1.0], 2)
 
 
 def start(env_id, seed=3, options=None, **kwargs):
@@ -83,7 +83,7 @@ def test_the_return_is_the_performance_and_success_lasts_five_seconds_after_lett
 
 def settled(env, x, speed=0.0):
     """Info of an episode that ends with this sheet, let go and at rest so far, and pushed in its last step."""
-    env.step(LETS_GO)
+    env.step(RELEASE)
     task, own = env.task, env.task.episode[0]
     task.simulation.reset(positions=x)
     task.simulation.release()
@@ -98,7 +98,7 @@ def settled(env, x, speed=0.0):
     return info
 
 
-@pytest.mark.parametrize(("env_id", "action"), [(HANG, 0 * LETS_GO), (HOOK, LETS_GO), (HOOK, np.tile([0, 0, 1.0, 0], 2))])
+@pytest.mark.parametrize(("env_id", "action"), [(HANG, 0 * RELEASE), (HOOK, RELEASE), (HOOK, np.tile([0, 0, 1.0, 0], 2))])
 def test_sheets_released_early_or_held_to_the_end_score_zero(env_id, action):
     env, terminated = start(env_id, seed=5)[0], False
     while not terminated:
