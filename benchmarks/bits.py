@@ -42,14 +42,14 @@ VARIANTS: tuple[tuple[str, Row], ...] = (
     ("ClothDrape-v0", {"randomize": {"density": [0.15, 0.2]}, "obs_mode": "particles"}),
     ("ClothDrapeGripper-v0", {"slip_force": 0.3}),
 )
-LETS_GO = 0.81  # random actions are below this, and so lets go in a step of a hundred
+RELEASE_ABOVE = 0.81  # random actions are below this, and so lets go in a step of a hundred
 
 
 # --- environments -------------------------------------------------------------------------------------------------------------
 
 
 class Episodes:
-    """A batch of an id: the expert acts in even environments, and odd ones get random actions, and what is over begins again."""
+    """A batch of an id: the expert acts in even environments, odd ones get random actions, and ended episodes are reset."""
 
     def __init__(self, env_id: str, num_envs: int, threads: int, **kwargs: Any) -> None:
         self.env: Any = gym.make_vec(
@@ -62,7 +62,7 @@ class Episodes:
         return self._brought(observations=observation, infos=info)
 
     def step(self) -> Row:
-        actions = np.array([random.uniform(-1, LETS_GO, self.env.single_action_space.shape) for random in self.random])
+        actions = np.array([random.uniform(-1, RELEASE_ABOVE, self.env.single_action_space.shape) for random in self.random])
         actions[::2] = self.env.expert_actions()[::2]
         observation, reward, terminated, truncated, info = self.env.step(actions)
         brought = self._brought(observations=observation, rewards=reward, infos={**info, "ends": terminated | 2 * truncated})
@@ -143,7 +143,7 @@ def batches(select: list[str]) -> bool:
 
 
 def tell(name: str, found: list[list[str]], reference: list[list[str]]) -> bool:
-    """Print whether the environments of a batch do what they do in the first; halves of the run by environment."""
+    """Print whether the environments of a batch behave as in the first run; halves of the run by environment."""
     differ = [[i for i, (a, b) in enumerate(zip(ours, theirs)) if a != b] for ours, theirs in zip(found, reference)]
     brought = "; ".join(f"part {k + 1}: {len(d)} of {len(found[0])} differ, {d[:5]}" for k, d in enumerate(differ) if d)
     print(f"{name:<66} {brought or 'same bits'}", flush=True)

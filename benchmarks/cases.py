@@ -20,12 +20,12 @@ def parsed(description: str | None) -> argparse.Namespace:
     """``--select`` and ``--fresh``, as ``fill`` takes them."""
     parser = argparse.ArgumentParser(description=(description or "").split("\n")[0])
     parser.add_argument("--select", nargs="*", default=[], metavar="WORD", help="only cases whose names hold all these words")
-    parser.add_argument("--fresh", action="store_true", help="measure again what is there")
+    parser.add_argument("--fresh", action="store_true", help="measure existing cases again")
     return parser.parse_args()
 
 
 def fill(path: Path, sections: dict[str, list[Case]], select: list[str], fresh: bool, about: Row) -> Row:
-    """Measure the cases that the file lacks, and write each at once: what is interrupted goes on where it was."""
+    """Measure the missing cases of the file, and write each at once, so that an interrupted run can continue."""
     path.parent.mkdir(exist_ok=True)
     results: Row = {"machine": machine(), "about": about} | (json.loads(path.read_text()) if path.exists() and not fresh else {})
     wanted = [(name, *case) for name, rows in sections.items() for case in rows]

@@ -117,7 +117,7 @@ def main(env: Annotated[tuple[str, ...], tyro.conf.arg(metavar="ID ...")] = ()) 
         for cheat in CHEATS:
             found.append(score(env_id, cheat))
             print("  ".join(f"{key} {value:.3f}" if isinstance(value, float) else str(value) for key, value in found[-1].items()))
-        # what is finished is kept, whatever comes
+        # keep finished rows if the run is interrupted
         rows = [row for row in rows if row["env"] != env_id] + found
         rows.sort(key=lambda row: list(ENVIRONMENTS).index(row["env"]))
         files.write_json(RESULTS, {"machine": machine(), "episodes": EPISODES, "seed": SEED, "rows": rows})

@@ -1,4 +1,4 @@
-"""A hanging sheet beside MuJoCo: error against cost on one core.
+"""A hanging sheet, compared with MuJoCo: error over cost on one core.
 
     pip install "mujoco>=4" matplotlib
     python benchmarks/hanging_sheet.py                    # measures what the results lack, prints the tables, draws the plot
@@ -10,7 +10,7 @@ neither contact nor air.  The error is the rms distance over particles, at the e
 that none is measured by another's discretization.  Frames of 1/60 s are timed on one thread, and the median counts; those of a
 batch are summed over its environments.  Sections of ``results/hanging_sheet.json``:
 
-* ours, mujoco: error [mm] and frames/s; claim: beside each setting of MuJoCo, our fastest setting that errs no more;
+* ours, mujoco: error [mm] and frames/s; claim: for each setting of MuJoCo, our fastest setting with no greater error;
 * static: stretch under its own weight of a sheet held along one edge, over that of the converged run, minus one.
 """
 

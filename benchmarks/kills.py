@@ -98,7 +98,7 @@ def _interrupt_and_resume(
 
 
 def _forked(work: Callable[[], None], watch: Callable[[int], None] | None = None) -> tuple[int, str]:
-    """Exit status and output of some work in another process.  watch: what is done meanwhile, with the number of that process."""
+    """Exit status and output of some work in another process.  watch: called meanwhile with the id of that process."""
     read, write = os.pipe()
     child = os.fork()
     if not child:

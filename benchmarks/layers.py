@@ -36,7 +36,7 @@ STRIPS = ((0.0, (0.12, 0.34)), (0.1, (0.08, 0.35)), (0.3, (0.12, 1.2)), (0.5, (0
 
 
 def run(simulation: Simulation, frames: int) -> Row:
-    """Some control steps, and what they report."""
+    """Take some control steps, and return their report."""
     clamped = 0
     for _ in range(frames):
         simulation.step()

@@ -1,4 +1,4 @@
-"""How many files of a folder ``clothgym.load_mesh`` takes, what it says of them, and why it refuses others.
+"""Count the files of a folder that ``clothgym.load_mesh`` accepts, its warnings, and its reasons for refusing others.
 
 python benchmarks/mesh_files.py FOLDER [--scale 0.01] [--merge-tolerance 0.01]
 """

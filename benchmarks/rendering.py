@@ -40,7 +40,7 @@ def moments_of(env: Any) -> Any:
 
 
 def observed(env_id: str) -> dict[str, float]:
-    """Seconds that an environment's observation takes beside the rest of a step, by mode."""
+    """Seconds that an environment's observation adds to a step, by mode."""
     modes = ("keypoints", *PICTURES)
     model = gym.make_vec(f"clothgym:{env_id}", num_envs=NUM_ENVS, threads=1)
     particles = gym.make_vec(f"clothgym:{env_id}", num_envs=NUM_ENVS, threads=1, obs_mode="particles")

@@ -6,7 +6,7 @@ Sheets that lie flat are lifted at a random particle, carried some way and dropp
 self-collision (``starts.make``): rumpled ones were lifted a little, crumpled ones high.  Of the rumpled ones the most rumpled are
 kept, by mean height, of those whose two corners at the target can be taken: they lie half a side apart, and no cloth from elsewhere
 is within a gripper's reach of them.  Of the crumpled ones those that cover least.  Layers of a kept sheet are so far apart that
-neither rounding nor the unevenness of a task's start makes it intersect itself.  What is written is in tenths of a millimeter,
+neither rounding nor the unevenness of a task's start makes it intersect itself.  The file is in tenths of a millimeter,
 relative to the middle of the sheet on the floor.
 """
 

@@ -11,7 +11,7 @@ Sections of ``results/self_collision.json``:
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
 * drape: steps of random actions in ClothDrape-v0 with ``self_collision="strict"``, by target.
 
-What is counted is said in ``clothgym.geometry.intersections``, which knows nothing of self-collision.
+``clothgym.geometry.intersections`` defines the count, and is independent of self-collision.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What self-collision costs: against none, with the number of particles, and beside MuJoCo's.
+"""Cost of self-collision: relative to none, by number of particles, and compared with MuJoCo.
 
     pip install "mujoco>=4" matplotlib tqdm
     python benchmarks/self_collision_cost.py                      # measures what the results lack, prints tables, draws the plot

@@ -35,7 +35,7 @@ REST = 0.02  # largest rms speed of a sheet at rest, mean of the sheets [m/s]
 
 
 class Case(NamedTuple):
-    """A choice of dampings: the retardation time of springs and hinges [s], the rate of the linear drag [1/s], and what it is."""
+    """A choice of dampings: retardation time of springs and hinges [s], rate of the linear drag [1/s], and description."""
 
     damping_time: float
     drag_rate: float

@@ -76,7 +76,7 @@ def free(name: str, substeps: int, distance: float) -> Row:
 
 
 def slow(substeps: int, distance: float) -> Row:
-    """What is moved slowly."""
+    """Errors of slowly moving solids and attachments."""
     off, steps = np.array([distance, distance, 0]), STEPS[substeps]
     corner, below = MESH.rest_positions[-1] + off, off - (0, 0, 2)
     simulation = sheet(

@@ -9,7 +9,7 @@
 * cost: median time of a control step of 128 sheets on one thread, divided by 128.
 
 A task takes the cheapest setting that errs by 5 mm per meter or less, is stiff to 5 %, and has a substep of at most 0.9 of its
-stability bound, if it has one.  Iterative methods are swept with the iterations that are named beside them.
+stability bound, if it has one.  Iterative methods are swept with the stated numbers of iterations.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Do policies hold under another simulator?  Committed ones under other integrators, substeps, meshes, fabrics and physics.
 
-    python benchmarks/transfer.py            # goes on with what is in benchmarks/results/transfer.json; draws docs/transfer.png
+    python benchmarks/transfer.py            # continues benchmarks/results/transfer.json; draws docs/transfer.png
 
 Each policy was trained in the task as its id fixes it, and has not seen any of the others.  The same held-out episodes for all.
 """
@@ -34,7 +34,7 @@ ACTORS = (
     ("ClothDrape-v0", "learned:ppo"),
     ("ClothReach-v0", "learned:ppo"),
 )
-# what is changed, and what it is called in the picture
+# changed arguments, by their label in the picture
 VARIANTS: dict[str, dict[str, Any]] = {
     "as trained": {},
     "verlet": {"integrator": "verlet"},

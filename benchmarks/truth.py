@@ -1,4 +1,4 @@
-"""Truth from outside: cantilevers, drapes, swings and a fling beside what others have measured, filmed or solved.
+"""Validation against published data: cantilevers, drapes, swings and a fling, compared with measurements, films and solutions.
 
 python benchmarks/truth.py              # results/truth.json, which keeps the runs that are done, and docs/truth_*.png
 python benchmarks/truth.py --pictures   # the pictures alone, from those results
@@ -215,7 +215,7 @@ def draw_strips(figure: Any, rows: dict[str, Row]) -> None:
 
 
 def draw_drapes(figure: Any, rows: dict[str, Row]) -> None:
-    """Coefficients beside the measured ones, and the rims from above."""
+    """Computed and measured coefficients, and the rims from above."""
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.5))
     axes = left.subplots()
     measured = [value for value, _ in MEASURED.values()]

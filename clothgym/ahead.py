@@ -2,8 +2,8 @@
 
 Kernels are compiled once for each user and machine, a minute of work for one processor.  Two halves hardly depend on each other:
 contact of the sheet with itself, and the rest.  ``start`` runs a process that compiles the rest, by taking a step of a small sheet
-with the same integrator, bending, solids and attachments, while its caller compiles self-contact.  The locks of the cache see to it
-that neither compiles what the other does, and the caller loads what is ready.
+with the same integrator, bending, solids and attachments, while its caller compiles self-contact.  The locks of the cache prevent
+both from compiling the same kernel, and the caller loads finished kernels.
 
 ``CLOTHGYM_COMPILE_PROCESSES=1`` keeps all in one process.
 """

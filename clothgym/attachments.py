@@ -20,7 +20,7 @@ from clothgym._jit import apart, kernel, run_spans, specialize, used
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, positive, spread, vector
 from clothgym.collisions import COLLIDER_ROWS, SCRATCH_ROWS, Solids, keep_out, stop_at_solids
-from clothgym.elements import Elastic, Weave, room_for_forces
+from clothgym.elements import Elastic, Topology, room_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
 from clothgym.layout import Layout
@@ -214,7 +214,7 @@ class Attachments:
         x: NDArray,
         v: NDArray,
         free_w: NDArray,
-        weave: Weave,
+        topology: Topology,
         bending: Bending,
         fabric: Fabric,
         threads: int,
@@ -224,7 +224,7 @@ class Attachments:
         out, add = np.empty_like(self.x), pulls_with(bending, self.layout.by_particle)
 
         def work(first: int, last: int) -> None:
-            add(first, last, x, v, free_w, weave, fabric, self.holder, out)
+            add(first, last, x, v, free_w, topology, fabric, self.holder, out)
 
         if blocks is None:
             run_spans(work, self.layout.blocks, threads)
@@ -456,20 +456,20 @@ def steer_blocks(first, last, x, v, tips, targets, holder, limits, anchors, time
         steer(x[b], v[b], tips[b], targets[b], holder[b], limits, anchors, time_step)
 
 
-def add_pulls(first, last, x, v, free_w, weave, fabric, holder, out):
+def add_pulls(first, last, x, v, free_w, topology, fabric, holder, out):
     """``out <- sum_p (f_p + m_p g)`` over the particles p that each attachment holds [N], (blocks, attachments, 3, lanes).
 
     f: the forces of springs, bending and air.  Blocks ``first`` to ``last``.
     """
     stiffness, rigidity, damping_time, _, resistance, gravity, wind = fabric
-    f, scratch = np.empty(x.shape[1:], x.dtype), room_for_forces(x[first], weave.offset)
+    f, scratch = np.empty(x.shape[1:], x.dtype), room_for_forces(x[first], topology.offset)
     for b in range(first, last):
         # the forces on all particles of the block
         f[:] = 0
         elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
-        add_spring_forces(x[b], v[b], f, weave.elements, elastic, scratch)
-        add_bend_forces(x[b], v[b], f, weave.elements, elastic, scratch)
-        add_air_forces(x[b], v[b], f, weave.air, resistance[b], wind[b], x.dtype.type(0), scratch)
+        add_spring_forces(x[b], v[b], f, topology.elements, elastic, scratch)
+        add_bend_forces(x[b], v[b], f, topology.elements, elastic, scratch)
+        add_air_forces(x[b], v[b], f, topology.air, resistance[b], wind[b], x.dtype.type(0), scratch)
         # their sum, with the weights, for each attachment
         out[b] = 0
         for p in range(x.shape[2]):

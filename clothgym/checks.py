@@ -1,4 +1,4 @@
-"""Floor 0: checks of arguments.  They raise a ValueError that names the argument, its value and what it must be."""
+"""Floor 0: checks of arguments.  They raise a ValueError that names the argument, its value and the valid values."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def count(name: str, value: Any, what: str = "", least: int = 1, most: int = MOS
     return int(value)
 
 
-def room(what: str, particles: int) -> None:
+def check_memory(what: str, particles: int) -> None:
     """Check that so many particles fit into memory; what: names the arguments that ask for them, with their values."""
     if particles > MOST_PARTICLES:
         raise ValueError(
@@ -101,7 +101,7 @@ def _as_numbers(value: Any) -> NDArray[np.float64] | None:
             return None
     if array.dtype.kind not in "iuf" and array.size and not _is_short_float(array.dtype):
         return None
-    with np.errstate(over="ignore"):  # what is beyond float64 is infinite, and refused as such
+    with np.errstate(over="ignore"):  # numbers beyond float64 become infinite, and are refused
         return array.astype(np.float64, copy=False) if array.size else np.zeros(array.shape)
 
 

@@ -115,7 +115,7 @@ class SurfaceArrays(NamedTuple):
     area: NDArray
 
 
-class Weave(NamedTuple):
+class Topology(NamedTuple):
     """Everything that exerts forces on a sheet, in the form that the memory layout needs.
 
     springs: one by one.  elements: springs and hinges, one by one or by kinds.  air: triangles, or cells.  triangles: (triangles,
@@ -149,13 +149,13 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, any_order: bo
     return Elements(springs, bends)
 
 
-def weave_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, by_particle: bool) -> Weave:
-    """The weave of a mesh, from the mesh's ``elements`` and ``surface``; arguments as for ``grid_of`` and ``Weave``."""
+def topology_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, by_particle: bool) -> Topology:
+    """The topology of a mesh, from the mesh's ``elements`` and ``surface``; arguments as for ``grid_of`` and ``Topology``."""
     dtype = surface.shares.dtype
     if not by_particle:
-        return Weave(elements.springs, elements, surface, surface.triangles, np.zeros(0, np.int64))
+        return Topology(elements.springs, elements, surface, surface.triangles, np.zeros(0, np.int64))
     grid = grid_of(mesh, dtype, bending)
-    return Weave(elements.springs, grid, grid_surface_of(mesh, dtype), surface.triangles, grid.offset)
+    return Topology(elements.springs, grid, grid_surface_of(mesh, dtype), surface.triangles, grid.offset)
 
 
 def is_regular(mesh: ClothMesh) -> bool:
@@ -250,7 +250,7 @@ def _hinge_families(mesh: ClothMesh) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 @kernel
 def room_for_forces(x, offset):
-    """The ``Scratch`` of one block; x: (3, particles, lanes); offset: see ``Weave``."""
+    """The ``Scratch`` of one block; x: (3, particles, lanes); offset: see ``Topology``."""
     _, particles, lanes = x.shape
     before = 0
     for o in offset:

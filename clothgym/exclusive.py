@@ -1,4 +1,4 @@
-"""Floor 0: one thread at a time in an object, and what it knows of a call that was interrupted."""
+"""Floor 0: a guard that admits one thread at a time to an object, and records interrupted calls."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any, TypeVar, cast
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-class Turn:
-    """Whose turn it is in an object with a batch of environments.
+class CallGuard:
+    """A guard that admits one thread at a time to an object with a batch of environments.
 
     Attributes:
-        what, error: the object, for messages, and what is raised where environments are unfinished.
+        what, error: the object's name, for messages, and the exception for unfinished environments.
         unfinished: environments that a call is changing.  After an interruption they are still here: only a reset or a restored
             state takes them out.
     """
@@ -23,8 +23,8 @@ class Turn:
         self.what, self.unfinished, self.error = what, unfinished, error
         self._holder: dict[str, int] = {}
 
-    def take(self) -> bool:
-        """Begin a call; returns whether it is the outermost one of this thread, which has to ``give_back``.
+    def acquire(self) -> bool:
+        """Begin a call; returns whether it is the outermost one of this thread, which has to ``release``.
 
         Raises:
             RuntimeError: another thread is in a call.
@@ -40,12 +40,12 @@ class Turn:
             )
         return True
 
-    def give_back(self) -> None:
+    def release(self) -> None:
         """End the outermost call."""
         self._holder.pop("thread", None)
 
-    def check_whole(self) -> None:
-        """Refuse to go on with half a step.
+    def check_consistent(self) -> None:
+        """Check that no environment is left in the middle of a step.
 
         Raises:
             RuntimeError: a call was interrupted, and not all environments have been reset since.
@@ -57,31 +57,31 @@ class Turn:
             )
 
     def begin(self, envs: Iterable[int]) -> None:
-        """These environments are about to change."""
+        """Mark these environments as changing."""
         self.unfinished = {*self.unfinished, *envs}
 
     def finish(self, envs: Iterable[int]) -> None:
-        """These environments are whole again."""
+        """Mark these environments as consistent again."""
         self.unfinished = set(self.unfinished).difference(envs)
 
-    def __reduce__(self) -> tuple[type[Turn], tuple[str, Collection[int], type[Exception]]]:
-        """A copy is nobody's; it cannot be made while another thread is in a call."""
-        if self.take():
-            self.give_back()
-        return Turn, (self.what, self.unfinished, self.error)
+    def __reduce__(self) -> tuple[type[CallGuard], tuple[str, Collection[int], type[Exception]]]:
+        """A copy starts released.  Copying raises a RuntimeError while another thread is in a call."""
+        if self.acquire():
+            self.release()
+        return CallGuard, (self.what, self.unfinished, self.error)
 
 
 def exclusive(method: Method) -> Method:
-    """A method that one thread at a time may be in, by the object's ``turn``; it may call others of the object."""
+    """Decorate a method that admits one thread at a time, by the object's ``turn``; it may call other methods of the object."""
 
     @functools.wraps(method)
     def taken(self: Any, *args: Any, **kwargs: Any) -> Any:
         turn = self.turn
-        if not turn.take():
+        if not turn.acquire():
             return method(self, *args, **kwargs)
         try:
             return method(self, *args, **kwargs)
         finally:
-            turn.give_back()
+            turn.release()
 
     return cast(Method, taken)

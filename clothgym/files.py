@@ -2,8 +2,8 @@
 
 Arrays are plain ``npz`` files, which ``numpy.load`` reads too.  Their archive comment is a mark: what the file is, the version of
 its format, and the SHA-256 of every byte before that.  PyTorch's checkpoints are zip archives as well, and have the same mark.  A
-JSON object has its checksum as one more entry.  The checksums find damage; they do not prove who wrote a file.  So what is read is
-checked as a stranger's: nothing is unpickled, and sizes are compared before memory is taken.
+JSON object has its checksum as one more entry.  The checksums find damage; they do not prove who wrote a file.  Files are therefore
+read as untrusted: nothing is unpickled, and sizes are compared before memory is allocated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-LARGEST = 2**31  # bytes of a file, and of what is packed in it
+LARGEST = 2**31  # bytes of a file, and of its unpacked content
 LARGEST_JSON = 2**24
 CHECKSUM = "sha256"
 HEX = 64  # digits of a SHA-256
@@ -34,7 +34,7 @@ MARK = re.compile(rb"clothgym ([a-z ]{1,40}), version ([0-9]{1,9}), sha256 $")
 
 
 class Unwritten(OSError):
-    """A file that could not be written; the sentence says what is whole, and how to go on."""
+    """A file could not be written; the message names the complete files and the remedy."""
 
     def __init__(self, path: Path, error: OSError) -> None:
         super().__init__(
@@ -52,7 +52,7 @@ class Unwritten(OSError):
 
 @contextlib.contextmanager
 def replacing(path: str | Path, before: Path | None = None) -> Iterator[Path]:
-    """A place beside ``path`` to write to.  What is there at the end is synced and takes the name; nothing is left after an error.
+    """A temporary file in the folder of ``path``.  At the end it is synced and renamed; after an error it is removed.
 
     before: where what had the name is kept; it is lost otherwise.
 

@@ -91,7 +91,7 @@ def _gather(f, before, g0, g1, g2, g3, g4, g5, o0, o1, o2, o3, o4, o5):
 
 @disjoint
 def _gather_from(start, f, before, g0, g1, g2, g3, g4, g5, o0, o1, o2, o3, o4, o5):
-    """``_gather``, beginning with ``start``, (particles,), in place of what is in ``f``: its promise excludes that both are one."""
+    """``_gather`` with initial values ``start``, (particles,), instead of those in ``f``; both must not overlap."""
     a0, a1, a2, a3, a4, a5 = g0[before:], g1[before:], g2[before:], g3[before:], g4[before:], g5[before:]
     b0, b1, b2, b3, b4, b5 = (
         g0[before - o0 :], g1[before - o1 :], g2[before - o2 :], g3[before - o3 :], g4[before - o4 :], g5[before - o5 :]

@@ -1,7 +1,7 @@
 """Floor 1: how a batch lies in memory.
 
 Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see ``(block, component, particle, lane)``, and
-what lies side by side is what they do at once.
+vectorize over the elements that are adjacent in memory.
 
 For a grid under a method in which the order of the springs does not matter, that is the sheet's own particles: a block is one
 environment, of one lane, and the springs of one kind are one loop with a constant offset (see ``grid_forces``).  One environment

@@ -30,7 +30,8 @@ SWEEPS = 100  # at most, in a substep
 BEFORE, AFTER, USED = 0, 1, 2
 
 largest_strain = placeholder(
-    "largest_strain", "of (x, weave, largest): writes the largest strain of the structural and shear springs in each lane, (lanes,)"
+    "largest_strain",
+    "of (x, topology, largest): writes the largest strain of the structural and shear springs in each lane, (lanes,)",
 )
 
 
@@ -58,17 +59,17 @@ class Limiting(NamedTuple):
     sweeps: NDArray
 
 
-def _limit_strain(x, v, w, weave, limit, report):
+def _limit_strain(x, v, w, topology, limit, report):
     """Shorten springs longer than ``1 + limit`` rest lengths to that length, in place.
 
-    x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  weave: see ``elements.Weave``.  report: rows BEFORE,
-    AFTER and USED, (3, lanes).  BEFORE and USED keep the largest values of the control step.
+    x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  topology: see ``elements.Topology``.  report: rows
+    BEFORE, AFTER and USED, (3, lanes).  BEFORE and USED keep the largest values of the control step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
     enough = x.dtype.type(limit + TOLERANCE)
     for sweep in range(SWEEPS + 1):
-        largest_strain(x, weave, largest)
+        largest_strain(x, topology, largest)
         # stop when all lanes are within the tolerance, or no sweep is left
         going = False
         for l in range(lanes):
@@ -82,12 +83,12 @@ def _limit_strain(x, v, w, weave, limit, report):
         for l in range(lanes):
             if largest[l] > enough:
                 report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
-        _sweep_springs(x, v, w, weave.springs, x.dtype.type(limit), enough, largest)
+        _sweep_springs(x, v, w, topology.springs, x.dtype.type(limit), enough, largest)
 
 
-def _measure_strain(x, weave, report):
+def _measure_strain(x, topology, report):
     """Report the largest strain at the end of a control step.  Contact comes before and ignores the limit."""
-    largest_strain(x, weave, report[AFTER])
+    largest_strain(x, topology, report[AFTER])
 
 
 @disjoint
@@ -104,9 +105,9 @@ def _raise_to_stretch(x, y, z, o, weight, inverse, out):
 
 
 @kernel
-def _largest_on_grid(x, weave, largest):
+def _largest_on_grid(x, topology, largest):
     """The largest strain of a grid's structural and shear springs, (1,); x: (3, particles, 1)."""
-    offset, kind, rest_length, weight, _, _, _ = weave.elements
+    offset, kind, rest_length, weight, _, _, _ = topology.elements
     # the largest squared stretch at each particle, kind by kind
     one, n = x.dtype.type(1), x.shape[1]
     r, out = merged(x), np.zeros(n, x.dtype)
@@ -121,10 +122,10 @@ def _largest_on_grid(x, weave, largest):
 
 
 @kernel
-def _largest_in_lanes(x, weave, largest):
+def _largest_in_lanes(x, topology, largest):
     """The largest strain of the structural and shear springs, (lanes,); x: (3, particles, lanes)."""
     # the largest squared stretch
-    ends, rest_length, kind, _ = weave.springs
+    ends, rest_length, kind, _ = topology.springs
     one = x.dtype.type(1)
     largest[:] = 0
     for s in range(ends.shape[0]):
@@ -184,12 +185,12 @@ def _sweep_springs(x, v, w, springs, limit, enough, largest):
 
 
 @kernel
-def no_limit(x, v, w, weave, limit, report):
+def no_limit(x, v, w, topology, limit, report):
     """No limit: the springs stay as they are."""
 
 
 @kernel
-def no_measure(x, weave, report):
+def no_measure(x, topology, report):
     """No limit: nothing is measured."""
 
 

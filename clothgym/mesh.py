@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import count, indices, not_negative, number, positive, room, shown
+from clothgym.checks import check_memory, count, indices, not_negative, number, positive, shown
 from clothgym.mesh_repair import Repairs
 
 Int = NDArray[np.int32]
@@ -132,10 +132,10 @@ class ClothMesh:
         return 0, columns - 1, (rows - 1) * columns, rows * columns - 1
 
     def with_rest_angles(self, angle: float = 0.0, edges: ArrayLike | None = None, above: float = 0.0) -> ClothMesh:
-        """The same sheet with another angle at rest between the triangles beside some of its edges.
+        """The same sheet with another rest angle between the two triangles at some of its edges.
 
-        A garment that was modeled folded, or sewn along sharp seams, opens there when it is left alone.  Edges keep their lengths.
-        Skip springs between opposite corners get the length that they have at this angle.
+        A garment that was modeled folded, or sewn along sharp seams, then opens there.  Edges keep their lengths.
+        Skip springs between opposite corners get their length at this angle.
 
         Args:
             angle: [rad], 0 for flat, positive and negative to the two sides.
@@ -192,7 +192,7 @@ def _refolded(mesh: ClothMesh, chosen: NDArray, angle: float) -> Springs:
     span = np.sqrt(
         (feet[1] - feet[0]) ** 2 + heights[0] ** 2 + heights[1] ** 2 + 2 * heights[0] * heights[1] * np.cos(angle)
     )  # fmt: skip
-    # what they store at a curvature depends on their length
+    # their energy at a curvature depends on their length
     weight, rest_length = weight.copy(), rest_length.copy()
     weight[own] *= (rest_length[own] / span) ** 4
     rest_length[own] = span
@@ -211,7 +211,7 @@ def grid(rows: int, cols: int, width: float, height: float) -> ClothMesh:
     # bad arguments
     rows, cols = count("rows", rows, least=2), count("cols", cols, least=2)
     width, height = positive("width", width), positive("height", height)
-    room(f"rows={rows}, cols={cols}", rows * cols)
+    check_memory(f"rows={rows}, cols={cols}", rows * cols)
     # particles, row by row
     dx, dy = width / (cols - 1), height / (rows - 1)
     index = np.arange(rows * cols).reshape(rows, cols)

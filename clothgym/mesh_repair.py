@@ -15,7 +15,7 @@ from clothgym.geometry.polygons import as_triangles, quads_as_triangles, without
 from clothgym.mesh_files import Polygons
 
 FLATTEST = 1e-6  # twice a triangle's area over its longest side squared, below which it counts as degenerate
-FARTHEST_SEAM = 0.1  # largest tolerance, as a share of the size of what is read
+FARTHEST_SEAM = 0.1  # largest tolerance, as a share of the size of the mesh
 
 
 class Repairs(NamedTuple):
@@ -232,10 +232,10 @@ def flat_triangles(x: NDArray, triangles: NDArray) -> NDArray[np.bool_]:
 
 
 def _without_slivers(x: NDArray, triangles: NDArray, numbers: _Numbers) -> tuple[NDArray, int]:
-    """The triangles without those that have no area, and how many these were.
+    """The triangles without degenerate ones, and the number of degenerate ones.
 
-    If its shortest side has no length beside its longest, both ends of it become one vertex.  Otherwise one corner lies on the
-    longest side.  The triangle beyond this side is cut in two there, so that the surface stays in one piece.
+    If the shortest side is negligible relative to the longest, both its ends become one vertex.  Otherwise one corner lies on the
+    longest side.  The triangle on the other side of it is cut in two there, so that the surface stays in one piece.
     """
     flat = np.flatnonzero(flat_triangles(x, triangles)).tolist()
     if not flat:
@@ -311,10 +311,10 @@ def _one_side_up(triangles: NDArray, numbers: _Numbers) -> tuple[NDArray, int]:
     if not differ.any():
         return triangles, 0
     one, other = one % len(triangles), other % len(triangles)
-    beside: list[list[tuple[int, bool]]] = [[] for _ in range(len(triangles))]
+    adjacent: list[list[tuple[int, bool]]] = [[] for _ in range(len(triangles))]
     for s, t, turns in zip(one.tolist(), other.tolist(), differ.tolist()):
-        beside[s].append((t, turns))
-        beside[t].append((s, turns))
+        adjacent[s].append((t, turns))
+        adjacent[t].append((s, turns))
     # from each part's first triangle on
     turned = np.zeros(len(triangles), bool)
     seen = np.zeros(len(triangles), bool)
@@ -324,7 +324,7 @@ def _one_side_up(triangles: NDArray, numbers: _Numbers) -> tuple[NDArray, int]:
         seen[start], part, waiting = True, [start], deque([start])
         while waiting:
             t = waiting.popleft()
-            for neighbor, turns in beside[t]:
+            for neighbor, turns in adjacent[t]:
                 if not seen[neighbor]:
                     seen[neighbor], turned[neighbor] = True, turned[t] ^ turns
                     part.append(neighbor)

@@ -30,7 +30,7 @@ def check_properties(material: Material, parameters: NDArray) -> None:
     """Refuse properties, (envs, properties), that ``Material`` would not accept.
 
     Raises:
-        ValueError: the property, its value, and what it must be.
+        ValueError: names the property, its value, and the valid values.
     """
     for row in np.unique(parameters, axis=0):
         replace(material, **dict(zip(PROPERTIES, row.tolist())))

@@ -1,4 +1,4 @@
-"""Gymnasium ids, where their environments are, and who may act in them.  Strings only: ``make`` imports what it needs."""
+"""Gymnasium ids, the modules of their environments, and the scripted actors.  Strings only: ``make`` imports the rest."""
 
 from __future__ import annotations
 
@@ -16,70 +16,70 @@ from clothgym.checks import known
 ENVIRONMENTS = {
     "ClothReach-v0": (
         "ClothReach",
-        "Bring the free corner of a hanging sheet to a point where it can rest, and bring it to rest there.",
+        "Bring the free corner of a hanging sheet to rest at a goal.",
     ),
     "ClothDrape-v0": (
         "ClothDrape",
-        "Lay a hanging sheet over a target and let go of it.",
+        "Lay a hanging sheet over a target and release it.",
     ),
     "ClothDrapeGripper-v0": (
         "ClothDrapeGripper",
-        "Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.",
+        "Pick up a flat or rumpled sheet next to a target, drape it over the target, and release it.",
     ),
     "ClothHang-v0": (
         "ClothHang",
-        "Hang a sheet that is held by two corners over a rail, and let go of it.",
+        "Hang a sheet, held by two corners, over a rail and release it.",
     ),
     "ClothHang-Hard-v0": (
         "ClothHangHard",
-        "Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.",
+        "Pick up a flat or rumpled silk sheet from the floor, hang it over a thin rail, and release it.",
     ),
     "ClothHook-v0": (
         "ClothHook",
-        "Hang a sheet that is held by two corners by its hole on a hook, and let go of it.",
+        "Hang a sheet, held by two corners, on a hook by its hole and release it.",
     ),
     "ClothHook-Hard-v0": (
         "ClothHookHard",
-        "Pick up a silk sheet from the floor, flat or rumpled, hang it by its small hole on a hook, and let go.",
+        "Pick up a flat or rumpled silk sheet from the floor, hang it on a hook by its small hole, and release it.",
     ),
     "ClothStrain-v0": (
         "ClothStrain",
-        "Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.",
+        "Carry a stretchy sheet past a post to a goal, in gusts, without stretching it beyond a threshold.",
     ),
     "ClothFold-v0": (
         "ClothFold",
-        "Fold a sheet that lies on the floor in half, along its diagonal, or twice.",
+        "Fold a sheet on the floor in half, along its diagonal, or twice.",
     ),
     "ClothFold-Hard-v0": (
         "ClothFoldHard",
-        "Fold a large sheet of silk, turned by any angle on the floor, in half twice.",
+        "Fold a large silk sheet on the floor, turned by any angle, in half twice.",
     ),
     "ClothFoldGoal-v0": (
         "ClothFoldGoal",
-        "Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.",
+        "Bring the corners of a sheet on the floor to the goals of a random fold, with goal observations for HER.",
     ),
     "ClothFoldGoal-Hard-v0": (
         "ClothFoldGoalHard",
-        "Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.",
+        "Bring the corners of a large silk sheet to the goals of a random fold, with goal observations for HER.",
     ),
     "ClothFlatten-v0": (
         "ClothFlatten",
-        "Spread a crumpled sheet on the floor with two grippers, and let go.",
+        "Spread a crumpled sheet on the floor with two grippers and release it.",
     ),
     "ClothFlatten-Hard-v0": (
         "ClothFlattenHard",
-        "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.",
+        "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers and release it.",
     ),
     "ClothFling-v0": (
         "ClothFling",
-        "Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.",
+        "Swing a crumpled sheet, held by two corners, and lay it flat on a table within three throws.",
     ),
     "ClothFling-Hard-v0": (
         "ClothFlingHard",
-        "Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.",
+        "Swing a larger crumpled sheet, of a thinner fabric, and lay it flat on a table within three throws.",
     ),
 }
-# steps after which an episode of an id has ended by itself, at the latest
+# length of the longest episode of each id, in steps
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
     "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
@@ -87,14 +87,14 @@ LONGEST = {
     "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
     "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip
-ACTORS = ("noop", "random", "expert")  # in every environment; beside them the policy that a training run has left in its folder
+ACTORS = ("noop", "random", "expert")  # in every environment, in addition to policies of training runs
 
 
 def register() -> None:
     """Register every id once; importing the package again, as worker processes do, changes nothing.
 
-    ``max_episode_steps`` is one more than the longest episode takes: at that number Gymnasium's ``TimeLimit`` would also call an
-    episode truncated that has been evaluated, and terminated, in its last step.
+    ``max_episode_steps`` is one more than the longest episode takes: at exactly that length, Gymnasium's ``TimeLimit`` would also
+    truncate an episode that is evaluated, and terminates, in its last step.
     """
     for env_id, (name, _) in ENVIRONMENTS.items():
         if env_id not in gym.registry:
@@ -107,14 +107,14 @@ def register() -> None:
 
 
 def _look_here(module: str) -> None:
-    """Let a module be found in the current folder, where ``python -m clothgym`` finds it, and the command ``clothgym`` does not."""
+    """Make modules in the current folder importable; ``python -m clothgym`` finds them, but the command ``clothgym`` does not."""
     top, here = module.partition(".")[0], str(Path.cwd())
     if not sys.flags.safe_path and not {"", here} & set(sys.path) and top.isidentifier() and find_spec(top) is None:
         sys.path.append(here)
 
 
 def checked_id(env_id: str) -> str:
-    """A registered id whose environment is ours or built on ours, as ``gym.make`` takes it, without our own namespace.
+    """A registered id whose environment is a ``ClothEnv``, as ``gym.make`` takes it, without the prefix "clothgym:".
 
     env_id: "ClothDrape-v0", "clothgym:ClothDrape-v0", or "module:Id-v0" for an id that importing the module registers.
 
@@ -150,7 +150,7 @@ def checked_id(env_id: str) -> str:
 
 
 def actor_named(name: str, *others: str) -> str:
-    """One of ``ACTORS`` or of the others, or a path that exists.
+    """Check that a name is one of ``ACTORS`` or of the others, or an existing path; returns it.
 
     Raises:
         ValueError: neither; the message lists them.

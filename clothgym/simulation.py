@@ -10,12 +10,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from clothgym import _jit, ahead, checks, guards, integrators
 from clothgym.attachments import Attachments, Gripper, Grippers
-from clothgym.checks import count, finite, indices, members, not_negative, one_of, positive, room, sheets, shown, spread, vector
+from clothgym.checks import (
+    check_memory,
+    count,
+    finite,
+    indices,
+    members,
+    not_negative,
+    one_of,
+    positive,
+    sheets,
+    shown,
+    spread,
+    vector,
+)
 from clothgym.collisions import Collider, Contacts, SelfCollision, SelfContacts, Solids
 from clothgym.collisions.self.owner import options_of
 from clothgym.collisions.solids.sheet_contact import needed
-from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, weave_of
-from clothgym.exclusive import Turn, exclusive
+from clothgym.elements import digest_of, element_arrays, is_regular, surface_arrays, topology_of
+from clothgym.exclusive import CallGuard, exclusive
 from clothgym.forces import Energy, Oscillators, energy, structural_strain
 from clothgym.geometry.intersections import count_intersections
 from clothgym.integrators import Integrator
@@ -29,8 +42,8 @@ from clothgym.parameters import AIR_DENSITY, changed, check_properties, fabric_r
 from clothgym.state import Fabric, Orders, State, View, at_rest, check_fits
 
 GRAVITY = 9.81
-SURFACE_INTERVAL = 3e-3  # where solids touch the sheet between its particles is looked for at least this often [s]
-AIR_INTERVAL = 2e-3  # the air's force is slow beside the springs': it is computed again at most this often [s]
+SURFACE_INTERVAL = 3e-3  # longest interval between searches for contacts of triangles with solids [s]
+AIR_INTERVAL = 2e-3  # shortest interval between updates of the air's force, which is slow compared with the springs' [s]
 
 
 class Simulation:
@@ -94,8 +107,8 @@ class Simulation:
         members("colliders", colliders, Collider, "Plane, Sphere, Capsule, Box or MeshCollider")
         members("grippers", grippers, Gripper, "Gripper")
         self.num_envs = count("num_envs", num_envs)
-        room(f"num_envs={num_envs}", self.num_envs * mesh.num_particles)
-        self.turn = Turn("simulation")
+        check_memory(f"num_envs={num_envs}", self.num_envs * mesh.num_particles)
+        self.turn = CallGuard("simulation")
         one_of("dtype", dtype, "float32", "float64")
         one_of("on_divergence", on_divergence, "warn", "raise", "ignore")
         one_of("contact", contact, "sheet", "particles")
@@ -122,7 +135,7 @@ class Simulation:
         )
         self.anchors = self._attachments.anchors
         self.grippers = Grippers(self._attachments)
-        # what it touches: solids, and itself
+        # contact: with solids, and self-collision
         self._solids = Solids(self.layout, colliders, self.time_step, self.dtype)
         self.colliders = self._solids.colliders
         self._compile(options_of(self_collision) is not None)
@@ -132,7 +145,7 @@ class Simulation:
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, any_order=False)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
-        self._weave = weave_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
+        self._topology = topology_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
         # a state at rest, with masses and stiffness of the material
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -161,11 +174,11 @@ class Simulation:
         self._warn_if_beyond_bound(np.arange(1))
 
     def _compile(self, collides: bool) -> None:
-        """The main loop with the kernels of all that there is; collides: whether the sheet collides with itself."""
+        """Compose the main loop from the kernels of the present options; collides: whether the sheet collides with itself."""
         touched, method, dtype = needed(self.contact, self._solids.shapes.kinds), self.integrator, self.dtype.name
         parts = self.bending, self.layout.by_particle, self.strain_limit is not None, collides, touched
         self._advance = MainLoop(*compiled(method.substep, method.name, *parts))
-        # on a cold start another process compiles what is not of self-contact, which takes about as long
+        # on a cold start another process compiles everything except self-contact, which takes about as long
         if collides and method == integrators.INTEGRATORS.get(method.name) and not _jit.is_kept(self._advance.kernel):
             kinds = self._solids.shapes.kinds
             ahead.start(
@@ -195,7 +208,7 @@ class Simulation:
             ValueError: environments that share their memory with others, see ``layout.Layout``, cannot be advanced alone.
         """
         count("n", n)
-        self.turn.check_whole()
+        self.turn.check_consistent()
         chosen = None if envs is None else self.layout.alone(envs, self.integrator.name)
         self._prepare()
         schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
@@ -211,7 +224,7 @@ class Simulation:
             self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
             if held is not None:
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)
-            self._advance(first, last, motion, self._weave, self._fabric, solids, sheet, schedule, outcome)
+            self._advance(first, last, motion, self._topology, self._fabric, solids, sheet, schedule, outcome)
 
         def work_on(first: int, last: int) -> None:
             for span in [(first, last)] if chosen is None else [(block, block + 1) for block in chosen[first:last]]:
@@ -387,7 +400,7 @@ class Simulation:
     @exclusive
     def get_state(self) -> State:
         """All that is needed to go on bit for bit, as fresh copies; refused while a step is unfinished, as ``step`` is."""
-        self.turn.check_whole()
+        self.turn.check_consistent()
         return self._state()
 
     def _state(self) -> State:
@@ -529,7 +542,7 @@ class Simulation:
 
     def _pulls(self, blocks: list[int] | None = None) -> NDArray:
         return self._attachments.pulls(
-            self._x, self._v, self._free_w, self._weave, self.bending, self._fabric, self.threads, blocks
+            self._x, self._v, self._free_w, self._topology, self.bending, self._fabric, self.threads, blocks
         )
 
     def largest_substep(self, env: int = 0) -> tuple[float, str]:

@@ -165,10 +165,10 @@ class State:
 
 
 def check_fits(state: State, own: State) -> None:
-    """Refuse to go on in another simulation, which has a state of its ``own``; see ``SelfCollision`` for what is contact's.
+    """Check that a state belongs to this simulation, with the present state ``own``; ``SelfCollision`` checks the contact memory.
 
     Raises:
-        ValueError: what differs.
+        ValueError: names the difference.
     """
     advice = "give what get_state() gave, or State.load(path)"
     if not isinstance(state, State):

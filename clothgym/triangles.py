@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym.checks import as_array, count, finite, not_negative, positive, room, shown, warn
+from clothgym.checks import as_array, check_memory, count, finite, not_negative, positive, shown, warn
 from clothgym.mesh import EDGE, OPPOSITE, ClothMesh, Hinges, colored_hinges, colored_springs, frozen
 from clothgym.mesh_files import read_polygons
 from clothgym.mesh_repair import Repairs, directed_edges, flat_triangles, repaired
@@ -32,24 +32,24 @@ def triangle_mesh(vertices: ArrayLike, triangles: ArrayLike) -> ClothMesh:
         ValueError: other shapes or types; a triangle without area; an edge of more than two triangles, or of two that disagree on
             which side is up; or a vertex that belongs to no triangle.  The message names it.
     """
-    # the edges, and the area of the triangles beside each
+    # the edges, and the area of the triangles at each
     x = finite("vertices", vertices)
     corners = _checked(x, triangles)
     edges, inverse = np.unique(np.sort(directed_edges(corners), axis=1), axis=0, return_inverse=True)
     twice = np.linalg.norm(np.cross(x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]), axis=1)
-    beside = np.bincount(inverse, weights=np.tile(twice / 2, 3))
+    edge_area = np.bincount(inverse, weights=np.tile(twice / 2, 3))
     hinges = _calibrated(colored_hinges(x, corners), x)
     # skip springs between opposite corners at a distance l: they store B kappa^2 / 2 per area where the radius of curvature is l.
     # A spring stores half its constant times (l^3 kappa^2 / 32)^2, on a third of both triangles
     across = hinges.particles[:, 2:]
     span = np.linalg.norm(x[across[:, 1]] - x[across[:, 0]], axis=1)
     area = np.bincount(corners.ravel(), weights=np.repeat(twice / 6, 3), minlength=len(x))
-    around = _area_beside(hinges.particles[:, :2], edges, beside)
+    around = _area_at(hinges.particles[:, :2], edges, edge_area)
     springs = colored_springs(
         x,
         np.concatenate([edges, across]),
         np.repeat([EDGE, OPPOSITE], [len(edges), len(across)]),
-        np.concatenate([beside / np.sum((x[edges[:, 1]] - x[edges[:, 0]]) ** 2, axis=1), around / 3 / span**4]),
+        np.concatenate([edge_area / np.sum((x[edges[:, 1]] - x[edges[:, 0]]) ** 2, axis=1), around / 3 / span**4]),
     )
     width, height = np.ptp(x[:, 0]), np.ptp(x[:, 1])
     return ClothMesh(
@@ -64,7 +64,7 @@ def disc(radius: float, rings: int) -> ClothMesh:
         ValueError: a radius that is not positive, or fewer than one ring.
     """
     radius, rings = positive("radius", radius), count("rings", rings)
-    room(f"rings={rings}", 1 + 3 * rings * (rings + 1))
+    check_memory(f"rings={rings}", 1 + 3 * rings * (rings + 1))
     # ring by ring: its particles, and the triangles between it and the ring within, in six sectors
     points, triangles = [np.zeros((1, 3))], []
     for ring in range(1, rings + 1):
@@ -106,7 +106,7 @@ def load_mesh(path: str | Path, scale: float = 1.0, merge_tolerance: float = 0.0
         mesh = replace(triangle_mesh(x, triangles), repairs=repairs)
     except ValueError as error:
         raise ValueError(f"{str(path)!r} is not a sheet: {error}") from error
-    # what was changed, and what is probably not meant
+    # repairs, and probable mistakes
     said, size = repairs.told(), float(np.ptp(x, axis=0).max())
     if mesh.pieces > 1:
         said.append(f"the sheet has {mesh.pieces} pieces that nothing holds together")
@@ -169,8 +169,8 @@ def _calibrated(hinges: Hinges, x: NDArray) -> Hinges:
     return hinges._replace(weight=frozen(hinges.weight * (area / max((hinges.weight * square).sum(), 1e-300))))
 
 
-def _area_beside(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
-    """Area of the triangles beside the edges with these ends [m^2], (len(ends),); edges and their areas are sorted by ends."""
+def _area_at(ends: NDArray, edges: NDArray, area: NDArray) -> NDArray:
+    """Area of the triangles at the edges with these ends [m^2], (len(ends),); edges and their areas are sorted by ends."""
     size = edges.max() + 1
     ends = np.sort(ends, axis=1).astype(np.int64)
     return area[np.searchsorted(edges[:, 0] * size + edges[:, 1], ends[:, 0] * size + ends[:, 1])]
@@ -240,5 +240,5 @@ def _checked(x: NDArray, triangles: ArrayLike) -> NDArray[np.int64]:
         total = int(np.sum(np.all(np.sort(directed_edges(corners), axis=1) == sorted((a, b)), axis=1)))
         if total > 2:
             raise ValueError(f"edge {a}-{b} belongs to {total} triangles: a sheet's has one or two, remove the others")
-        raise ValueError(f"the triangles beside edge {a}-{b} disagree on which side is up: reverse one of them")
+        raise ValueError(f"the triangles at edge {a}-{b} have opposite orientations: flip one of them")
     return corners

@@ -13,7 +13,7 @@ from pathlib import Path
 
 
 class Page(HTMLParser):
-    """A page's anchors, the links of its text, and what it loads."""
+    """A page's anchors, the links of its text, and its loaded files."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

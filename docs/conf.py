@@ -26,7 +26,7 @@ version = release = clothgym.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 nitpicky = True
 exclude_patterns = ["demo"]
-highlight_language = "none"  # a block without a language is what is typed into a shell
+highlight_language = "none"  # a block without a language is shell input
 
 # pages in Markdown: anchors of headings as GitHub makes them
 myst_heading_anchors = 4
@@ -63,7 +63,7 @@ LINK_TO_DEMO = '<a class="demo" href="demo/index.html">See it move: episodes in 
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:
-    """Give a page what is elsewhere in the repository, and links that lead somewhere on the site."""
+    """Insert a page's text from elsewhere in the repository, and convert its links to links on the site."""
     text = source[0]
     folders = "../" * page.count("/")
     if page in OF_THE_ROOT:
@@ -74,7 +74,7 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         text = re.sub(rf"\]\({folders}\.\./{re.escape(name)}(#[\w-]+)?\)", f"]({folders}{place}.md)", text)
     if page == "peers":
         readme = (ROOT / "README.md").read_text()
-        table = re.search(r"^## Beside other projects\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
+        table = re.search(r"^## Comparison with other projects\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
         assert table, "README.md has no table of other projects"
         text = text.replace("\n## ", f"\n{table[1]}\n## ", 1)
     if page == "index" and DEMO.exists():

@@ -25,7 +25,7 @@ HOLD = 12  # frames for which the end of what comes to an end stands still
 
 
 class Clip(NamedTuple):
-    """What is filmed: a scene or an environment from a seed on, for ``seconds``, or to its end; from ``start`` on [s].
+    """A clip of a scene or an environment with a seed, for ``seconds``, or to its end; from ``start`` on [s].
 
     loop: where the motion has no end, frames over which the sheet passes from the last moments into the first.  at_least: the clip
     is the piece, at least so long [s], that begins and ends most alike; None for all.  settings: see ``Settings``.
@@ -77,7 +77,7 @@ def looped(frames: Sequence[Frame], over: int, at_least: int | None) -> list[Fra
 
 def film(clip: Clip) -> list[NDArray[np.uint8]]:
     """The frames of a clip, (SIZE, SIZE, 3) each, so that the last goes with the first, and with the sheet in sight in all."""
-    from pictures import corners, framed  # a script beside this one
+    from pictures import corners, framed  # a script in this folder
 
     stage = stage_named(clip.name, clip.seed, settings=clip.settings)
     for _ in range(round(clip.start / stage.recording.time_step)):

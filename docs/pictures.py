@@ -51,7 +51,7 @@ def labeled(image: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     return np.asarray(picture)
 
 
-def beside(images: Sequence[NDArray[np.uint8]], axis: int = 1) -> NDArray[np.uint8]:
+def side_by_side(images: Sequence[NDArray[np.uint8]], axis: int = 1) -> NDArray[np.uint8]:
     """Pictures in a row, or below each other with ``axis=0``, with white between them."""
     shape = list(images[0].shape)
     shape[axis] = GAP
@@ -80,7 +80,7 @@ def scale_of_strain(width: int, most: float) -> NDArray[np.uint8]:
     return np.asarray(picture)
 
 
-# --- what is seen -------------------------------------------------------------------------------------------------------
+# --- cameras --------------------------------------------------------------------------------------------------------------
 
 
 def framed(camera: Camera, points: NDArray) -> Camera:
@@ -195,7 +195,7 @@ class Row(NamedTuple):
         draw = episode.painter(SIZE, 3, self.color)
         chosen = [episode.moments[step] for step in self.steps] + [episode.moments[-1]]
         labels = [self.title] + [f"{moment.time:.1f} s" for moment in chosen[1:]]
-        return beside([labeled(draw(moment), label) for moment, label in zip(chosen, labels)])
+        return side_by_side([labeled(draw(moment), label) for moment, label in zip(chosen, labels)])
 
 
 SHAPES = {shape: {"target": {"shape": shape, "center": (0.0, 0.0)}} for shape in ("sphere", "box", "post")}
@@ -236,7 +236,7 @@ STRIPS: dict[str, list[Row]] = {
 
 def draw_strips(names: Iterable[str]) -> None:
     for name in names:
-        picture = beside([row.draw() for row in STRIPS[name]], axis=0)
+        picture = side_by_side([row.draw() for row in STRIPS[name]], axis=0)
         if STRIPS[name][0].color == "strain":
             picture = np.concatenate([picture, scale_of_strain(picture.shape[1], 0.1)])
         write(HERE / name, picture)
@@ -256,7 +256,7 @@ def film(path: Path, episodes: Sequence[Episode], stride: int, color: str = "fab
         for place, (episode, draw) in enumerate(zip(episodes, painters)):
             if k - stride < len(episode.moments) - 1:
                 still[place] = draw(episode.moments[min(k, len(episode.moments) - 1)])
-        frames.append(beside(still))
+        frames.append(side_by_side(still))
         if color == "strain":
             frames[-1] = np.concatenate([frames[-1], scale_of_strain(frames[-1].shape[1], episodes[0].task.strain_shown)])
     # the end stands for a second
@@ -333,7 +333,7 @@ def draw_contact() -> None:
         x = heap.simulation.positions[0]
         x = x - x[:, :2].mean(axis=0) @ np.eye(2, 3)
         images.append(labeled(picture(heap.simulation.mesh, x, Camera(eye=(0.75, -0.8, 0.5), target=(0, 0, 0.02)), []), title))
-    write(HERE / "contact.png", beside(images))
+    write(HERE / "contact.png", side_by_side(images))
 
 
 def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any:

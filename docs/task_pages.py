@@ -1,10 +1,10 @@
-"""The pages of docs/tasks/: one for each id, and a table of all.
+"""Generate the pages of docs/tasks/: one for each id, and a table of all tasks.
 
 python docs/task_pages.py
 
-A page is made of the id's docstring, of its picture, and of its rows in benchmarks/results/suite.json, which are made by
-training/evaluate.py --suite and training/plan.py; a test holds what is committed against what this makes.  The picture is one of
-docs/pictures.py, else the id's film in the gallery.
+A page consists of the id's docstring, its picture, and its rows in benchmarks/results/suite.json, which training/evaluate.py
+--suite and training/plan.py write.  A test compares the committed pages with the output of this script.  The picture is one of
+docs/pictures.py, else the id's clip in the gallery.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ for folder in (HERE, ROOT / "training"):
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
 
-import gallery  # noqa: E402 - a script beside this one
+import gallery  # noqa: E402 - a script in this folder
 import results  # noqa: E402 - scripts of training/
 import suite  # noqa: E402
 
-Suite = dict[str, Any]  # what the file of scores holds
+Suite = dict[str, Any]  # content of the file of scores
 NOTHING: Suite = {"rows": []}
 
 
 def read_scores(path: Path = RESULTS) -> Suite:
-    """The file of a suite's scores, of whatever machine; without one there are no rows."""
+    """Read the file of a suite's scores, from any machine; no rows if there is no file."""
     return files.read_json(path, "file of a suite's scores", f"make it with  {COMMAND}") if path.exists() else NOTHING
 
 
 def all_pages(scores: Suite) -> dict[str, str]:
-    """Every page's text by the name of its file."""
+    """Text of every page, by file name."""
     pages = {f"{env_id}.md": page(env_id, scores) for env_id in ENVIRONMENTS}
     return pages | {"README.md": index(scores)}
 
@@ -61,20 +61,19 @@ def page(env_id: str, scores: Suite) -> str:
     # the first line, the picture, and the rest
     first, _, rest = manual.partition("\n")
     parts = [f"# {env_id}", first, _picture(env_id), _facts(env_id), rest.strip(), "## Scores", _scores(env_id, scores)]
-    made_of = (
-        f"Made by `python docs/task_pages.py` from the docstring in [`envs/{source}`](../../envs/{source}) and the suite's scores."
-    )
+    link = f"[`envs/{source}`](../../envs/{source})"
+    made_of = f"`python docs/task_pages.py` generates this page from the docstring in {link} and the scores."
     return "\n\n".join(part for part in (*parts, made_of) if part) + "\n"
 
 
 def _linked(text: str, own: str) -> str:
-    """A page with links to those of other ids."""
+    """A page with links to the pages of other ids."""
     others = "|".join(re.escape(env_id) for env_id in ENVIRONMENTS if env_id != own)
     return re.sub(rf"``({others})``", r"[`\1`](\1.md)", text)
 
 
 def _picture(env_id: str) -> str:
-    """The id's picture as a link, if there is one in the repository."""
+    """A link to the id's picture, if the repository has one."""
     clips = [gallery.HERE / f"{name}.gif" for name, clip in gallery.CLIPS.items() if clip.name == env_id]
     for path in ([HERE / FILMS[env_id]] if env_id in FILMS else []) + clips:
         if path.exists():
@@ -89,20 +88,20 @@ def _sheet(task: Any) -> str:
 
 
 def _time(task: Any) -> str:
-    """How many steps, and how long they are."""
+    """Number of steps, and their frequency."""
     settling = f" and {task.settling_steps} to settle" if task.settling_steps else ""
     return f"{task.acting_steps} steps{settling}, {round(1 / task.physics.time_step)} Hz"
 
 
 def _size(space: gym.Space) -> str:
-    """The shape of a space: of a Box as numbers, of a Dict by name."""
+    """The shape of a space: numbers for a Box, by name for a Dict."""
     if isinstance(space, gym.spaces.Dict):
         return ", ".join(f"{name} {_size(one)}" for name, one in space.items())
     return " x ".join(map(str, space.shape or (1,)))
 
 
 def _facts(env_id: str) -> str:
-    """What one wants to know first."""
+    """A table of the basic facts."""
     env = gym.make(env_id).unwrapped
     task: Any = env.task  # type: ignore[attr-defined]
     rows = [
@@ -117,11 +116,11 @@ def _facts(env_id: str) -> str:
 
 
 def _scores(env_id: str, scores: Suite) -> str:
-    """The table of an id's rows, and how they were made; what is of other code is marked."""
+    """The table of an id's rows, with their sources; rows of other code are marked."""
     digests = results.read_digests()
     rows = [row for row in scores["rows"] if row["env"] == env_id]
     if not rows:
-        return f"None are committed yet; this makes them: `{COMMAND} --env {env_id}`, and `python docs/task_pages.py` the page."
+        return f"None are committed yet. `{COMMAND} --env {env_id}` makes them, and `python docs/task_pages.py` this page."
     lines = [suite.cells(row) for row in rows]
     for line, row in zip(lines, rows):
         line["policy"] += "" if results.is_present(row, digests) else " **(old)**"
@@ -133,13 +132,14 @@ def _scores(env_id: str, scores: Suite) -> str:
     said = [
         f"`{COMMAND}`{', and `python training/plan.py` for `cem`' if planned else ''}; {machine['processor']}, {machine['date']}."
     ]
-    said += [f"Episodes from seed {seeds} on, which no training uses; means and rates with their 95 % intervals (rates: Wilson's)."]
+    said += [f"Episodes start from seed {seeds}, which no training uses."]
+    said += ["Means and rates have 95 % intervals (rates: Wilson's)."]
     said += ["Score: `normalized_performance`."]
     if "held" in columns:
-        said += ["Success: in the last step; held: from its first success on to the end."]
+        said += ["Success: in the last step; held: from its first success to the end."]
     if "best" in columns:
         said += ["Best: the best score of an episode."]
-    said += [f"What has been learned is in [results](../results.md#{env_id.lower()})."] if "-Hard-" not in env_id else []
+    said += [f"[Results](../results.md#{env_id.lower()}) has the scores of learned policies."] if "-Hard-" not in env_id else []
     return "\n".join([*table, "", "\n".join(said)])
 
 
@@ -163,9 +163,9 @@ def index(scores: Suite) -> str:
         rows.append(f"| [`{env_id}`]({env_id}.md) | {goal} | {about} | {cells['score']} | {cells['success']} |")
         env.close()
     said = [
-        "The scripted expert's scores are on held-out seeds; each page has them beside those of doing nothing, of chance and of",
-        f"what was planned or learned: `{COMMAND}`.",
-        "The pages are made by `python docs/task_pages.py`.",
+        "The scripted expert's scores are from held-out seeds. Each page compares them with no action, random actions, and planned",
+        f"or learned policies (`{COMMAND}`).",
+        "`python docs/task_pages.py` generates the pages.",
     ]
     return "\n".join(["# Tasks", "", *rows, "", *said]) + "\n"
 

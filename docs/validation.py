@@ -1,4 +1,4 @@
-"""The plots of docs/physics.md: the library beside closed forms and converged solutions.
+"""The plots of docs/physics.md: the library compared with closed forms and converged solutions.
 
     python docs/validation.py            # draws docs/validation.png, in a minute or two
 

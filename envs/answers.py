@@ -1,7 +1,7 @@
-"""What a step has brought, as ``info``; and that it stands: an environment that is over gives its last answer until it is reset.
+"""The result of a step as ``info``; an environment whose episode has ended repeats its last answer until it is reset.
 
-An answer is whether and how the episode has ended, the record of info, and what the physics tells beside it.  What is of one step
-alone and is summed over an episode, the reward with its terms and a cost, is zero after the end.
+An answer consists of the end of the episode, the record of info, and the info of the physics.  Quantities of a single step, which
+are summed over an episode (the reward with its terms, and a cost), are zero after the end.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ if TYPE_CHECKING:
 
 ENDS = ("terminated", "truncated", "failure")  # fields of ``Task.outcome``: whether and how an episode has ended
 COST = "cost"  # of a step, where a constraint is the task
-# what ``info_of_physics`` may tell beside the record of info
+# entries of ``info_of_physics`` in addition to the record of info
 PHYSICAL = (("self_contacts", np.int64), ("clamped_moves", np.int64), ("attachment_lag", np.float64))
 
 
 def info_of_physics(simulation: Simulation) -> dict[str, NDArray]:
-    """With a limiter the strain that it met; with self-collision its contacts, the moves that it cut short, and how far what is
-    held lags behind [m]."""
+    """With a limiter the strain before it; with self-collision its contacts, truncated displacements, and attachment lag [m]."""
     limiting, contacts = simulation.limiting, simulation.self_contacts
     info = {} if limiting is None else {"strain_before_limiting": limiting.before}
     if contacts is not None:
@@ -36,7 +35,7 @@ def info_of_physics(simulation: Simulation) -> dict[str, NDArray]:
 
 
 def note_physics(task: Task, envs: NDArray) -> None:
-    """Write what the physics tells of these environments beside the record of info, or into it."""
+    """Write the info of the physics of these environments, to the record of info or next to it."""
     for name, values in info_of_physics(task.simulation).items():
         record = task.info if name in names_of(task.info) else task.physical
         record[name][envs] = values[envs]
@@ -44,7 +43,7 @@ def note_physics(task: Task, envs: NDArray) -> None:
 
 @contextmanager
 def standing(task: Task) -> Iterator[None]:
-    """Within it a control step is made: the answers of environments that were over before it stand, and others are noted."""
+    """Context of a control step: keeps the answers of environments whose episodes had ended, and notes those of the others."""
     over = task.episode["over"].copy()
     # the usual case, at once
     if not over.any():
@@ -57,7 +56,7 @@ def standing(task: Task) -> Iterator[None]:
     task.info[over] = kept_info
     for name, values in kept_ends.items():
         task.outcome[name][over] = values
-    # what is of one step alone
+    # quantities of a single step
     task.outcome["reward"][over], task.terms[over] = 0, np.zeros((), task.terms.dtype)
     if COST in names_of(task.info):
         task.info[COST][over] = 0

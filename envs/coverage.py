@@ -11,7 +11,7 @@ import numpy as np
 from clothgym._jit import apart, inlined
 
 CELL, FINE_CELL = 0.01, 0.0025  # of the grid after each step, and at an episode's start and end [m]
-MOST_CELLS = 2000  # along a side of what is looked at, from the sheet's lowest x and y
+MOST_CELLS = 2000  # along a side of the measured area, from the sheet's lowest x and y
 BITS, ALL = 64, np.uint64(2**64 - 1)  # of a word of cells
 PAIRS, NIBBLES, BYTES, ONES = (np.uint64(byte * (2**64 // 255)) for byte in (0x55, 0x33, 0x0F, 0x01))  # in each byte
 SOFTGYM_CELLS = 100  # along a side of the particles' bounding box

@@ -1,4 +1,4 @@
-"""ClothDrapeGripper-v0: pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go."""
+"""ClothDrapeGripper-v0: pick up a flat or rumpled sheet next to a target, drape it over the target, and release it."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from clothgym.envs.scoring import grasp
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 
-PICKING = 0.3  # share of the potential that is for taking hold
+PICKING = 0.3  # share of the potential for grasping
 
-# the scripted expert's ways, in sides: how far beyond the target, above it on the way and below its top at the end; and how far
-# above it before it sets out
+# the scripted expert's path, in sides: distance beyond the target, height above it on the way, depth below its top at the end, and
+# height above it before it moves sideways
 EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
 
 
@@ -32,7 +32,7 @@ EXPERT_BEYOND, EXPERT_LIFT, EXPERT_DROP, EXPERT_CLEARS = 0.32, 0.42, 0.25, 0.15
 
 @inlined
 def _potential(own, rules, sheet):
-    """How far the taking hold is along, and how near the sheet is to the target."""
+    """Progress of grasping, and nearness of the sheet to the target."""
     taken = 0.0
     for k in range(rules.places.shape[0]):
         taken += grasp(sheet.holder[rules.places[k]] >= 0, rules, sheet, k)
@@ -41,7 +41,7 @@ def _potential(own, rules, sheet):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """What is observed in both draping tasks, and each gripper: its tip, the way to its place, its fingers."""
+    """The observations of both draping tasks, and for each gripper its tip, the displacement to its place, and its fingers."""
     observe_target(own, rules, sheet, seen)
     for k in range(rules.places.shape[0]):
         attachment, place = sheet.attachments[k], rules.places[k]
@@ -52,10 +52,10 @@ def _observe(own, rules, sheet, seen):
 
 
 def _observations(grippers: int) -> tuple[Observation, ...]:
-    """What is observed with so many grippers."""
+    """The observations with this number of grippers."""
     about = (
-        "for each gripper its tip relative to the target's top [L], the way from its tip to the corner that it is meant to take "
-        "[L/10], and how far open its fingers are"
+        "for each gripper its tip relative to the target's top [L], the displacement from its tip to its corner [L/10], and the "
+        "opening of its fingers"
     )
     bounds = (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0)
     own = Observation("grippers", about, (grippers, 7), "", bounds)
@@ -66,7 +66,7 @@ class DrapeGripperTask(DrapingTask, PickingTask):
     """The task of ``ClothDrapeGripper-v0``, see ``ClothDrapeGripperEnv``."""
 
     physics = PHYSICS
-    # an agent is never done: it may take hold again until its time is up
+    # an agent is never done: it may grasp again until its time is up
     kernels = Kernels(
         _potential, draping.evaluate_cover, _observe, act=take, account=draping.account_reference, fingers=close_or_open
     )  # fmt: skip
@@ -80,8 +80,8 @@ class DrapeGripperTask(DrapingTask, PickingTask):
     arguments: ClassVar = {
         **DrapingTask.arguments,
         **PickingTask.arguments,
-        "grippers": "or 1, which is meant to take the middle of the edge (4 actions, 74 observations; harder)",
-        "slip_force": "pull at which the cloth slips out of a gripper [N]; it weighs 0.70 N",
+        "grippers": "or 1, for the middle of the edge (4 actions, 74 observations; harder)",
+        "slip_force": "pull at which the cloth slips out of a gripper [N]; the cloth weighs 0.70 N",
     }
 
     def __init__(self, num_envs: int, grippers: int = 2, **kwargs: Any) -> None:
@@ -93,7 +93,7 @@ class DrapeGripperTask(DrapingTask, PickingTask):
 
     @property
     def places(self) -> NDArray:  # type: ignore[override]
-        """The particles that each gripper is to take: both corners of the edge at the target, or its middle."""
+        """The particle for each gripper: both corners of the edge at the target, or its middle."""
         mesh = self.physics.mesh
         left, right = mesh.corners[2:]
         return np.array([left, right] if len(self.physics.grippers) == 2 else [left + mesh.grid_shape[1] // 2])
@@ -115,12 +115,12 @@ class DrapeGripperTask(DrapingTask, PickingTask):
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """To the corners, close, up, over the target and a third of a side beyond it, down, open, and away.
+        """Move to the corners, close, lift, move over the target and a third of a side beyond it, lower, open, and leave.
 
-        Without memory: where the grippers are, and what they hold, says which part of the way they are on.
+        The expert has no memory: the positions of the grippers and the held particles determine the phase.
         """
         tips, tops, side = self.simulation.grippers.positions.astype(np.float64), self.episode["top"][:, None], self.physics.side
-        # over the target, both at the height of the lower one's way, as far apart as the corners are at rest
+        # over the target, both at the height of the lower one, as far apart as the corners at rest
         beyond = tops[..., 1] + EXPERT_BEYOND * side
         low = np.maximum(tops[..., 2] - EXPERT_DROP * side, 0.02)
         arrived = np.abs(tips[..., 1].mean(axis=1, keepdims=True) - beyond) < 0.03
@@ -135,29 +135,30 @@ class DrapeGripperTask(DrapingTask, PickingTask):
 
 
 class ClothDrapeGripperEnv(ClothEnv):
-    """Pick up a sheet that lies beside a target, flat or rumpled, drape it, and let go.
+    """Pick up a flat or rumpled sheet next to a target, drape it over the target, and release it.
 
     ## Description
-    The sheet and the targets are those of ``ClothDrape-v0``, and so is the evaluation.  But the sheet lies on the floor, flat or
-    rumpled, and two grippers hover above the corners of its edge at the target, which stops their tips.  After 100 steps they open,
-    and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until
-    then is as good as to let go.
+    The sheet, the targets and the evaluation are those of ``ClothDrape-v0``.  But the sheet lies on the floor, flat or
+    rumpled, and two grippers hover above the corners of its edge at the target.  The target stops their tips.  After 100 steps the
+    grippers open, and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  Holding the sheet in
+    place until then is as good as releasing it earlier.
 
     $physics
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L in the place of its 0.15 L), plus 0.3 times the mean
-    over both corners of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
+    During the episode the potential is 0.7 times that of ``ClothDrape-v0`` (with 0.4 L instead of its 0.15 L), plus 0.3 times the
+    mean over both corners of 1 for a held corner, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     As in ``ClothDrape-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet lies before the target, 0.05 to 0.15 L away from it, turned by up to 0.2 rad and up to 0.1 L to the side; in half
-    of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L beside
-    and 0.2 to 0.35 L above their corners.  The target's axis is within 0.25 L of the origin; a box is turned by up to 45 degrees.
+    The sheet lies in front of the target, 0.05 to 0.15 L away from it, turned by up to 0.2 rad and up to 0.1 L to the side; in half
+    of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, displaced from their
+    corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The target's axis is within 0.25 L of the origin; a box is
+    turned by up to 45 degrees.
     """
 
     task_class = DrapeGripperTask

@@ -1,6 +1,6 @@
-"""What the draping tasks share: the sheet, its target, what is observed of it, the potential and the evaluation.
+"""Common parts of the draping tasks: the sheet, its target, the observations, the potential and the evaluation.
 
-Their tasks are ``DrapingTask``, and name these kernels; the target of an episode is kept in its record, see ``REMEMBERS``.
+The tasks derive from ``DrapingTask`` and use these kernels.  An episode's record holds its target, see ``REMEMBERS``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from clothgym.envs.task import Task
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 
-# what the ids of both tasks fix, but for what holds the sheet
+# settings of both ids, without the attachments
 PHYSICS = Physics(
     mesh=grid(17, 17, 0.6, 0.6),
     material=MEDIAN,
@@ -41,18 +41,18 @@ CENTERING_SCALE = 0.2  # in sides: performance is halved at this distance
 # of the reference's coverage; of the covered points under one layer; in sides
 ENOUGH_COVERAGE, ENOUGH_SPREAD, ENOUGH_CENTERING = 0.9, 0.9, 0.1
 
-LETS_GO = 0.8  # an action above this opens the anchor: random actions seldom let go before the agent has seen why it should hold
+RELEASE_ABOVE = 0.8  # an action above this opens the anchor; high, so that random actions seldom release the sheet early
 BOX = SHAPES.index("box")
 TARGET_SLOT = 1  # the target's place among ``colliders``
 
-# of the target: its place in SHAPES, its size, its highest point [m], how it is turned, and the most that can be covered
+# of the target: index in SHAPES, size, highest point [m], yaw as an angle and as (cos, sin), and the reference coverage
 REMEMBERS: Fields = [
     *[("solid", np.int64), ("radius", float), ("top", float, 3), ("yaw", float), ("turn", float, 2), ("reference", float)],
 ]
 
 
 def observations(attachments: int, holds: str) -> tuple[Observation, ...]:
-    """What is observed beside the points of the sheet; holds: what the attachments are asked, for the page."""
+    """The observations in addition to the points of the sheet; holds: description of the flags of the attachments."""
     return (
         Observation("center", "center of area, relative to the target's top", (3,), "L", POSITION_BOUND),
         Observation("holds", holds, (attachments,)),
@@ -76,7 +76,7 @@ def upper_corners(mesh: ClothMesh) -> tuple[int, ...]:
 def let_go(own, rules, sheet, move, free):
     """Open the anchors that the action opens, or all when time is up."""
     for k in range(free.shape[0]):
-        if sheet.holds[k] > 0 and (move[k, 3] > LETS_GO or own.step >= rules.acting_steps):
+        if sheet.holds[k] > 0 and (move[k, 3] > RELEASE_ABOVE or own.step >= rules.acting_steps):
             free[k], sheet.holds[k] = 1, 0
 
 
@@ -84,10 +84,10 @@ def let_go(own, rules, sheet, move, free):
 
 
 def checked_shapes(shapes: Any) -> tuple[str, ...]:
-    """Shapes of targets, one by its name or several in a sequence.
+    """Check shapes of targets: one name, or a sequence of several.
 
     Raises:
-        ValueError: there is none, or one that no target has.
+        ValueError: the sequence is empty or has an unknown shape.
     """
     given = (shapes,) if isinstance(shapes, str) else shapes
     if not isinstance(given, Sequence) or not given or any(shape not in SHAPES for shape in given):
@@ -96,7 +96,7 @@ def checked_shapes(shapes: Any) -> tuple[str, ...]:
 
 
 def recalled(own: Any) -> Target:
-    """The target in an episode's record."""
+    """The target of an episode, from its record."""
     *center, height = own["top"].tolist()
     return Target(SHAPES[int(own["solid"])], float(own["radius"]), height, tuple(center), float(own["yaw"]))
 
@@ -105,7 +105,7 @@ class DrapingTask(Task):
     """Base of both tasks.
 
     Args:
-        shapes: from which episodes draw that of their target.
+        shapes: shapes of targets that episodes draw from.
 
     Attributes:
         guide_reach: distance at which a guide point counts half, in sides.
@@ -118,7 +118,7 @@ class DrapingTask(Task):
     )
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {"solid": (0, len(SHAPES) - 1)}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "target")
-    arguments: ClassVar[Mapping[str, str]] = {"shapes": "of the targets that episodes draw from"}
+    arguments: ClassVar[Mapping[str, str]] = {"shapes": "shapes of targets that episodes draw from"}
 
     def __init__(self, num_envs: int, shapes: str | Sequence[str] = SHAPES, **kwargs: Any) -> None:
         self.shapes = checked_shapes(shapes)
@@ -126,16 +126,16 @@ class DrapingTask(Task):
 
     @property
     def targets(self) -> list[Target]:
-        """Those of the episodes."""
+        """The targets of the episodes."""
         return [recalled(own) for own in self.episode]
 
     def colliders(self) -> list[Collider]:
-        """The floor, and a target in whose place each episode has its own."""
+        """The floor, and a target that each episode replaces by its own."""
         floor, side = Plane(friction=FRICTION, thickness=ON_FLOOR), self.physics.side
         return [floor, Target("sphere", 0.25 * side, 0.5 * side, (0.0, 0.0)).collider(FRICTION, THICKNESS)]
 
     def working_area(self) -> tuple[NDArray, float]:
-        # the sheet begins before the target, which is about the origin
+        # the sheet starts in front of the target, which is near the origin
         return np.array([0.0, -0.35 * self.physics.side]), 1.3 * self.physics.side
 
     def episode_colliders(self, env: int) -> Mapping[int, Collider]:
@@ -162,7 +162,7 @@ class DrapingTask(Task):
         return super().constants() | own | surface
 
     def draw_target(self, env: int, rng: np.random.Generator, wanted: Any) -> Target:
-        """Draw the target of an environment's episode, of which some properties may be wanted, and write it into its record.
+        """Draw the target of an environment's episode, with the properties in ``wanted`` fixed, and write it to its record.
 
         Raises:
             ValueError: ``wanted`` is no dict of a target's properties.
@@ -193,7 +193,7 @@ def _surface_of(own, units):
 
 @kernel
 def _nearness(x, surface, reach):
-    """How near the sheet is to points of the target's upper surface, see ``soft_coverage``."""
+    """Nearness of the sheet to points of the target's upper surface, see ``soft_coverage``."""
     points = placed(*surface)
     return soft_coverage(x, points, reach)
 
@@ -224,15 +224,14 @@ def _off_center(own, rules, sheet):
 
 @inlined
 def covering(own, rules, sheet):
-    """How near the sheet is to the target's upper surface, and how central, in [0, 1]."""
+    """Nearness of the sheet to the target's upper surface, and its centering, in [0, 1]."""
     near = _nearness(sheet.x, _surface_of(own, rules.guides), rules.guide_reach)
     return (near + 1 / falloff(_off_center(own, rules, sheet), CENTERING_SCALE)) / 2
 
 
 @inlined
 def evaluate_cover(own, rules, sheet, info):
-    """Write what covers the target, how flat, central and much at rest it is; returns the normalized performance."""
-    # what the evaluation measures
+    """Write coverage, spread, centering and speed of the sheet; returns the normalized performance."""
     surface, normals = _surface_of(own, rules.evaluated), rules.normals[1 if own.solid == BOX else 0]
     info.coverage, info.spread = _coverage(sheet.x, sheet.mesh.triangles, surface, normals, rules.judged_within)
     info.off_center = _off_center(own, rules, sheet)
@@ -247,15 +246,15 @@ def evaluate_cover(own, rules, sheet, info):
 
 @inlined
 def account_reference(own, rules, sheet, info, terms, running, failure):
-    """The most that can be covered of this target; no reward terms."""
+    """The reference coverage of this target; no reward terms."""
     info.coverage_reference = own.reference
     return 0.0
 
 
 @inlined
 def observe_target(own, rules, sheet, seen):
-    """The sheet's center, what holds it, the target, and the time."""
-    # the sheet, and what holds it
+    """The sheet's center, its attachments, the target, and the time."""
+    # the sheet and its attachments
     for c in range(3):
         seen.center[c] = (sheet.summary[CENTROID + c] - own.top[c]) / rules.side
     for k in range(sheet.holds.shape[0]):

@@ -42,9 +42,9 @@ class TaskState:
 
     Attributes:
         simulation: the physics.
-        episode: what is remembered of the episodes, by name; the environment is the first axis of each.
+        episode: variables of the episodes, by name; the environment is the first axis of each.
         generators: the random generators, one an environment, as JSON.
-        task: what it belongs to, by name: the task, what is observed, and a digest of its arguments.  The digest of the mesh is
+        task: identity of the task, by name: the task, its observations, and a digest of its arguments.  The digest of the mesh is
             ``simulation.sheet``.
     """
 
@@ -183,7 +183,7 @@ def within_ball(vectors: NDArray) -> NDArray:
 
 
 def check_state(task: Any, state: TaskState) -> None:
-    """Refuse a state's episodes, and what it belongs to; ``Simulation.set_state`` sees to the physics."""
+    """Check a state's episodes and its task; ``Simulation.set_state`` checks the physics."""
     advice = "give what get_state() gave, or TaskState.load(path)"
     if not isinstance(state, TaskState) or not all(isinstance(part, dict) for part in (state.episode, state.task)):
         raise ValueError(f"state={shown(state)}: {advice}")

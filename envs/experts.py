@@ -26,9 +26,9 @@ def as_actions(task: Any, ways: NDArray, last: NDArray, speed: float | NDArray =
 def carry_by_places(task: Any, carry: NDArray, there: NDArray, away: NDArray, speed: float | NDArray = SPEED) -> NDArray:
     """Actions of grippers that go to their places, close, carry the sheet when all hold theirs, open where it is there, and leave.
 
-    Without memory: what is held, and what has been, says which part of the way they are on.
-    task: a ``GripperTask`` with ``places``, whose episodes remember what has been ``picked``.  carry, away: ways of this step [m]
-    of those that carry, and of those that leave, (num_envs, grippers, 3).  there: whether to open, (num_envs, grippers or 1).
+    The expert has no memory: the particles that are held, or have been held, determine the phase.
+    task: a ``GripperTask`` with ``places``, whose episodes record ``picked``.  carry, away: displacements in this step [m]
+    of grippers that carry, and of grippers that leave, (num_envs, grippers, 3).  there: whether to open, (num_envs, grippers or 1).
     speed: as of ``as_actions``.
     """
     grippers, places = task.simulation.grippers, task.places

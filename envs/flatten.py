@@ -21,14 +21,14 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, beside_corners, observe_next
+from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, corner_neighbors, observe_next
 from clothgym.mesh import grid
 
-HOLDING = 0.1  # share of the potential that is for holding the sheet
-HOLD_SCALE = 0.15  # in sides: how that rises as a gripper nears the sheet
-FLAT_ALREADY = 0.99  # coverage of which there is nothing to improve
-SANE_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
-SHORTEST = 1e-9  # distance of tips that hold both ends of an edge, which has no direction if they touch [m]
+HOLDING = 0.1  # share of the potential for holding the sheet
+HOLD_SCALE = 0.15  # in sides: length scale of that share as a gripper approaches the sheet
+FLAT_ALREADY = 0.99  # coverage from which on a sheet counts as flat
+TORN_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
+SHORTEST = 1e-9  # least distance of tips in divisions [m]
 
 
 # --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
@@ -36,7 +36,7 @@ SHORTEST = 1e-9  # distance of tips that hold both ends of an edge, which has no
 
 @inlined
 def improvement(coverage, start):
-    """Normalized improvement: share of what was not covered at the start that is covered now, in [0, 1]."""
+    """Normalized improvement: share of the initially uncovered area that is covered now, in [0, 1]."""
     if coverage >= FLAT_ALREADY:
         return 1.0
     return 0.0 if start >= FLAT_ALREADY else min(max((coverage - start) / (1 - start), 0.0), 1.0)
@@ -44,11 +44,11 @@ def improvement(coverage, start):
 
 @inlined
 def measure_coverage(own, rules, sheet):
-    """Grips; how high each gripper has been since it took hold; and the coverage, on the coarser grid but for the start."""
+    """Largest height of each gripper since its grasp; and the coverage, on the coarser grid except at the start."""
     for k in range(sheet.holds.shape[0]):
         own.raised[k] = max(own.raised[k], sheet.attachments[k, 2]) if sheet.holds[k] > 0 else 0.0
     # a sheet that has failed keeps the last one
-    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= SANE_STRETCH2 and not own.over:
+    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= TORN_STRETCH2 and not own.over:
         cell = FINE_CELL if own.step == 0 else CELL
         own.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, cell) / rules.flat_area, 1.0)
         if own.step == 0:
@@ -57,7 +57,7 @@ def measure_coverage(own, rules, sheet):
 
 @inlined
 def spread_potential(own, rules, sheet):
-    """Coverage, and for each gripper 1 if it holds cloth, else at most a half as it nears it."""
+    """Coverage, and for each gripper 1 if it holds cloth, else at most a half as it approaches it."""
     held = 0.0
     for k in range(sheet.holds.shape[0]):
         if sheet.holds[k] > 0:
@@ -72,7 +72,7 @@ def spread_potential(own, rules, sheet):
 
 @inlined
 def evaluate_spread(own, rules, sheet, info):
-    """Write how much the sheet covers, and how much at rest it is; returns the normalized improvement."""
+    """Write the sheet's coverage and speed; returns the normalized improvement."""
     info.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL) / rules.flat_area, 1.0)
     info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.flat_area
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
@@ -82,7 +82,7 @@ def evaluate_spread(own, rules, sheet, info):
 
 @inlined
 def account_spread(own, rules, sheet, info, terms, running, failure):
-    """Coverage now and at the start, and what has become of a success; no reward terms."""
+    """Coverage now and at the start, and the record of successes; no reward terms."""
     info.coverage, info.coverage_start = own.coverage, own.coverage_start
     score = improvement(own.coverage, own.coverage_start)
     follow(own, info, score, own.coverage >= rules.enough, running, failure)
@@ -91,21 +91,21 @@ def account_spread(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def observe_spread(own, rules, sheet, seen):
-    """Grippers, time, coverage, and how fast the sheet moves."""
+    """Grippers, time, coverage, and the sheet's speed."""
     observe_grippers(own, rules, sheet, seen)
     seen.coverage, seen.speed = own.coverage, np.sqrt(sheet.summary[SPEED2])
 
 
 @inlined
 def _observe_held_edge(rules, sheet, seen):
-    """While both grippers hold an edge: which way the sheet is laid down, where its far edge is, and how fast, in those axes."""
+    """While both grippers hold an edge: the direction of laying down, the far edge's position, and its speed, in those axes."""
     seen.out[:], seen.far[:], seen.swing = 0, 0, 0
     for e in range(len(EDGES)):
         for crossed in range(2):
             first, second = rules.corners[EDGES[e, crossed]], rules.corners[EDGES[e, 1 - crossed]]
             if sheet.holder[first] != 0 or sheet.holder[second] != 1:
                 continue
-            # along the edge, and across it, to the side on which the sheet lies with its front up
+            # unit vectors along the edge, and across it, toward the side on which the sheet lies with its front up
             x, y = sheet.attachments[1, 0] - sheet.attachments[0, 0], sheet.attachments[1, 1] - sheet.attachments[0, 1]
             long = max(np.sqrt(x * x + y * y), SHORTEST)
             x, y, side = x / long, y / long, 1 - 2 * crossed
@@ -122,7 +122,7 @@ def _observe_held_edge(rules, sheet, seen):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """What both spreading tasks observe; what grippers take next; how high they have been since they took hold; the far edge."""
+    """The observations of both spreading tasks; the next grasp points; the largest heights since the grasp; the far edge."""
     observe_spread(own, rules, sheet, seen)
     observe_ways(rules, sheet, seen)
     observe_next(own, rules, sheet, seen, False)
@@ -150,7 +150,7 @@ class SpreadingTask(ManipulationTask):
     accounts: ClassVar[Fields] = (*ManipulationTask.accounts, ("coverage", float), ("coverage_start", float))
     observations: ClassVar[tuple[Observation, ...]] = (
         *ManipulationTask.observations,
-        Observation("coverage", "share of the sheet's area that it covers"),
+        Observation("coverage", "covered area over the sheet's area"),
         Observation("speed", "rms speed of the sheet", (), "m/s", VELOCITY_BOUND),
     )
     ranges: ClassVar = {
@@ -164,7 +164,7 @@ class SpreadingTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        taken = {"corners": np.array(mesh.corners), "beside_corners": beside_corners(mesh), "columns": mesh.grid_shape[1]}
+        taken = {"corners": np.array(mesh.corners), "corner_neighbors": corner_neighbors(mesh), "columns": mesh.grid_shape[1]}
         return super().constants() | own | taken
 
 
@@ -187,23 +187,25 @@ class FlattenTask(SpreadingTask):
         Observation("corners_held", "for each gripper whether it holds each of the corners", (2, CORNERS)),
         NEXT,
         Observation(
-            "out", "while both hold the corners of an edge, the level direction across it in which the sheet is laid flat", (2,)
+            "out",
+            "while both hold the corners of an edge, the horizontal direction across it in which the sheet is laid flat",
+            (2,),
         ),
         Observation(
             "far",
-            "while both hold an edge, the way from each tip to the far corner of its side: along the edge, across it, and up",
+            "while both hold an edge, from each tip to the far corner of its side: along the edge, across it, and up",
             (2, 3),
             "L",
             POSITION_BOUND,
         ),
-        Observation("swing", "while both hold an edge, how fast the far edge moves across it", (), "m/s", VELOCITY_BOUND),
-        Observation("raised", "how high each gripper has been since it took hold, or 0", (2,), "L", POSITION_BOUND),
+        Observation("swing", "while both hold an edge, speed of the far edge across it", (), "m/s", VELOCITY_BOUND),
+        Observation("raised", "largest height of each gripper since its grasp, or 0", (2,), "L", POSITION_BOUND),
         Observation("lifted", f"for each gripper whether that is above {LIFTED[0]} L, and above {LIFTED[1]} L", (2, len(LIFTED))),
     )
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
-        # the sheets of this resolution, before the first reset asks for them
+        # the sheets of this resolution, before the first reset needs them
         rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
@@ -238,10 +240,10 @@ class FlattenHardTask(FlattenTask):
 
 
 class ClothFlattenEnv(ClothEnv):
-    """Spread a crumpled sheet on the floor with two grippers, and let go.
+    """Spread a crumpled sheet on the floor with two grippers and release it.
 
     ## Description
-    A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers take hold of it, of other layers too.  After 300 steps they
+    A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers can grasp it, including other layers.  After 300 steps they
     open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
     $physics
@@ -249,32 +251,32 @@ class ClothFlattenEnv(ClothEnv):
     ## Observation Space
     $observations
 
-    ``next`` is a choice that the environment makes: the nearest edge of which both corners can be taken without other cloth; where
-    there is none, the corner with the least of it, for one gripper; and while one holds a corner, a neighbor of it for the other.
-    It is 0 for a gripper that has nothing to take, and for both while a sheet that they do not hold covers 0.955 or more.
+    ``next`` is a choice that the environment makes: the nearest edge whose corners can both be grasped without other cloth; if
+    there is none, the corner with the least other cloth, for one gripper; and while one gripper holds a corner, a neighboring
+    corner for the other.  It is 0 for a gripper without a grasp point, and for both while a released sheet covers 0.955 or more.
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one that holds cloth,
-    else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
+    During the episode the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for a gripper that
+    holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
 
     ## Evaluation
-    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1: on a
-    grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The normalized performance is the
-    normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.
-    A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and held by nothing.
+    The coverage c is the area of the union of the sheet's triangles, projected to the floor, over that of the flat sheet, limited
+    to one.  It is measured on a grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The
+    normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or
+    more, else 0 if c0 is.  A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and released.
 
     ``info`` has ``coverage`` and ``coverage_start`` in each step; ``best``, the best normalized improvement so far;
     ``first_success``, the first step with enough coverage, or -1; and ``success_held``, whether it has been enough ever since.  At
     the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and ``softgym_coverage``, SoftGym's
-    measure: of 100 x 100 cells of the particles' bounding box those within a particle's spacing of a particle, over the flat
-    sheet's area.  This one depends on how the sheet is turned, and may exceed 1.
+    measure: the area of those of 100 x 100 cells of the particles' bounding box that are within a particle's spacing of a particle,
+    over the flat sheet's area.  This measure depends on the orientation of the sheet, and may exceed 1.
 
     ## Starting State
     One of 128 crumpled sheets that cover 0.18 to 0.47 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a
     random particle and dropped, twice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along
-    x and y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are
+    x and y.  Held-out seeds draw from the same sheets, in new combinations.  The grippers are
     open, 0.3 to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
     """
 
@@ -282,11 +284,11 @@ class ClothFlattenEnv(ClothEnv):
 
 
 class ClothFlattenHardEnv(ClothEnv):
-    """Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers, and let go.
+    """Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers and release it.
 
     ## Description
-    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers take hold of it, of other layers
-    too.  After 320 steps they open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
+    A square sheet, L = 0.8 m, with 21 x 21 particles, lies crumpled on the floor.  Two grippers can grasp it, including other
+    layers.  After 320 steps they open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
     $physics
 
@@ -305,9 +307,9 @@ class ClothFlattenHardEnv(ClothEnv):
 
     ## Starting State
     One of 96 crumpled sheets that cover 0.12 to 0.42 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a random
-    particle and dropped, thrice.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
-    y.  Held-out seeds draw from the same sheets: what is new in them is the combination, not the sheet.  The grippers are open, 0.3
-    to 0.5 L to the left and right of the origin, 0.4 to 0.6 L above the floor.
+    particle and dropped, three times.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along
+    x and y.  Held-out seeds draw from the same sheets, in new combinations.  The grippers are open, 0.3 to 0.5 L to the left and
+    right of the origin, 0.4 to 0.6 L above the floor.
     """
 
     task_class = FlattenHardTask

@@ -19,8 +19,8 @@ LIFT, LIFT_ONE = 1.25, 0.95  # height that is aimed at with an edge, and with a 
 CALM, CALM_ONE = 0.5, 0.7  # rms speed of the particles at which the sheet is laid down, and the other corner taken [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sheet is laid down [m/s]
-# while it is laid down the far edge is to be farther away by AHEAD for each meter that the hands sink.  Up to NEARER [m] of what it
-# is too near is corrected: for each meter the hands move backward faster [1/s], and down more slowly, by this share [1/m]
+# while the sheet is laid down, the far edge must move away by AHEAD for each meter that the grippers sink.  A deficit of up to
+# NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
 AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
 TEARING = 0.5  # strain at which it lets go
 AGAIN = 95  # steps that another try takes
@@ -53,7 +53,7 @@ def flatten_actions(task: Any) -> NDArray:
             move[e, :, 2], grip[e] = 0.3, [1.0 if corner[k] < 0 else -1.0 for k in range(2)]
         elif corner[0] >= 0 and corner[1] >= 0:
             move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, side, own, speed[e], v[e])
-            # what is entangled is pulled slowly, and let go of before it tears
+            # entangled cloth is pulled slowly, and released before it tears
             strain = float(task.info["strain_max"][e])
             move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
             grip[e] = 1 if strain > TEARING else grip[e]
@@ -73,8 +73,8 @@ def flatten_picks(task: Any) -> NDArray:
     """Actions of all environments with "pick_place", (num_envs, 10): corners by their numbers, in a fixed order, are pulled apart.
 
     First both ends of an edge, and of the opposite one, to where the edge would lie were the sheet flat behind it; then the
-    diagonals, one across the other.  No choice among corners: but for the side on which they lie, what it does is a smooth function
-    of where they are, and of time; and what is flat is left alone.
+    diagonals, one across the other.  It makes no choice among corners: except for the side of the corners, its actions are a smooth
+    function of their positions and of time.  A flat sheet is left alone.
     """
     n, side, half = task.num_envs, task.physics.side, task.workspace * task.physics.side
     p = task.simulation.positions[:, list(task.physics.mesh.corners), :2].astype(np.float64)
@@ -130,12 +130,12 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
         move[k] = _to(np.array([0.0, 0.0, LIFT_ONE * side]), tips[k])
         move[k, :2] *= 0.5
     if others[1 - k] < 0:
-        pass  # what is held are both neighbors
+        pass  # both neighbors are held
     elif close or (up and speed < CALM_ONE):
         move[1 - k] = _to(goal, tips[1 - k])
         grip[1 - k] = -1 if way < NEAR else 1
     else:
-        # it waits beside
+        # wait next to it
         move[1 - k] = _to(goal + (0, 0, 0.1), tips[1 - k])
     return move, grip
 
@@ -180,7 +180,7 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     height = x[ends, 2].mean()
     if low < 0.012 and (reach > 0.96 * side or -middle @ out > 1.3 * side):
         return np.zeros((2, 3)), np.ones(2)
-    # down behind the far edge, backward as it touches the floor; and at the end so that what is off the floor does not fold
+    # down behind the far edge, backward when it touches the floor; at the end slowly enough that cloth off the floor does not fold
     touching = far[2] < 0.03 or height < 0.5 * side
     slack = float(np.clip(side - 0.01 - AHEAD * height - reach, 0.0, NEARER)) if height < 0.5 * side else 0.0
     back = LAYING * max(height / side, 0.4 if reach < 0.97 * side else 0.0) + CORRECTION * slack if touching else 0.4 * LAYING

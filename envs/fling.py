@@ -1,4 +1,4 @@
-"""ClothFling-v0 and ClothFling-Hard-v0: swing a rumpled sheet that two grippers hold, and lay it flat, in three throws."""
+"""ClothFling-v0 and ClothFling-Hard-v0: swing a crumpled sheet, held by two grippers, and lay it flat in three throws."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import CLEAR, EDGES, NEXT, beside_corners, observe_next, places_to_take
+from clothgym.envs.taking import CLEAR, EDGES, NEXT, corner_neighbors, observe_next, places_to_take
 from clothgym.mesh import grid
 
 SPEED = 2.0  # of the grippers [m/s]
 THROWS = 3
-CLOSING = 4  # steps in which the fingers close on the corners as an episode begins
-PERIODS = (12, 36, 108)  # of the waves that are observed [steps]
-NOT_MADE = -1.0  # coverage after a throw that has not been made
+CLOSING = 4  # steps in which the fingers close on the corners at the start of an episode
+PERIODS = (12, 36, 108)  # of the observed waves [steps]
+NO_THROW = -1.0  # coverage after a throw that has not been made
 APART = 0.15  # least distance of the tips as an episode begins, in sides
 NEARER = 0.75  # share of the distance at which tips take a corner otherwise: a sheet may stir as it is taken
 # the box in which the tips move, from the origin, in sides: half along x, half along y, in which the sheet is thrown, and up
@@ -49,20 +49,20 @@ BOX = (0.9, 0.3, 1.25)
 
 @inlined
 def _measure_throws(own, rules, sheet):
-    """Coverage; how many throws have been made, and what the sheet covers since each; and which grippers may not close."""
+    """Coverage; the number of throws, and the coverage after each; and the grippers that may not close."""
     measure_coverage(own, rules, sheet)
     count = sheet.holds.shape[0]
     if own.step == 0:
         own.throws, own.throwing = 0, 0
         for i in range(THROWS):
-            own.after[i] = NOT_MADE
+            own.after[i] = NO_THROW
         for k in range(count):
             own.took[k], own.barred[k] = 0, 0
             for c in range(3):
                 own.tips[k, c] = sheet.attachments[k, c]
     if own.over:
         return
-    # a throw begins as the first gripper takes hold, and ends when nothing is held any more
+    # a throw begins when the first gripper grasps the sheet, and ends when the sheet is released
     holding = 0
     for k in range(count):
         if sheet.holds[k] > 0:
@@ -74,7 +74,7 @@ def _measure_throws(own, rules, sheet):
     own.throwing = holding
     if not holding and own.throws > 0:
         own.after[own.throws - 1] = own.coverage
-    # a gripper takes hold once in a throw
+    # a gripper grasps once in a throw
     for k in range(count):
         own.barred[k] = own.throws >= THROWS or (own.took[k] == 1 and sheet.holds[k] == 0)
 
@@ -88,7 +88,7 @@ def _tell(own, info):
 
 @inlined
 def _evaluate_fling(own, rules, sheet, info):
-    """The evaluation of a spread sheet; what it covers after the last throw is what it covers now."""
+    """The evaluation of a spread sheet; the coverage after the last throw is the present one."""
     score = evaluate_spread(own, rules, sheet, info)
     if own.throws > 0:
         own.after[own.throws - 1] = info.coverage
@@ -98,7 +98,7 @@ def _evaluate_fling(own, rules, sheet, info):
 
 @inlined
 def _account_fling(own, rules, sheet, info, terms, running, failure):
-    """Coverage now, at the start and after each throw, and what has become of a success: only what nothing holds counts."""
+    """Coverage now, at the start and after each throw, and the record of successes; only a released sheet counts."""
     info.coverage, info.coverage_start = own.coverage, own.coverage_start
     _tell(own, info)
     free = own.throws > 0 and own.throwing == 0
@@ -109,7 +109,7 @@ def _account_fling(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe_fling(own, rules, sheet, seen):
-    """Grippers, time, coverage, the throws that are left, what grippers take next; and waves that tell steps of a throw apart."""
+    """Grippers, time, coverage, the remaining throws, the next grasp points; and waves that resolve the steps of a throw."""
     observe_spread(own, rules, sheet, seen)
     seen.next[:] = 0
     if own.throws < THROWS:
@@ -122,7 +122,7 @@ def _observe_fling(own, rules, sheet, seen):
 
 
 class Start(NamedTuple):
-    """A sheet, by its place among ``rumpled_sheets``, and the tips that hold both corners of an edge of it [m], (2, 3)."""
+    """Index of a sheet in ``rumpled_sheets``, and the tips that hold both corners of an edge of it [m], (2, 3)."""
 
     sheet: int
     tips: NDArray
@@ -130,17 +130,17 @@ class Start(NamedTuple):
 
 @cache
 def held_sheets(rows: int, columns: int, side: float, bank: Bank) -> tuple[NDArray, list[Start]]:
-    """Crumpled sheets [m], (sheets, particles, 3), and their edges whose corners grippers can take without any other cloth.
+    """Crumpled sheets [m], (sheets, particles, 3), and their edges whose corners grippers can grasp without other cloth.
 
-    If there is none, those at which they take the least.
+    If there are no such edges, those with the least other cloth.
     """
     sheets, mesh = rumpled_sheets(rows, columns, side, bank), grid(rows, columns, side, side)
-    near, at = beside_corners(mesh) > 0, sheets[:, list(mesh.corners)]
+    near, at = corner_neighbors(mesh) > 0, sheets[:, list(mesh.corners)]
     takes = at + NEARER * (places_to_take(sheets, mesh)[0] - at)
     takes[..., 2] = np.maximum(takes[..., 2], LOWEST)
-    # what is taken beside the corners, (sheets, 4)
+    # number of other particles in each grasp, (sheets, 4)
     others = ((length(takes[:, :, None] - sheets[:, None]) < CLEAR) & ~near).sum(axis=2)
-    # and by edge, and how far apart the tips are, seen from above
+    # and by edge, and the horizontal distance of the tips
     tips = takes[:, EDGES]
     close = np.linalg.norm((tips[:, :, 1] - tips[:, :, 0])[..., :2], axis=2) < APART * side
     taken = others[:, EDGES].sum(axis=2) + 1000 * close
@@ -166,7 +166,7 @@ class FlingTask(SpreadingTask):
     settling_steps = 40
     enough = 0.9
     bank: ClassVar[Bank] = CRUMPLED
-    turned: ClassVar[float] = 0.3  # by which the line of the held corners is turned at most [rad]
+    turned: ClassVar[float] = 0.3  # largest angle between the line of the held corners and the x axis [rad]
     accounts: ClassVar[Fields] = (
         *SpreadingTask.accounts,
         ("throws", np.int64),
@@ -174,20 +174,20 @@ class FlingTask(SpreadingTask):
     )
     observations = (
         *SpreadingTask.observations,
-        Observation("throws_left", "share of the throws that is left"),
+        Observation("throws_left", "share of remaining throws"),
         NEXT,
-        Observation("clock", f"triangle waves of {PERIODS} steps, each of them also a quarter earlier", (len(PERIODS), 2)),
+        Observation("clock", f"triangle waves of {PERIODS} steps, each also a quarter period earlier", (len(PERIODS), 2)),
     )
     ranges: ClassVar = {
-        **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NOT_MADE, 1.0), "took": (0, 1),
+        **SpreadingTask.ranges, "throws": (0, THROWS), "throwing": (0, 1), "after": (NO_THROW, 1.0), "took": (0, 1),
         "barred": (0, 1),
     }  # fmt: skip
-    no_picks = "what is picked and placed is not thrown"
-    arguments: ClassVar = {**GripperTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
+    no_picks = "picking and placing cannot throw a sheet"
+    arguments: ClassVar = {**GripperTask.arguments, "action_mode": f'only "velocity": {no_picks}'}
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
-        # the sheets of this resolution, before the first reset asks for them
+        # the sheets of this resolution, before the first reset needs them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
 
     def arena(self) -> tuple[NDArray, NDArray]:
@@ -203,7 +203,7 @@ class FlingTask(SpreadingTask):
 
     def check_episode(self, env: int, own: Any) -> None:
         super().check_episode(env, own)
-        if not np.array_equal(own["after"] > NOT_MADE, np.arange(THROWS) < own["throws"]):
+        if not np.array_equal(own["after"] > NO_THROW, np.arange(THROWS) < own["throws"]):
             raise ValueError(
                 f"the state's episode {env} has {int(own['throws'])} throws and coverages {own['after'].tolist()} after them: give "
                 "what get_state() gave"
@@ -214,7 +214,7 @@ class FlingTask(SpreadingTask):
         sheets, starts = held_sheets(*self.physics.mesh.grid_shape, side, self.bank)
         start = starts[int(rng.integers(len(starts)))]
         x, tips = sheets[start.sheet].copy(), start.tips.copy()
-        # mirrored; turned so that the corners lie one on either side; and moved, so that both are within reach
+        # mirrored; turned so that the corners are on either side; and moved so that both are within reach
         if rng.uniform() < 0.5:
             x[:, 0] *= -1
             tips[:, 0] *= -1
@@ -236,7 +236,7 @@ class FlingTask(SpreadingTask):
         return self.uneven(x, rng)
 
     def before_step(self, actions: NDArray) -> None:
-        """Grippers that stay and close on the corners at the start, and fingers that may not close."""
+        """Let grippers stay and close on the corners at the start, and keep barred fingers open."""
         block, lane = self._place
         wanted, targets = self.simulation.orders.openings, self.simulation.orders.targets
         first = np.flatnonzero(self.episode["step"] <= CLOSING)
@@ -269,71 +269,71 @@ class FlingHardTask(FlingTask):
 
 
 class ClothFlingEnv(ClothEnv):
-    """Swing a rumpled sheet that two grippers hold by two corners, and lay it flat on a table, within three throws.
+    """Swing a crumpled sheet, held by two corners, and lay it flat on a table within three throws.
 
     ## Description
     A square sheet, L = 0.6 m, lies crumpled on a table, the plane z = 0.  Two grippers are at two neighboring corners of it: in the
-    first four steps they stay there and close, whatever the action, and hold these corners.  They are those of
-    ``ClothDrapeGripper-v0``: they take the particles within 3 cm of their tips when their fingers have closed, other layers too.
+    first four steps they stay there and close, for any action, and hold these corners.  They are those of
+    ``ClothDrapeGripper-v0``: when their fingers have closed they hold the particles within 3 cm of their tips, including other
+    layers.
 
-    The arms reach only so far: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L
-    high.  Along y, in which the sheet is thrown, this is not enough to lay a sheet down: slow hands, at 0.5 m/s, end with a
-    coverage of about 0.7.  Swung, the sheet goes on by its inertia, and the air carries it.
+    The reach is limited: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L
+    high.  Along y, the direction of the throw, this is not enough to lay a sheet down: slow grippers, at 0.5 m/s, reach a
+    coverage of about 0.7.  A swinging sheet continues by its inertia, and the air supports it.
 
-    A throw begins as a gripper takes hold, and ends when nothing is held any more.  In it each gripper takes hold once: when it has
-    let go, it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps they
-    open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
+    A throw begins when a gripper grasps the sheet, and ends when the sheet is released.  Each gripper grasps once in a throw: after
+    its release it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps
+    they open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
 
     $physics
 
     ## Observation Space
     $observations
 
-    ``next`` is a choice that the environment makes.  Grippers that hold nothing take an edge that spans 0.1 m along x or more, the
-    first of them the end with the smaller x.  It is the nearest such edge, where each particle of other cloth that would be taken
-    along counts for a meter of way.  Only if there is no better edge within reach they take the sides of one, where these come
-    within reach; n is 1000 then.  While one gripper holds a corner, the other takes a neighbor of it; this is given for one that
-    may not close any more, too.  ``next`` is 0 for a gripper that has nothing to take; for both, once three throws have been made;
-    and while a sheet that nothing holds covers 0.905 or more.
+    ``next`` is a choice that the environment makes.  Free grippers grasp an edge that spans 0.1 m along x or more, the
+    first gripper the end with the smaller x.  It is the nearest such edge, where each particle of other cloth in the grasp
+    adds a meter to the distance.  Only if no such edge is within reach they grasp the sides of one, where these come
+    within reach; n is 1000 then.  While one gripper holds a corner, the other grasps a neighboring corner; this is given even for a
+    gripper that may not close any more.  ``next`` is 0 for a gripper without a grasp point; for both after three throws;
+    and while a released sheet covers 0.905 or more.
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for one that holds cloth,
-    else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
+    During the episode the potential is 0.9 times the coverage, plus 0.1 times the mean over both grippers of 1 for a gripper that
+    holds cloth, else ``1/2 / (1 + (d/0.15 L)^2)`` with the distance d of its tip from the nearest particle.
 
     ## Evaluation
-    The coverage c is the area of the union of the sheet's triangles, seen from above, over that of the flat sheet, at most 1, as in
-    ``ClothFlatten-v0``.  The normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in
-    [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.  A success has a coverage of 0.9 or more, at rest (less than 0.02 m/s rms), and
-    held by nothing.  It is less than the 0.95 of ``ClothFlatten-v0``, as a throw cannot be corrected, and more than the 0.8 of
-    FlingBot's report.
+    The coverage c is the area of the union of the sheet's triangles, projected to the table, over that of the flat sheet, at most
+    1, as in ``ClothFlatten-v0``.  The normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's
+    c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.  A success has a coverage of 0.9 or more, at rest (less than 0.02 m/s
+    rms), and released.  The threshold is lower than the 0.95 of ``ClothFlatten-v0``, as a throw cannot be corrected, and higher
+    than the 0.8 of FlingBot's report.
 
-    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``throws``, those that have ended; ``coverage_after_1``,
-    ``coverage_after_2`` and ``coverage_after_3``, the coverage after each, as it was last before the sheet was taken again, -1 for
-    a throw that has not been made; ``best``, the best normalized improvement so far of a sheet that nothing held after a throw;
-    ``first_success``, the first step with enough coverage, held by nothing, or -1; and ``success_held``, whether it has been so
+    ``info`` has ``coverage`` and ``coverage_start`` in each step; ``throws``, the number of finished throws; ``coverage_after_1``,
+    ``coverage_after_2`` and ``coverage_after_3``, the last coverage after each throw before the next grasp, -1 for
+    a throw that has not been made; ``best``, the best normalized improvement so far of a released sheet after a throw;
+    ``first_success``, the first step with enough coverage of a released sheet, or -1; and ``success_held``, whether this has lasted
     ever since.  At the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and
     ``softgym_coverage``, see ``ClothFlatten-v0``.
 
     ## Starting State
-    One of the crumpled sheets of ``ClothFlatten-v0``, with an edge whose corners the grippers can take without any other
+    One of the crumpled sheets of ``ClothFlatten-v0``, with an edge whose corners the grippers can grasp without other
     cloth, at least 0.15 L apart: 78 such edges, of 53 sheets.  It is mirrored or not, and turned so that this line is
     within 0.3 rad of the x axis, one gripper on either side; its middle is up to 0.1 L from the origin along x and y, or as near to
-    that as both corners are within reach.  Held-out seeds draw from the same sheets: what is new in them is the combination, not
-    the sheet.
+    that as both corners are within reach.  Held-out seeds draw from the same sheets, in new combinations.
     """
 
     task_class = FlingTask
 
 
 class ClothFlingHardEnv(ClothEnv):
-    """Swing a larger rumpled sheet, of a thinner fabric, and lay it flat on a table, within three throws.
+    """Swing a larger crumpled sheet, of a thinner fabric, and lay it flat on a table within three throws.
 
     ## Description
-    Everything is as in ``ClothFling-v0`` but for the sheet, L = 0.8 m with 21 x 21 particles, its fabric, the tropical wool of
-    ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity, its start, and its time, 320 steps.  The grippers are
-    as fast, 2 m/s, which is less for a larger sheet, and the box has the same size in sides.
+    This task differs from ``ClothFling-v0`` in the sheet, L = 0.8 m with 21 x 21 particles, its fabric, the tropical wool of
+    ``Material.preset("wool_tropical")``, of 163 g/m^2 and half the rigidity, its start, and its time, 320 steps.  The grippers have
+    the same speed, 2 m/s, which is less relative to the larger sheet, and the box has the same size in sides.
 
     $physics
 

@@ -1,7 +1,8 @@
 """The scripted expert of ``ClothFling-v0``: take an edge by its corners, lift it, wait, swing, and lay the sheet down.
 
-It sees the whole state, and has no memory: throws begin at given steps, and where the hands are says how far one is.  So what it
-does is a continuous function of what is observed, but for the step at which it begins, and can be cloned.
+It sees the whole state, and has no memory: throws start at fixed steps, and the positions of the grippers determine the phase.
+Except for the starting step, its actions are therefore a continuous function of the observation, which can be learned by behavior
+cloning.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 TEARING = 0.5  # strain at which it lets go
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
-REST = 0.1  # rms speed at which it judges what it has thrown [m/s]
+REST = 0.1  # rms speed below which it evaluates the throw [m/s]
 LATE = 4  # steps by which a throw may be late
-TIMED = 0.01  # sides that a step's difference from the time counts for, beside the distance from the way
+TIMED = 0.01  # weight of a step's time difference relative to the distance from the path, in sides
 ASTRAY = 0.2  # distance from the way at which there is no throw, in sides
 BACK = 20.0  # speed toward the way, for each meter from it [1/s]
 STEP = 0.25  # of the search along the way, in control steps

@@ -1,4 +1,4 @@
-"""ClothFold-v0 and ClothFold-Hard-v0: fold a sheet that lies on the floor in half, along its diagonal, or twice."""
+"""ClothFold-v0 and ClothFold-Hard-v0: fold a sheet on the floor in half, along its diagonal, or twice."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ FOLDS = ("half", "diagonal", "quarter")
 ACTING_STEPS = {"half": 80, "diagonal": 90, "quarter": 150}
 # largest distance of a point of the sheet from its place and mean height over the floor, in sides
 ENOUGH_FOLDED, ENOUGH_FLAT = {"half": 0.1, "diagonal": 0.1, "quarter": 0.15}, 0.05
-PICKING = 0.3  # share of the potential that is for taking hold
+PICKING = 0.3  # share of the potential for grasping
 
-# the scripted expert: height of its arc over that of a half circle; how near the end it opens, and how near points have met, in
-# sides; how far it looks ahead on the arc, and the arc's lowest height in each fold [m]: what is pressed on the layers below jumps
-# when it is let go
+# the scripted expert: height of its arc relative to a half circle; distance from the end at which it opens, and distance at which
+# points count as joined, in sides; look-ahead along the arc, and the arc's lowest height in each fold [m]: cloth pressed onto the
+# layers below jumps when it is released
 EXPERT_ARC, EXPERT_NEAR, EXPERT_MET = 0.9, 0.03, 0.1
 EXPERT_STEP, EXPERT_LOW = 0.03, (0.015, 0.018)
-EXPERT_DONE = 0.9  # best score of an episode from which on it lets well alone
+EXPERT_DONE = 0.9  # best score of an episode above which the expert stops
 
 
 # --- the ideal folds ----------------------------------------------------------------------------------------------------------
 
 
 def ideals(fold: str, points: NDArray) -> NDArray[np.float64]:
-    """Where the points of a sheet are in the ideal folds of that name, thin and flat [m], (ways, points, 2).
+    """Positions of a sheet's points in the ideal folds of that name, thin and flat [m], (ways, points, 2).
 
-    points: in the flat sheet, about its center [m], (points, 2).  ways: over which of four edges, corners or both it is folded.
+    points: in the flat sheet, about its center [m], (points, 2).  ways: the folds over each of four edges, corners or both.
     """
     u, v = points[:, 0], points[:, 1]
     if fold == "half":
@@ -63,10 +63,10 @@ def ideals(fold: str, points: NDArray) -> NDArray[np.float64]:
 
 @kernel
 def aligned(x, share, ideal, placed):
-    """Lay an ideal fold where it is nearest to a sheet, by a rotation and a translation of the floor; returns the mean distance.
+    """Align an ideal fold with a sheet, by a rotation and a translation in the plane; returns the mean distance.
 
     The motion minimizes the mean squared distance, in closed form in the plane: with both centered, the rotation's cosine and sine
-    are as the sums of dot and cross products (Umeyama 1991, for two dimensions and without a scale).
+    are proportional to the sums of dot and cross products (Umeyama 1991, in two dimensions, without scaling).
     x: of the sheet [m], (3, particles).  share: of the area, by particle.  ideal: (particles, 2).  placed: out, (3, particles).
     """
     # both centers
@@ -85,7 +85,7 @@ def aligned(x, share, ideal, placed):
         cross += share[p] * (a * v - b * u)
     size = max(np.sqrt(dot * dot + cross * cross), 1e-30)
     c, s = dot / size, cross / size
-    # the ideal in its place, and how far the sheet's points are from it, seen from above
+    # the aligned ideal, and the horizontal distance of the sheet's points from it
     total = 0.0
     for p in range(x.shape[1]):
         a, b = ideal[p, 0] - px, ideal[p, 1] - py
@@ -96,7 +96,7 @@ def aligned(x, share, ideal, placed):
 
 @kernel
 def nearest_fold(x, share, folds, placed):
-    """The least mean distance from the ideal folds [m], and which of them has it; ``placed`` is that one, (3, particles)."""
+    """The least mean distance from the ideal folds [m], and the index of that fold; ``placed`` receives it, (3, particles)."""
     best, way = np.inf, 0
     for k in range(folds.shape[0]):
         error = aligned(x, share, folds[k], placed)
@@ -108,7 +108,7 @@ def nearest_fold(x, share, folds, placed):
 
 @apart
 def fold_errors(x, share, folds):
-    """How far a sheet is from the nearest ideal fold, seen from above: on the average and at most; and its mean height [m]."""
+    """Mean and largest horizontal distance of a sheet from the nearest ideal fold, and its mean height [m]."""
     placed = np.empty(x.shape, np.float64)
     error, _ = nearest_fold(x, share, folds, placed)
     worst, height = 0.0, 0.0
@@ -120,7 +120,7 @@ def fold_errors(x, share, folds):
 
 @apart
 def overlap(x, share, folds, triangles, cell):
-    """Area of the floor below a sheet and the nearest ideal fold over that below either; cell: of the grid [m]."""
+    """Intersection over union of the floor areas below a sheet and the nearest ideal fold; cell: of the grid [m]."""
     placed = np.empty(x.shape, np.float64)
     nearest_fold(x, share, folds, placed)
     both, either = shared_area(x, placed, triangles, cell)
@@ -129,14 +129,14 @@ def overlap(x, share, folds, triangles, cell):
 
 @inlined
 def _measure(own, rules, sheet):
-    """How far the sheet is from its nearest ideal fold, in sides."""
+    """Distances of the sheet from its nearest ideal fold, and its height, in sides."""
     error, worst, height = fold_errors(sheet.x, sheet.mesh.share, rules.folds)
     own.error, own.worst, own.height = error / rules.side, worst / rules.side, height / rules.side
 
 
 @inlined
 def _folded(own, rules):
-    """How far the fold is along, in [0, 1]: 0 for the flat sheet, 1 for the ideal."""
+    """Progress of the fold, in [0, 1]: 0 for the flat sheet, 1 for the ideal."""
     return min(max(1 - own.error / rules.unfolded, 0.0), 1.0)
 
 
@@ -148,7 +148,7 @@ def _reached(own, rules):
 
 @inlined
 def _potential(own, rules, sheet):
-    """How the taking hold is along, and the fold."""
+    """Progress of grasping and of the fold."""
     taken = 0.0
     for k in range(rules.places.shape[0]):
         taken += grasp(sheet.holder[rules.places[k]] >= 0, rules, sheet, k)
@@ -157,7 +157,7 @@ def _potential(own, rules, sheet):
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write the error of the fold, how it overlaps the ideal and how much at rest it is; returns the normalized performance."""
+    """Write the error of the fold, its overlap with the ideal and its speed; returns the normalized performance."""
     info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, FINE_CELL)
     info.fold_error_mm = 1000 * own.error * rules.side
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
@@ -176,7 +176,7 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The grippers, and the ways from their tips to the corners that they are meant to take first."""
+    """The grippers, and the displacements from their tips to the corners that they grasp first."""
     observe_grippers(own, rules, sheet, seen)
     for k in range(rules.places.shape[0]):
         for c in range(3):
@@ -184,10 +184,10 @@ def _observe(own, rules, sheet, seen):
 
 
 def along_arc(way: NDArray, height: NDArray, whole: NDArray, low: float) -> tuple[NDArray, NDArray]:
-    """The expert's next step on an arc to a goal [m], (..., 3), and the way that is left along the floor [m], (...).
+    """The expert's next step on an arc to a goal [m], (..., 3), and the remaining horizontal distance [m], (...).
 
-    It goes some way on, and as high as the arc is there.  way: from each tip to its goal [m], (..., 3).  height: of the tips [m].
-    whole: width of the arcs [m].  low: height of their ends [m].
+    The step moves ``EXPERT_STEP`` ahead, to the arc's height there.  way: from each tip to its goal [m], (..., 3).  height: of the
+    tips [m].  whole: width of the arcs [m].  low: height of their ends [m].
     """
     left = np.sqrt(way[..., 0] ** 2 + way[..., 1] ** 2)
     ahead = np.clip(left - EXPERT_STEP, 0, whole)
@@ -207,16 +207,16 @@ class FoldTask(ManipulationTask):
     settling_steps = 60
     observations = (
         *ManipulationTask.observations,
-        Observation("ways", "from each tip to the corner that it is meant to take first", (2, 3), "L/10", 40.0),
+        Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0),
     )
-    points_relative_to = "where the sheet's center lay"
+    points_relative_to = "the initial center of the sheet"
     evaluation = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (
         ("fold_error", float), ("fold_error_max", float), ("height", float), *ManipulationTask.accounts,
     )  # fmt: skip
     arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
-    away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
-    turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
+    away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
+    turned: ClassVar[float] = np.pi / 4  # largest yaw of the sheet [rad]
     acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
 
     def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:
@@ -226,20 +226,20 @@ class FoldTask(ManipulationTask):
 
     @property
     def stages(self) -> list[list[tuple[int, int]]]:
-        """For each fold after the other: the particle that each gripper takes, and the one that it brings it to."""
+        """For each consecutive fold, the particle that each gripper takes, and the particle that it moves it to."""
         lower_left, lower_right, left, right = self.physics.mesh.corners
         if self.fold == "diagonal":
             return [[(right, lower_left)]]
         first = [(left, lower_left), (right, lower_right)]
         if self.fold == "half":
             return [first]
-        # the ends of the crease and of the edges that lie together
+        # the ends of the crease and of the joined edges
         rows, columns = self.physics.mesh.grid_shape
         middle = (rows // 2) * columns
         return [first, [(middle, middle + columns - 1), (lower_left, lower_right)]]
 
     def remembers(self) -> Fields:
-        # how the sheet was turned, and the errors now
+        # the initial turn of the sheet, and the present errors
         return [*super().remembers(), ("turn", float, 2), ("error", float), ("worst", float), ("height", float)]
 
     def constants(self) -> dict[str, Any]:
@@ -256,12 +256,12 @@ class FoldTask(ManipulationTask):
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         x, center, turn = self.lie_flat(rng, self.away, self.turned)
         self.episode["origin"][env], self.episode["turn"][env] = (*center, 0), turn
-        # both grippers above the edge that they are meant to take first
+        # both grippers above the edge that they grasp first
         self.hover(env, rng, x[list(self.physics.mesh.corners[2:])])
         return self.uneven(x, rng)
 
     def _began(self) -> NDArray:
-        """Where the sheet's points lay at the start [m], (num_envs, particles, 3)."""
+        """Initial positions of the sheet's points [m], (num_envs, particles, 3)."""
         rest, turn = self.physics.mesh.rest_positions, self.episode["turn"][:, None]
         u, v, _ = (rest - rest.mean(axis=0)).T
         across = np.stack([turn[..., 0] * u - turn[..., 1] * v, turn[..., 1] * u + turn[..., 0] * v, 0 * turn[..., 0] * u], axis=2)
@@ -270,17 +270,17 @@ class FoldTask(ManipulationTask):
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """Each corner along an arc onto the one that it is to meet, and then away; one fold after the other.
+        """Move each corner along an arc onto its goal, and then leave; one fold after the other.
 
-        Without memory: a fold is done where its particles have met, and are not held apart from each other.
+        The expert has no memory: a fold is done when its particles are joined, and are not held apart from each other.
         """
         holder, side = self.simulation.grippers.holder, self.physics.side
         x, tips = self.simulation.positions.astype(np.float64), self.simulation.grippers.positions.astype(np.float64)
-        # goals are where the sheet's points lay: what lies there now may be dragged along, and cannot be reached
+        # goals are initial positions of the sheet's points: the points there now may be dragged along, out of reach
         rest, began = self.physics.mesh.rest_positions, self._began()
-        # up and open, but for the grippers of the first fold that is not done
+        # up and open, except the grippers of the first unfinished fold
         move, closed = np.tile([0.0, 0.0, 0.1], (self.num_envs, 2, 1)), np.zeros((self.num_envs, 2), bool)
-        # what has been folded and let go is not taken up again
+        # a finished and released fold is not grasped again
         found = (self.episode["best"] > EXPERT_DONE) & ~np.logical_or.reduce(holder >= 0, axis=1)
         for low, stage in zip(EXPERT_LOW, self.stages):
             taken, goals = (np.array(part) for part in zip(*stage))
@@ -291,7 +291,7 @@ class FoldTask(ManipulationTask):
             now = ~found & ~(np.logical_and.reduce(met, axis=1) & ~np.logical_or.reduce(apart, axis=1))
             found |= now
             step, left = along_arc(began[:, goals] - tip, tip[..., 2], whole, low)
-            # those that hold their place wait for the others, at the start and at the end
+            # grippers that hold their particle wait for the others, at the start and at the end
             to_place = place - tip
             all_held = np.logical_and.reduce(held, axis=1, keepdims=True)
             there = held & (left < EXPERT_NEAR * side) & (tip[..., 2] < low + 0.02)
@@ -303,7 +303,7 @@ class FoldTask(ManipulationTask):
         return as_actions(self, move, np.where(closed, -1.0, 1.0))
 
     def expert_picks(self) -> NDArray:
-        """The corners of the first fold that is not done to those that they are to meet; else nothing, beside the sheet."""
+        """Pick the corners of the first unfinished fold and place them on their goals; else pick nothing, next to the sheet."""
         side, half = self.physics.side, self.workspace * self.physics.side
         x, rest, began = self.simulation.positions.astype(np.float64), self.physics.mesh.rest_positions, self._began()
         actions = np.ones((self.num_envs, len(self.physics.grippers), pick_place.NUMBERS))
@@ -343,52 +343,52 @@ class FoldHardTask(FoldTask):
 
 
 class ClothFoldEnv(ClothEnv):
-    """Fold a sheet that lies on the floor in half, along its diagonal, or twice.
+    """Fold a sheet on the floor in half, along its diagonal, or twice.
 
     ## Description
-    A sheet of 0.6 m lies flat on the floor, turned and aside.  Two grippers hover above the corners of one edge.  ``fold`` says how
-    it is to be folded: in half, over the diagonal, or in half twice.  When the time is up the fingers open, and the sheet settles
-    for two seconds, in which actions are ignored; then it is evaluated.  To hold the fold in its place until then is as good as to
-    let go.
+    A sheet of 0.6 m lies flat on the floor, turned and off center.  Two grippers hover above the corners of one edge.  ``fold``
+    selects the fold: in half, over the diagonal, or in half twice.  When the time is up the fingers open, and the sheet settles
+    for two seconds, in which actions are ignored; then it is evaluated.  Holding the fold in place until then is as good as
+    releasing it earlier.
 
     $physics
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.7 times ``1 - e/e0``, see below, plus 0.3 times the mean over the corners that are meant to be
-    taken first of 1 for one that is held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
+    During the episode the potential is 0.7 times ``1 - e/e0``, see below, plus 0.3 times the mean over the first corners to be
+    grasped of 1 for a held corner, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
-    Seen from above, each point of the sheet has a place in the ideal fold, which is thin and flat.  The ideal lies where it is
-    nearest: over any of the four edges or corners, and moved and turned on the floor as a whole, so that the mean squared distance
-    is least (Umeyama 1991).  ``info["fold_error"]`` is the mean distance e of the sheet's points from their places, by area, in
-    sides, ``fold_error_max`` the largest, ``height`` the mean height over the floor, all three after every step.  At the end there
-    are also ``fold_error_mm``, in millimeters, ``overlap``, the area of the floor below the sheet and the ideal over that below
-    either, and ``rms_speed`` in m/s.
+    Each point of the sheet has a horizontal position in the ideal fold, which is thin and flat.  The ideal fold is the nearest one:
+    over any of the four edges or corners, translated and rotated on the floor as a whole, so that the mean squared distance
+    is least (Umeyama 1991).  ``info["fold_error"]`` is the mean horizontal distance e of the sheet's points from their positions,
+    by area, in sides, ``fold_error_max`` the largest, ``height`` the mean height over the floor, all three after every step.  At
+    the end there are also ``fold_error_mm``, in millimeters, ``overlap``, the intersection over union of the floor areas below the
+    sheet and the ideal, and ``rms_speed`` in m/s.
 
     Success: ``fold_error_max`` at most 0.1 (0.15 for the quarter, of four layers), ``height`` at most 0.05, and ``rms_speed`` below
     0.02 m/s.  ``info["best"]`` is the episode's best ``1 - e/e0``, ``first_success`` the first step with both distances small
-    enough, or -1, and ``success_held`` says whether they have been from then on.
+    enough, or -1, and ``success_held`` whether they have been small enough ever since.
 
     ``info["normalized_performance"]`` is ``(1 - e/e0) / (1 + (height/0.05)^4) / (1 + (rms_speed/0.1)^2)``, with the error e0 of the
-    flat sheet: 0 for doing nothing, 1 for the ideal.
+    flat sheet: 0 for no action, 1 for the ideal.
 
     ## Starting State
     The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
-    up to 0.1 L beside and 0.2 to 0.35 L above their corners.
+    displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.
     """
 
     task_class = FoldTask
 
 
 class ClothFoldHardEnv(ClothEnv):
-    """Fold a large sheet of silk, turned by any angle on the floor, in half twice.
+    """Fold a large silk sheet on the floor, turned by any angle, in half twice.
 
     ## Description
-    Everything is as in ``ClothFold-v0`` but for the sheet, L = 0.8 m (21 x 21 particles), its fabric, silk
-    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), its start, and the fold, which is the quarter unless ``fold`` says
-    another: two folds after each other, the second of two layers.  The sheet settles for three seconds.
+    This task differs from ``ClothFold-v0`` in the sheet, L = 0.8 m (21 x 21 particles), its fabric, silk
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), its start, and the default of ``fold``, which is the quarter:
+    two consecutive folds, the second of two layers.  The sheet settles for three seconds.
 
     $physics
 
@@ -399,8 +399,8 @@ class ClothFoldHardEnv(ClothEnv):
     As in ``ClothFold-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet's center is up to 0.25 L from the origin along x and y, and it is turned by any angle.  The grippers are open, up to
-    0.1 L beside and 0.2 to 0.35 L above the corners of one edge.
+    The sheet's center is up to 0.25 L from the origin along x and y, and it is turned by any angle.  The grippers are open,
+    displaced from the corners of one edge by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.
     """
 
     task_class = FoldHardTask

@@ -1,4 +1,4 @@
-"""ClothFoldGoal-v0 and ClothFoldGoal-Hard-v0: one fold, asked for by where the sheet's corners are to be; for HER."""
+"""ClothFoldGoal-v0 and ClothFoldGoal-Hard-v0: one fold, given by goals for the sheet's corners; for HER."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import REWARD_MODES
 
 ENOUGH_NEAR = 0.075  # largest distance of a corner from its goal, in sides
-LAYER = 0.008  # height of what is folded over the layer below [m]
-LEAST, MOST = 0.5, 1.0  # how far a corner is carried, as a share of the way to the opposite edge or corner
+LAYER = 0.008  # height of the folded layer over the layer below [m]
+LEAST, MOST = 0.5, 1.0  # range of a fold, as a share of the distance to the opposite edge or corner
 # the corners in order around the sheet, as places in ``mesh.corners``: each edge joins one to the next
 AROUND = (0, 1, 3, 2)
 GOALS = ("achieved_goal", "desired_goal")
@@ -40,7 +40,7 @@ GOALS = ("achieved_goal", "desired_goal")
 
 @inlined
 def _measure(own, rules, sheet):
-    """How far the corners are from their goals, in sides: on the average and at most."""
+    """Mean and largest distance of the corners from their goals, in sides."""
     total, worst = 0.0, 0.0
     for k in range(CORNERS):
         away = distance(sheet.x[:, rules.corners[k]], own.goal[k]) / rules.side
@@ -53,13 +53,13 @@ def _measure(own, rules, sheet):
 
 @inlined
 def _near(own, rules, sheet):
-    """How far the corners have come on the way from the start, in [0, 1]."""
+    """Share of the initial mean distance that is covered, in [0, 1]."""
     return min(max(1 - own.away / own.began, 0.0), 1.0)
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write how much at rest the sheet is, and whether it is folded as asked for; returns the normalized performance."""
+    """Write the sheet's speed, and whether it is folded to its goals; returns the normalized performance."""
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = own.worst <= ENOUGH_NEAR and info.rms_speed < ENOUGH_REST
     return _near(own, rules, sheet) / falloff(info.rms_speed, SPEED_SCALE)
@@ -76,7 +76,7 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The grippers and their ways to the corners, and where these are and are to be."""
+    """The grippers and their displacements to the corners, and the positions and goals of the corners."""
     observe_grippers(own, rules, sheet, seen)
     observe_ways(rules, sheet, seen)
     for k in range(CORNERS):
@@ -106,15 +106,15 @@ class FoldGoalTask(ManipulationTask):
     acting_steps = 80
     settling_steps = 40
     obs_modes = ("keypoints", "particles")
-    # the goals at the end, from where ``as_dict`` takes them
+    # the goals come last, for ``as_dict``
     observations = (
         *ManipulationTask.observations,
         WAYS,
-        Observation(GOALS[0], "where the four corners are", (CORNERS, 3), "L", POSITION_BOUND),
-        Observation(GOALS[1], "where they are to be", (CORNERS, 3), "L", POSITION_BOUND),
+        Observation(GOALS[0], "positions of the four corners", (CORNERS, 3), "L", POSITION_BOUND),
+        Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND),
     )
     goals = GOALS
-    points_relative_to = "where the sheet's center lay"
+    points_relative_to = "the initial center of the sheet"
     evaluation = (("rms_speed", float),)
     accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**ManipulationTask.ranges, "carried": (-1, CORNERS - 1)}
@@ -122,9 +122,9 @@ class FoldGoalTask(ManipulationTask):
         **ManipulationTask.arguments,
         "reward_mode": '-1, and 0 where every corner is near its goal; or ``"delta"`` or ``"sparse"``',
     }
-    away: ClassVar[float] = 0.15  # how far from the origin the sheet's center may lie, in sides
-    turned: ClassVar[float] = np.pi / 4  # by how much it may be turned [rad]
-    single: ClassVar[float] = 0.0  # share of the episodes with one carried corner alone, which tends to slide back
+    away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
+    turned: ClassVar[float] = np.pi / 4  # largest yaw of the sheet [rad]
+    single: ClassVar[float] = 0.0  # share of the episodes with only one carried corner, which tends to slide back
 
     def __init__(self, num_envs: int, reward_mode: str = "goal", **kwargs: Any) -> None:
         one_of("reward_mode", reward_mode, "goal", *REWARD_MODES)
@@ -132,8 +132,8 @@ class FoldGoalTask(ManipulationTask):
         self.reward_mode = reward_mode
 
     def remembers(self) -> Fields:
-        # goals of the corners [m], those that each gripper is meant to take, or -1, and how far [m]; the corners' distances from
-        # their goals now, and on the average at the start, in sides
+        # goals of the corners [m], the corner of each gripper, or -1, and the width of its arc [m]; mean and largest distance of
+        # the corners from their goals, and the initial mean distance, in sides
         own: Fields = [("goal", float, (CORNERS, 3)), ("carried", np.int64, 2), ("width", float)]
         return [*super().remembers(), *own, ("away", float), ("worst", float), ("began", float)]
 
@@ -144,19 +144,19 @@ class FoldGoalTask(ManipulationTask):
         mesh, side, own = self.physics.mesh, self.physics.side, self.episode[env]
         x, center, _ = self.lie_flat(rng, self.away, self.turned)
         own["origin"] = *center, 0
-        # the fold: of an edge or of a corner, which, and how far
+        # the fold: an edge or a corner, its index, and its range
         corners, edge, first = x[list(mesh.corners)], rng.uniform() >= self.single, int(rng.integers(4))
         share = rng.uniform(LEAST, MOST)
         a, b, beyond, before = (AROUND[(first + k) % 4] for k in range(4))
         own["goal"] = corners
         if edge:
-            # both along the edges that leave it
+            # both move along the adjacent edges
             own["carried"], own["width"] = (a, b), share * side
             own["goal"][[a, b]] += share * (corners[[before, beyond]] - corners[[a, b]]) + (0, 0, LAYER)
         else:
             own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * side
             own["goal"][a] += share * (corners[beyond] - corners[a]) + (0, 0, LAYER)
-        # above the corner that each is to take
+        # each gripper above its corner
         self.hover(env, rng, corners[[a, b]])
         return self.uneven(x, rng)
 
@@ -167,15 +167,16 @@ class FoldGoalTask(ManipulationTask):
             achieved, desired = (self.observation[:, self.observation_slices[name]] for name in GOALS)
             self.terms[...] = np.zeros((), self.terms.dtype)
             self.terms["progress"] = np.where(running, goal_reward(achieved, desired), 0)
-            # else the fastest way to few of these would be to tear the sheet
+            # without this cost, tearing the sheet would maximize the return
             failed, left = running & (self.outcome["failure"] != FINE), self.most_steps() - self.steps_taken()
             self.terms["failure"] = np.where(failed, -np.maximum(left, 0), 0)
             self.outcome["reward"] = np.where(failed, self.terms["progress"] + self.terms["failure"], self.terms["progress"])
 
     def expert_actions(self) -> NDArray:
-        """Each carried corner along an arc to its goal, and then up and away.
+        """Move each carried corner along an arc to its goal, and then leave upward.
 
-        Without memory: a corner that is near its goal and is not held has been brought, and so has one that was, and was let go.
+        The expert has no memory: a corner that is near its goal and is not held is done, and so are corners that were near and have
+        been released.
         """
         grippers, side, envs = self.simulation.grippers, self.physics.side, np.arange(self.num_envs)[:, None]
         tips, carried = grippers.positions.astype(np.float64), self.episode["carried"]
@@ -184,7 +185,7 @@ class FoldGoalTask(ManipulationTask):
         used, held = carried >= 0, grippers.holder[envs, place] >= 0
         met = length(x - goal) < ENOUGH_NEAR * side
         step, left = along_arc(goal - tips, tips[..., 2], self.episode["width"][:, None], EXPERT_LOW[0])
-        # those that hold their corner wait for the others, at the start and at the end
+        # grippers that hold their corner wait for the others, at the start and at the end
         all_held = np.logical_and.reduce(held | ~used, axis=1, keepdims=True)
         there = (left < EXPERT_NEAR * side) & (tips[..., 2] < EXPERT_LOW[0] + 0.02)
         all_there = np.logical_and.reduce(there | ~used, axis=1, keepdims=True)
@@ -215,14 +216,15 @@ class FoldGoalHardTask(FoldGoalTask):
 
 
 class GoalReward:
-    """What hindsight experience replay asks of an environment."""
+    """The interface for hindsight experience replay."""
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any = None) -> NDArray[np.float32]:
-        """0 where every corner is near its goal, else -1, (...), and less for a failure, whatever the goal.
+        """0 where every corner is near its goal, else -1, (...), and less for a failure, for any goal.
 
-        achieved_goal, desired_goal: (..., 12), for instance a batch of relabeled ones.
-        info: what the step has said, whose ``reward/failure`` is added; of many steps a sequence of dictionaries, as
-            ``HerReplayBuffer`` has them with ``copy_info_dict=True``.
+        achieved_goal, desired_goal: (..., 12), for instance a batch of relabeled goals.
+        info: of the step; its ``reward/failure`` is added.  For many steps a sequence of dictionaries, as ``HerReplayBuffer``
+        stores
+            them with ``copy_info_dict=True``.
         """
         if info is None or isinstance(info, Mapping):
             failure = (info or {}).get("reward/failure", 0.0)
@@ -232,69 +234,69 @@ class GoalReward:
 
 
 class ClothFoldGoalEnv(GoalReward, ClothEnv):
-    """Bring the corners of a sheet on the floor to the goals that a fold has drawn, with observations as for HER.
+    """Bring the corners of a sheet on the floor to the goals of a random fold, with goal observations for HER.
 
     ## Description
-    The sheet and both grippers are those of ``ClothFold-v0``.  Each episode draws one fold and asks for it by where the four
-    corners are to be: those of one edge are carried over the sheet, at least half the way to the opposite edge, and the others stay
-    where they lie.  When the time is up the fingers open, and the sheet settles, in which actions are ignored.
+    The sheet and both grippers are those of ``ClothFold-v0``.  Each episode draws one fold, and defines it by goals for the four
+    corners: the corners of one edge are carried over the sheet, at least half the way to the opposite edge, and the others stay
+    in place.  When the time is up the fingers open, and the sheet settles in steps whose actions are ignored.
 
-    Observations and ``compute_reward`` are those of Gymnasium-Robotics' goal environments, so that hindsight experience replay
-    can put other goals in the place of those that were asked for: SB3's ``HerReplayBuffer`` takes the single environment, and a
+    Observations and ``compute_reward`` follow Gymnasium-Robotics' goal environments, so that hindsight experience replay
+    can relabel goals: SB3's ``HerReplayBuffer`` takes the single environment, and a
     batch from ``clothgym.adapters.sb3.make_sb3_vec_env``.
 
     $physics
 
     ## Observation Space
-    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
-    these.
+    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: ``observation`` has the numbers of this table without the
+    last two rows, which are the goals.
 
     $observations
 
     ## Rewards
-    ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: what
-    ``compute_reward(achieved_goal, desired_goal, info)`` says, of one goal, (12,), or of many, (..., 12).  A failure costs one more
-    for each step that was left, so that it is never better than to go on.  ``HerReplayBuffer`` hears of it with
+    ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: the value
+    of ``compute_reward(achieved_goal, desired_goal, info)``, for one goal, (12,), or for many, (..., 12).  A failure costs one more
+    for each remaining step, so that it is never better than continuing.  ``HerReplayBuffer`` includes this cost with
     ``copy_info_dict=True``.
     $rewards
 
-    On the way the potential is ``1 - d/d0``, see below.
+    During the episode the potential is ``1 - d/d0``, see below.
 
     ## Evaluation
     ``info["distance"]`` is the mean distance d of the corners from their goals, in sides, and ``distance_max`` the largest, after
-    every step; at the end there is also ``rms_speed`` in m/s.  Only the corners count: how flat the rest lies is
-    ``ClothFold-v0``'s.
+    every step; at the end there is also ``rms_speed`` in m/s.  Only the corners count: ``ClothFold-v0`` evaluates the flatness of
+    the rest.
 
-    Success: ``distance_max`` at most 0.075 and ``rms_speed`` below 0.02 m/s, at the end, when the grippers have let go.
+    Success: ``distance_max`` at most 0.075 and ``rms_speed`` below 0.02 m/s, at the end, when the grippers are open.
     ``info["best"]`` is the episode's best ``1 - d/d0``, ``first_success`` the first step with every corner near, or -1, and
-    ``success_held`` says whether they have been from then on.
+    ``success_held`` whether they have been near ever since.
 
-    ``info["normalized_performance"]`` is ``(1 - d/d0) / (1 + (rms_speed/0.1)^2)``, with d0 of the start: 0 for doing nothing, 1 for
+    ``info["normalized_performance"]`` is ``(1 - d/d0) / (1 + (rms_speed/0.1)^2)``, with d0 of the start: 0 for no action, 1 for
     the ideal.
 
     ## Starting State
-    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  Any of the four edges
-    is to be carried, by 0.5 to 1 of the way across, evenly.  The grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above its
-    corners.
+    The sheet's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  One of the four edges
+    is carried by 0.5 to 1 of the distance across, uniformly drawn.  The grippers are open, displaced from its corners by up to 0.1
+    L along x and y and by 0.2 to 0.35 L upward.
     """
 
     task_class = FoldGoalTask
 
 
 class ClothFoldGoalHardEnv(GoalReward, ClothEnv):
-    """Bring the corners of a large sheet of silk to the goals that a fold has drawn, with observations as for HER.
+    """Bring the corners of a large silk sheet to the goals of a random fold, with goal observations for HER.
 
     ## Description
-    Everything is as in ``ClothFoldGoal-v0`` but for the sheet and its start, which are those of ``ClothFold-Hard-v0``: L = 0.8 m
-    (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  And as often as not
-    one corner is to be carried alone, at least half the way to the opposite one, while the other gripper, which begins above the
-    next corner, has nothing to do.  The time is 100 steps, and 50 of settling.
+    This task differs from ``ClothFoldGoal-v0`` in the sheet and its start, which are those of ``ClothFold-Hard-v0``: L = 0.8 m
+    (21 x 21 particles) of silk, its center up to 0.25 L from the origin along x and y, turned by any angle.  In half of the
+    episodes only one corner is carried, at least half the way to the opposite one, and the other gripper, which starts above the
+    next corner, has no task.  The time is 100 steps, and 50 of settling.
 
     $physics
 
     ## Observation Space
-    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: the numbers of this table but for the last two rows, and
-    these.
+    ``Dict`` of ``observation``, ``achieved_goal`` and ``desired_goal``: ``observation`` has the numbers of this table without the
+    last two rows, which are the goals.
 
     $observations
 

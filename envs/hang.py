@@ -1,4 +1,4 @@
-"""ClothHang-v0 and ClothHang-Hard-v0: hang a sheet over a rail, held by two corners or lying on the floor, and let go."""
+"""ClothHang-v0 and ClothHang-Hard-v0: hang a sheet over a rail, from two held corners or from the floor, and release it."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ from clothgym.envs.stepping import Kernels
 from clothgym.envs.targets import FRICTION
 
 HALF_LENGTH = 0.75  # half the rail's length between the axes of its posts, in sides
-OVER = 0.05  # cloth less than this above the rail's contact surface rests on it, in sides
+OVER = 0.05  # cloth less than this above the rail's contact surface counts as supported, in sides
 ENOUGH_BALANCE, ENOUGH_SUPPORT = 0.6, 0.9  # twice the smaller side's share; in sides
 
-# the scripted expert's ways, in sides: how far above the rail on the way and how far beyond it; where it lets go, beyond the rail
-# and below it; and how far above the rail it sets out
+# the scripted expert's path, in sides: height above the rail and distance beyond it on the way; distance beyond and depth below the
+# rail at the release; and height above the rail before it moves sideways
 EXPERT_LIFT, EXPERT_BEYOND, EXPERT_AT, EXPERT_DROP, EXPERT_CLEARS = 0.42, 0.32, 0.14, 0.39, 0.15
 
 
@@ -50,12 +50,12 @@ EXPERT_LIFT, EXPERT_BEYOND, EXPERT_AT, EXPERT_DROP, EXPERT_CLEARS = 0.42, 0.32, 
 
 @apart
 def hang_of(x, triangles, rest, areas, side, rail, turn, ends, low, high, out):
-    """How a sheet hangs over a rail: (share of it beyond the rail, share on the floor, length that the rail carries, in sides).
+    """Write how a sheet hangs over a rail: share of its area beyond the rail, share on the floor, supported length in sides.
 
     The rail's vertical plane cuts the sheet's triangles.  Areas and lengths are those of the flat sheet, by linear functions on the
-    triangles, so that the same surface in other triangles has the same shares.  A point of the cut is carried if it is between
-    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.  A line that halves a square is as
-    long as a side or longer: length beyond that counts for nothing.
+    triangles, so they do not depend on the triangulation of a surface.  A point of the cut is supported if it is between
+    ``low`` and ``high`` above the rail's axis [m], and no farther than ``ends`` from its middle.  A line that halves a square is at
+    least as long as a side: length beyond a side does not count.
 
     x: (3, particles) [m].  rest: (particles, 2) [m].  areas: of the triangles, summing to 1.  rail: middle of its axis [m].
     turn: cosine and sine of its yaw.
@@ -108,19 +108,19 @@ def balance_of(own):
 
 @inlined
 def hang_score(own):
-    """How well the sheet hangs, in [0, 1]: 1 for halves on both sides that the rail carries, and nothing on the floor."""
+    """Score of the hanging sheet, in [0, 1]: 1 if the rail supports it at its middle, and nothing is on the floor."""
     return balance_of(own) * own.hang[2] * (1 - own.hang[1])
 
 
 @inlined
 def hangs(own):
-    """Whether it hangs, at rest or not."""
+    """Whether the sheet hangs, at rest or not."""
     return balance_of(own) >= ENOUGH_BALANCE and own.hang[2] >= ENOUGH_SUPPORT and own.hang[1] <= MOST_LYING
 
 
 @inlined
 def _guidance(own, rules, sheet):
-    """How near the center of area is to that of a sheet that hangs, in [0, 1]: a quarter of a side below the rail."""
+    """Nearness of the center of area to that of a hanging sheet, a quarter of a side below the rail, in [0, 1]."""
     x, y = sheet.summary[CENTROID] - own.rail[0], sheet.summary[CENTROID + 1] - own.rail[1]
     # anywhere along the rail where the sheet does not reach beyond its ends
     along = max(abs(own.turn[0] * x + own.turn[1] * y) - (rules.ends - rules.side / 2), 0.0)
@@ -130,19 +130,19 @@ def _guidance(own, rules, sheet):
 
 @inlined
 def _hanging(own, rules, sheet):
-    """How well a held sheet hangs, and how near it is to that."""
+    """Score of a held sheet, and its nearness to hanging."""
     return guided(_guidance(own, rules, sheet), hang_score(own))
 
 
 @inlined
 def _picking_and_hanging(own, rules, sheet):
-    """How far the taking hold is along, and the hanging."""
+    """Progress of grasping and of hanging."""
     return picked(own, rules, sheet, _hanging(own, rules, sheet))
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write how the sheet hangs and how much it is at rest; returns the normalized performance."""
+    """Write the measures of the hanging sheet and its speed; returns the normalized performance."""
     info.balance, info.support, info.lying = balance_of(own), own.hang[2], own.hang[1]
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = hangs(own) and info.rms_speed < ENOUGH_REST
@@ -151,13 +151,13 @@ def _evaluate(own, rules, sheet, info):
 
 @inlined
 def _account(own, rules, sheet, info, terms, running, failure):
-    """What has become of the score and of a success; no reward terms."""
+    """Write the record of scores and of successes; no reward terms."""
     return account_hanging(own, rules, sheet, info, hang_score(own), hangs(own), running, failure)
 
 
 @inlined
 def _observe_rail(own, rules, sheet, seen):
-    """The sheet's center and how it hangs, and the rail."""
+    """The sheet's center, the measures of hanging, and the rail."""
     for c in range(3):
         seen.center[c] = (sheet.summary[CENTROID + c] - own.origin[c]) / rules.side
         seen.hang[c] = own.hang[c]
@@ -167,14 +167,14 @@ def _observe_rail(own, rules, sheet, seen):
 
 @inlined
 def _observe_held(own, rules, sheet, seen):
-    """What is observed in both tasks, and what is held."""
+    """The observations of both tasks, and the held corners."""
     _observe_rail(own, rules, sheet, seen)
     observe_held(own, rules, sheet, seen)
 
 
 @inlined
 def _observe_grippers(own, rules, sheet, seen):
-    """What is observed in both tasks, and each gripper."""
+    """The observations of both tasks, and each gripper."""
     _observe_rail(own, rules, sheet, seen)
     observe_picking(own, rules, sheet, seen)
 
@@ -182,7 +182,7 @@ def _observe_grippers(own, rules, sheet, seen):
 OBSERVATIONS = (
     Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND),
     Observation(
-        "hang", "share of the sheet beyond the rail, share on the floor, length that the rail carries [L], at most 1", (3,)
+        "hang", "share of the sheet beyond the rail, share on the floor, length that the rail supports [L], at most 1", (3,)
     ),
     Observation("rail_height", "height of the rail's axis", (), "L", 2.0),
     Observation("rail_turn", "cosine and sine of its yaw", (2,)),
@@ -198,7 +198,7 @@ class RailTask(HangingTask):
 
     Attributes:
         radius: of the rail and its posts, in sides.  rail_friction: between them and the cloth.  rail_thickness: distance at which
-            the cloth rests on them [m]: about the height of the arc over a side of a triangle, so that particles carry the sheet.
+            the cloth rests on them [m]: about the height of the arc over a side of a triangle, so that particles support the sheet.
     """
 
     stand = frame_at = "rail"
@@ -245,11 +245,11 @@ class RailTask(HangingTask):
         return bool(own["rail"][2] > self.radius * self.physics.side)
 
     def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
-        """Up, over the rail, and down on its other side until half of the sheet is there."""
+        """Lift, move over the rail, and lower on its other side until half of the sheet is there."""
         side, mesh = self.physics.side, self.physics.mesh
         across, above = hands[..., 1].mean(axis=1, keepdims=True), hands[..., 2].min(axis=1, keepdims=True)
         high = above > EXPERT_CLEARS * side
-        # over it; or, beyond the rail, down
+        # over the rail; or, beyond it, down
         down = (across > (EXPERT_BEYOND - 0.04) * side) | ((across > 0.5 * EXPERT_AT * side) & ~high)
         goal = np.empty_like(hands)
         goal[..., 0] = mesh.rest_positions[list(mesh.corners[2:]), 0]
@@ -277,7 +277,7 @@ class HangHardTask(RailTask, FromFloorTask):
     """The task of ``ClothHang-Hard-v0``, see ``ClothHangHardEnv``."""
 
     physics = LARGE_SILK
-    # an agent is never done: it may take hold again until its time is up
+    # an agent is never done: it may grasp again until its time is up
     kernels = Kernels(
         _picking_and_hanging, _evaluate, _observe_grippers, act=take, measure=measure_hang, account=_account,
         fingers=close_or_open,
@@ -300,19 +300,19 @@ class HangHardTask(RailTask, FromFloorTask):
 
 
 class ClothHangEnv(ClothEnv):
-    """Hang a sheet that is held by two corners over a rail, and let go of it.
+    """Hang a sheet, held by two corners, over a rail and release it.
 
     ## Description
     A square sheet of side L = 0.6 m (17 x 17 particles) hangs from two held corners, 0.5 to 0.7 L in front of a rail: a rod of
     radius 0.05 L and length 1.6 L, level, on two posts of the same radius, its axis 0.75 to 1 L above the floor.  The agent moves
-    both corners and may let go of each.  When it holds none, or after 80 steps, at which both are let go, the sheet has five
-    seconds, 150 steps, in which actions are ignored; then it is evaluated.  To hold it in the right place until then is as good as
-    to let go.
+    both corners and may release each.  After 80 steps both are released.  When no corner is held, the sheet settles for five
+    seconds, 150 steps, in which actions are ignored; then it is evaluated.  Holding the sheet in place until then is as good as
+    releasing it earlier.
 
     $physics
 
-    The fabric is the median of 618 measured ones, its linear drag that of filmed cloth.  Cloth rests 6 mm from the rail's surface,
-    about the height of the rail's arc over a side of a triangle, so that particles carry it and it does not tremble.
+    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.  Cloth rests 6 mm from the rail's
+    surface, about the height of the rail's arc over a side of a triangle, so that particles support it and it does not tremble.
 
     ## Action Space
     $actions corner
@@ -320,21 +320,21 @@ class ClothHangEnv(ClothEnv):
     ## Rewards
     $rewards
 
-    On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance d of the sheet's
-    center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.
+    During the episode the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the distance d of the
+    sheet's center of area from the nearest point L/4 below the rail at which the sheet does not reach beyond its ends.
 
     ## Evaluation
     The rail's vertical plane cuts the sheet.  Balance B is twice the smaller part's share of the area.  Support S is the length of
     the cut, measured on the flat sheet, that lies between the rail's posts, and between its axis and 0.05 L above the surface on
     which cloth rests: in sides, at most 1, since no line that halves a square is shorter.  F is the share of the area lower than
-    3 cm.  All are of the triangles' surface, so another resolution of the same surface has the same.  The score after each step
-    is B S (1 - F): 0 on the floor, beside or under the rail; 1 for a sheet that the rail halves.  So cloth that is held up without
-    the rail, that lies beneath it, or that hangs by a corner scores nothing or little.
+    3 cm.  All measures are of the triangles' surface, and do not depend on its resolution.  The score after each step
+    is B S (1 - F): 0 on the floor, next to or under the rail; 1 for a sheet that the rail halves.  Cloth that is held up without
+    the rail, lies beneath it, or hangs by a corner therefore scores nothing or little.
 
     ``info["normalized_performance"]`` = B S (1 - F) / (1 + (v / 0.1 m/s)^2), with the rms speed v, after the five seconds.
     ``info["is_success"]``: B >= 0.6 (3/10 of the sheet on either side), S >= 0.9, F <= 0.02 and v under 0.02 m/s.  ``info`` also
     has ``balance``, ``support``, ``lying`` (F), ``rms_speed`` [m/s], which are 0 until then, and in each step ``best``, the
-    episode's best score, ``first_success``, the first step after which the sheet hangs so and nothing holds it, or -1,
+    episode's best score, ``first_success``, the first step after which the sheet hangs in this way and is not held, or -1,
     ``success_held``, whether it has hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the
     ``reward/...`` terms.
 
@@ -348,30 +348,31 @@ class ClothHangEnv(ClothEnv):
 
 
 class ClothHangHardEnv(ClothEnv):
-    """Pick up a silk sheet from the floor, flat or rumpled, hang it over a thin rail, and let go.
+    """Pick up a flat or rumpled silk sheet from the floor, hang it over a thin rail, and release it.
 
     ## Description
     The rail and the evaluation are those of ``ClothHang-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles), of silk
-    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction 0.3, and cloth rests 7
-    mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail,
-    which stops their tips.  After 130 steps they open, and the sheet has five seconds, 150 steps, in which actions are ignored;
-    then it is evaluated.
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction is 0.3, and cloth rests
+    7 mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail.
+    The rail stops their tips.  After 130 steps the grippers open, and the sheet settles for five seconds, 150 steps, in which
+    actions are ignored; then it is evaluated.
 
     $physics
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners of 1 for one that has
-    been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
+    During the episode the potential is 0.8 times that of ``ClothHang-v0``, plus 0.2 times the mean over both corners of 1 for a
+    corner that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     As in ``ClothHang-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet lies before the rail, all of it 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the side; in
-    half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open, up to 0.1 L
-    beside and 0.2 to 0.35 L above their corners.  The rail is drawn as in ``ClothHang-v0``.
+    The sheet lies in front of the rail, completely 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the
+    side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open,
+    displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The rail is drawn as in
+    ``ClothHang-v0``.
     """
 
     task_class = HangHardTask

@@ -218,28 +218,28 @@ class HangingTask(Task):
         return self.before(env, x, -(self.extent * side + away), sideways)
 
     def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
-        """What is left of the way of two hands that hang the sheet up [m], in the frame, (num_envs, 2, 3); whether they are there,
-        (num_envs, 1); and their speed, as ``as_actions`` takes it.
+        """Remaining displacements of two hands that hang the sheet up [m], in the frame, (num_envs, 2, 3); whether they have
+        arrived, (num_envs, 1); and their speed, as ``as_actions`` takes it.
 
         hands: in the frame [m], (num_envs, 2, 3).
         """
         raise NotImplementedError
 
     def expert_actions(self) -> NDArray:
-        """To where the sheet hangs, and let go.
+        """Move to the hanging position, and release.
 
-        Without memory: where hands and sheet are says which part of the way they are on.
+        The expert has no memory: the positions of hands and sheet determine the phase.
         """
         way, there, speed = self.ways(self.in_frame(self.episode["targets"]))
         return as_actions(self, self.out_of_frame(way) / 2, np.where(there, 1.0, -1.0) * np.ones((1, 2)), speed)
 
 
 class FromFloorTask(PickingTask, HangingTask):
-    """Base of those in which two grippers pick up their corners of a sheet on the floor, flat or rumpled."""
+    """Base of the tasks in which two grippers pick up their corners of a flat or rumpled sheet on the floor."""
 
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**PickingTask.ranges, **HangingTask.ranges}
-    no_picks = "what is picked and placed ends on the floor"
-    arguments: ClassVar = {**PickingTask.arguments, "action_mode": f'"velocity" alone: {no_picks}'}
+    no_picks = "picking and placing ends on the floor"
+    arguments: ClassVar = {**PickingTask.arguments, "action_mode": f'only "velocity": {no_picks}'}
 
     def rumpled(self) -> NDArray:
         """Rumpled sheets about the origin [m], (sheets, particles, 3)."""
@@ -250,7 +250,7 @@ class FromFloorTask(PickingTask, HangingTask):
         side, sheets = self.physics.side, self.rumpled()
         gap, sideways, yaw = side * rng.uniform(0.1, 0.2), side * rng.uniform(-0.1, 0.1), rng.uniform(-0.2, 0.2)
         x = lying_sheet(rng, sheets, self.physics.mesh, yaw, options)
-        # all of it beside
+        # completely in front of the stand
         x = self.before(env, x, -x[:, 1].max() - (self.extent * side + gap), sideways)
         x[:, 2] += np.abs(rng.normal(scale=UNEVEN, size=len(x)))
         self.hover(env, rng, x[self.places])

@@ -1,6 +1,6 @@
-"""ClothHook-v0 and ClothHook-Hard-v0: hang a sheet by its hole on a hook, held by two corners or lying on the floor, and let go.
+"""ClothHook-v0 and ClothHook-Hard-v0: hang a sheet on a hook by its hole, from two held corners or from the floor; release it.
 
-A hook is an arm that rises from a post.  In its frame the arm is across from 0 to before it.
+A hook is an arm that rises from a post.  In the hook's frame the arm extends along negative y from the origin.
 """
 
 from __future__ import annotations
@@ -45,16 +45,16 @@ from clothgym.triangles import triangle_mesh
 
 # in sides: the arm's length; radii of arm and post; height of the post above the arm's root
 ARM, ARM_RADIUS, POST_RADIUS, TOP = 0.3, 0.02, 0.03, 0.3
-RISE = np.pi / 6  # by which the arm rises [rad]
+RISE = np.pi / 6  # slope of the arm [rad]
 # distance at which cloth rests on them [m]: the height of the arc over a side of a triangle, so that it does not tremble
 ON_HOOK = 0.01
 
-# the scripted expert, in sides: how far before the tip it brings the hole; how far beside the arm's axis the hole's middle may be
-# on its way along the arm; how near the root that way ends; where the hole's middle is below the axis when it lets go; and how far
-# apart its hands are, as a share of the edge
+# the scripted expert, in sides: distance in front of the tip to which it brings the hole; largest distance of the hole's middle
+# from the arm's axis on its way along the arm; distance from the root at which that way ends; depth of the hole's middle below the
+# axis at the release; and distance of its hands, as a share of the edge
 EXPERT_BEFORE, EXPERT_WITHIN, EXPERT_NEAR, EXPERT_DROP, EXPERT_WIDE = 0.12, 0.03, 0.1, 0.03, 0.96
 EXPERT_CARRIES = 0.4  # its speed along the arm, as a share of the limit
-EXPERT_GAIN = 0.3  # share of the hole's way that the hands go at once: it swings below them
+EXPERT_GAIN = 0.3  # share of the hole's displacement that the hands move in a step: the hole swings below them
 
 
 # --- the sheet ----------------------------------------------------------------------------------------------------------------
@@ -63,8 +63,8 @@ EXPERT_GAIN = 0.3  # share of the hole's way that the hands go at once: it swing
 class HoledSheet(NamedTuple):
     """A square sheet with a rectangular hole.
 
-    mesh: its triangles.  kept: its particles in the grid that it is cut from, (particles,).  rim: its particles around the hole, in
-    order, (rim,).  corners: as a grid's.  key: particles that are observed: corners, middles of the edges, corners of the hole.
+    mesh: its triangles.  kept: indices of its particles in the original grid, (particles,).  rim: its particles around the hole, in
+    order, (rim,).  corners: as a grid's.  key: observed particles: corners, middles of the edges, corners of the hole.
     """
 
     mesh: ClothMesh
@@ -75,13 +75,15 @@ class HoledSheet(NamedTuple):
 
 
 def sheet_with_hole(rows: int, side: float, width: int, height: int, below: int) -> HoledSheet:
-    """A sheet cut from a square grid of an odd number of rows: without ``width`` x ``height`` of its cells, amid them, ``below`` so
-    many cells from the upper edge; width is even."""
+    """A sheet cut from a square grid with an odd number of rows.
+
+    The hole has ``width`` x ``height`` cells, is centered along the upper edge, and starts ``below`` cells below it; width is even.
+    """
     whole = grid(rows, rows, side, side)
     index = np.arange(rows * rows).reshape(rows, rows)
     left, top = (rows - 1 - width) // 2, rows - 1 - below
     right, bottom = left + width, top - height
-    # a triangle is in the hole if its middle is
+    # a triangle is in the hole if its centroid is
     row, column = (whole.triangles // rows).mean(axis=1), (whole.triangles % rows).mean(axis=1)
     hole = (bottom < row) & (row < top) & (left < column) & (column < right)
     triangles = whole.triangles[~hole]
@@ -105,15 +107,15 @@ def sheet_with_hole(rows: int, side: float, width: int, height: int, below: int)
 
 @apart
 def threads(x, rim, a, b):
-    """How often the segment from a to b goes through a hole, less how often it comes back.
+    """Number of crossings of the segment from a to b through a hole, less those in the opposite direction.
 
-    The hole is spanned by the fan of triangles from the mean of its rim to the rim's edges.  A line meets a triangle where it has
-    all three edges on the same side: the signs of three volumes.  Of two triangles that share an edge, both have the same numbers.
+    The hole is spanned by the fan of triangles from the mean of its rim to the rim's edges.  A line meets a triangle if it has
+    all three edges on the same side: the signs of three volumes.  Two triangles that share an edge use the same volume for it.
 
     x: (3, particles) [m].  rim: particles around the hole, in order, (rim,).
     """
     count, n = 0, rim.shape[0]
-    # all from a: along the segment, and to the hole's middle
+    # relative to a: the segment's direction, and the hole's middle
     d, m = (b[0] - a[0], b[1] - a[1], b[2] - a[2]), np.zeros(3)
     for k in range(n):
         for c in range(3):
@@ -127,7 +129,7 @@ def threads(x, rim, a, b):
         w = _volume(d, m, p)
         if (u > 0) != (v > 0) or (v > 0) != (w > 0):
             continue
-        # and whether both ends are on different sides of the triangle: their volumes with it
+        # and whether the ends are on different sides of the triangle: their volumes with it
         before = _volume(p, q, m)
         after = before - (u + v + w)
         if (before > 0) != (after > 0):
@@ -162,7 +164,7 @@ def measure_hook(own, rules, sheet):
     own.tip[2] = own.root[2] + rules.arm_up
     own.threaded = threads(sheet.x, rules.rim, own.root, own.tip) != 0
     own.lying = lying_of(sheet.x, sheet.mesh.triangles, rules.areas)
-    # middle of the rim; and the area that it goes around, as a vector
+    # middle of the rim; and the vector area of the rim
     n = rules.rim.shape[0]
     for c in range(3):
         own.hole[c] = own.facing[c] = 0.0
@@ -194,26 +196,26 @@ def on_hook(own):
 
 @inlined
 def _guidance(own, rules):
-    """How short the way is that is left to the hole's middle, in [0, 1]: along the arm to its root, from before its tip."""
+    """Falloff of the remaining path length of the hole's middle, in [0, 1]: from the tip along the arm to its root."""
     left = distance(own.hole, own.root) if own.threaded else distance(own.hole, own.tip) + rules.arm
     return 1 / falloff(left, GUIDE_SCALE * rules.side)
 
 
 @inlined
 def _hooking(own, rules, sheet):
-    """How well a held sheet hangs, and how near it is to that."""
+    """Score of a held sheet, and its nearness to hanging."""
     return guided(_guidance(own, rules), hook_score(own))
 
 
 @inlined
 def _picking_and_hooking(own, rules, sheet):
-    """How far the taking hold is along, and the hooking."""
+    """Progress of grasping and of hooking."""
     return picked(own, rules, sheet, _hooking(own, rules, sheet))
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write how the sheet hangs and how much it is at rest; returns the normalized performance."""
+    """Write the measures of the hanging sheet and its speed; returns the normalized performance."""
     info.threaded, info.lying, info.rms_speed = own.threaded, own.lying, np.sqrt(sheet.summary[SPEED2])
     info.is_success = on_hook(own) and info.rms_speed < ENOUGH_REST
     return hook_score(own) / falloff(info.rms_speed, SPEED_SCALE)
@@ -221,7 +223,7 @@ def _evaluate(own, rules, sheet, info):
 
 @inlined
 def _account(own, rules, sheet, info, terms, running, failure):
-    """What has become of the score and of a success; no reward terms."""
+    """Write the record of scores and of successes; no reward terms."""
     return account_hanging(own, rules, sheet, info, hook_score(own), on_hook(own), running, failure)
 
 
@@ -237,14 +239,14 @@ def _observe_hook(own, rules, sheet, seen):
 
 @inlined
 def _observe_held(own, rules, sheet, seen):
-    """What is observed in both tasks, and what is held."""
+    """The observations of both tasks, and the held corners."""
     _observe_hook(own, rules, sheet, seen)
     observe_held(own, rules, sheet, seen)
 
 
 @inlined
 def _observe_grippers(own, rules, sheet, seen):
-    """What is observed in both tasks, and each gripper."""
+    """The observations of both tasks, and each gripper."""
     _observe_hook(own, rules, sheet, seen)
     observe_picking(own, rules, sheet, seen)
 
@@ -283,10 +285,10 @@ class HookingTask(HangingTask):
         "facing": (-1.0, 1.0),
     }  # fmt: skip
     reset_options: ClassVar[tuple[str, ...]] = ("material", "hook")
-    arguments: ClassVar = {"rows": "none: the sheet has one mesh, of triangles", "side": "none other, as for ``rows``"}
+    arguments: ClassVar = {"rows": "not supported: the sheet has a fixed triangle mesh", "side": "fixed, as for ``rows``"}
 
     def remembers(self) -> Fields:
-        # the end of the arm's axis [m]; the hole's middle [m] and normal; and how the sheet hangs
+        # the end of the arm's axis [m]; the hole's middle [m] and normal; and the measures of hanging
         own: Fields = [("tip", float, 3), ("hole", float, 3), ("facing", float, 3), ("threaded", np.uint8), ("lying", float)]
         return [*super().remembers(), *own]
 
@@ -301,7 +303,7 @@ class HookingTask(HangingTask):
         return cls.sheet_cut.key
 
     def tip_of(self, root: NDArray, turn: NDArray) -> NDArray:
-        """Where the arm from this root, turned so, ends [m]."""
+        """End of the arm with this root and turn [m]."""
         (c, s), side = turn, self.physics.side
         return root + ARM * side * np.array([np.cos(RISE) * s, -np.cos(RISE) * c, np.sin(RISE)])
 
@@ -329,20 +331,20 @@ class HookingTask(HangingTask):
         own["tip"] = own["origin"] = self.tip_of(own["root"], own["turn"])
 
     def ways(self, hands: NDArray) -> tuple[NDArray, NDArray, float | NDArray]:
-        """The hole before the tip, along the arm, and down until the rim lies on it."""
+        """Move the hole in front of the tip, then along the arm, then down until the rim lies on it."""
         side, episode = self.physics.side, self.episode
         u, v, w = np.moveaxis(self.in_frame(episode["hole"][:, None])[:, 0], 1, 0)
         out, threaded = ARM * np.cos(RISE) * side, episode["threaded"] == 1
-        # the axis at the hole, and beyond the tip where it would go on
+        # height of the axis at the hole, extrapolated beyond the tip
         axis = -np.minimum(v, 0) * np.tan(RISE)
-        beside = np.hypot(u, w - axis)
-        along = threaded | ((beside < EXPERT_WITHIN * side) & (v < 0))
+        off_axis = np.hypot(u, w - axis)
+        along = threaded | ((off_axis < EXPERT_WITHIN * side) & (v < 0))
         near = threaded & (v > -EXPERT_NEAR * side)
-        # to a point before the tip; along the arm; and down
+        # to a point in front of the tip; along the arm; and down
         before = out + EXPERT_BEFORE * side
         goal = np.stack([
             np.zeros_like(u),
-            np.where(near, v, np.where(along, v + 0.1 * side, np.minimum(v + beside, -before))),
+            np.where(near, v, np.where(along, v + 0.1 * side, np.minimum(v + off_axis, -before))),
             np.where(near, axis - 3 * EXPERT_DROP * side, np.where(along, axis - 0.1 * side * np.tan(RISE), before * np.tan(RISE))),
         ], axis=1)  # fmt: skip
         common = goal - np.stack([u, v, w], axis=1)
@@ -372,7 +374,7 @@ class HookHardTask(HookingTask, FromFloorTask):
 
     sheet_cut = sheet_with_hole(21, 0.8, 2, 2, below=2)
     physics = replace(LARGE_SILK, mesh=sheet_cut.mesh, substeps=46)
-    # an agent is never done: it may take hold again until its time is up
+    # an agent is never done: it may grasp again until its time is up
     kernels = Kernels(
         _picking_and_hooking, _evaluate, _observe_grippers, act=take, measure=measure_hook, account=_account,
         fingers=close_or_open,
@@ -394,18 +396,18 @@ class HookHardTask(HookingTask, FromFloorTask):
 
 
 class ClothHookEnv(ClothEnv):
-    """Hang a sheet that is held by two corners by its hole on a hook, and let go of it.
+    """Hang a sheet, held by two corners, on a hook by its hole and release it.
 
     ## Description
-    A square sheet of side L = 0.6 m has a hole, 0.25 L wide and 0.125 L high, 0.125 L below its upper edge and in the middle of it:
-    a grid of 17 x 17 particles without 4 x 2 of its cells, 286 particles.  It hangs from its upper corners, 0.3 to 0.5 L before the
+    A square sheet of side L = 0.6 m has a centered hole, 0.25 L wide and 0.125 L high, 0.125 L below its upper edge: a grid of
+    17 x 17 particles without 4 x 2 of its cells, 286 particles.  It hangs from its upper corners, 0.3 to 0.5 L in front of the
     tip of a hook: an arm of length 0.3 L and radius 0.02 L, which rises by 30 degrees from a post, radius 0.03 L.  The arm's root
-    is 1.15 to 1.35 L above the floor, and the post ends 0.3 L higher.  The agent moves both corners and may let go of each.  When
-    it holds none, or after 100 steps, at which both are let go, the sheet has five seconds, 150 steps, in which actions are
-    ignored; then it is evaluated.  To hold it on the hook until then is as good as to let go.
+    is 1.15 to 1.35 L above the floor, and the post ends 0.3 L higher.  The agent moves both corners and may release each.  After
+    100 steps both are released.  When no corner is held, the sheet settles for five seconds, 150 steps, in which actions are
+    ignored; then it is evaluated.  Holding the sheet on the hook until then is as good as releasing it earlier.
 
     Cloth rests 10 mm from the hook's surface, about the height of the arm's arc over a side of a triangle, so that it does not
-    tremble.  The mesh is one of triangles, whose edges are the springs; ``rows`` and ``side`` are fixed.
+    tremble.  The mesh consists of triangles, whose edges are the springs; ``rows`` and ``side`` are fixed.
 
     $physics
 
@@ -415,20 +417,20 @@ class ClothHookEnv(ClothEnv):
     ## Rewards
     $rewards
 
-    On the way the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the way d that is left to the
-    middle of the hole's rim: to the arm's root if the arm is in the hole, else to its tip and along the arm.
+    During the episode the potential is the mean of the score (below) and of ``1/(1 + (d/0.4 L)^2)``, with the remaining path length
+    d of the middle of the hole's rim: to the arm's root if the arm is in the hole, else to its tip and along the arm.
 
     ## Evaluation
     The arm is in the hole if its axis goes through it: triangles from the mean of the rim to the rim's edges span the hole, and the
     axis, from root to tip, meets them more often from one side than from the other.  F is the share of the sheet's area lower than
-    3 cm.  The score after each step is 1 - F if the arm is in the hole, else 0.  So a sheet that lies over the arm or the post
-    scores nothing.
+    3 cm.  The score after each step is 1 - F if the arm is in the hole, else 0.  A sheet that lies over the arm or the post
+    therefore scores nothing.
 
     ``info["normalized_performance"]`` is this score over ``1 + (v / 0.1 m/s)^2``, with the rms speed v, after the five seconds.
     ``info["is_success"]``: the arm is in the hole, F <= 0.02 and v under 0.02 m/s.  ``info`` also has ``threaded``, whether the arm
     is in the hole, ``lying`` (F), ``rms_speed`` [m/s], which are 0 until then, and in each step ``best``, the episode's best score,
-    ``first_success``, the first step after which the sheet hangs so and nothing holds it, or -1, ``success_held``, whether it has
-    hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the ``reward/...`` terms.
+    ``first_success``, the first step after which the sheet hangs in this way and is not held, or -1, ``success_held``, whether it
+    has hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the ``reward/...`` terms.
 
     ## Starting State
     The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
@@ -440,30 +442,31 @@ class ClothHookEnv(ClothEnv):
 
 
 class ClothHookHardEnv(ClothEnv):
-    """Pick up a silk sheet from the floor, flat or rumpled, hang it by its small hole on a hook, and let go.
+    """Pick up a flat or rumpled silk sheet from the floor, hang it on a hook by its small hole, and release it.
 
     ## Description
     The hook and the evaluation are those of ``ClothHook-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles but one), of
     silk (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), and its hole is a square of 0.1 L, 0.1 L below the upper
-    edge, through which the arm must go with 14 mm to spare on either side.  The sheet lies on the floor, flat or rumpled, and
-    two grippers hover above the corners of its upper edge.  After 160 steps they open, and the sheet has five seconds, 150 steps,
-    in which actions are ignored; then it is evaluated.
+    edge.  The arm passes through it with a clearance of 14 mm on either side.  The sheet lies on the floor, flat or rumpled, and
+    two grippers hover above the corners of its upper edge.  After 160 steps they open, and the sheet settles for five seconds, 150
+    steps, in which actions are ignored; then it is evaluated.
 
     $physics
 
     ## Rewards
     $rewards
 
-    On the way the potential is 0.8 times that of ``ClothHook-v0``, plus 0.2 times the mean over both corners of 1 for one that has
-    been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
+    During the episode the potential is 0.8 times that of ``ClothHook-v0``, plus 0.2 times the mean over both corners of 1 for a
+    corner that has been held, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     As in ``ClothHook-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet lies before the hook, all of it 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad against it and up to 0.1 L to
-    the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut out.  The
-    grippers are open, up to 0.1 L beside and 0.2 to 0.35 L above their corners.  The hook is drawn as in ``ClothHook-v0``.
+    The sheet lies in front of the hook, completely 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad against it and up to
+    0.1 L to the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut
+    out.  The grippers are open, displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The hook is
+    drawn as in ``ClothHook-v0``.
     """
 
     task_class = HookHardTask

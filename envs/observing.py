@@ -35,7 +35,7 @@ PICTURES_A_THREAD = 4  # fewer are not worth another thread
 
 
 class Observation(NamedTuple):
-    """What is observed beside the points of the sheet: a number, or an array of numbers.
+    """An observation in addition to the points of the sheet: a number, or an array of numbers.
 
     name: its key in ``observation_slices``.  about, unit: for the page; "L" is the sheet's longer side.  shape: of the array.
     bound: largest magnitude, one for all or one for each number along the last axis.  function: its values from the task,
@@ -60,7 +60,7 @@ class View(NamedTuple):
 
 
 def points_observed(task: Task | type[Task], obs_mode: str, count: int) -> list[Observation]:
-    """What is observed of so many points of the sheet, "particles" or "keypoints": where they are, and their velocities."""
+    """The observations of this number of points of the sheet, "particles" or "keypoints": their positions and velocities."""
     what = task.key_points if obs_mode == "keypoints" else "all particles, row by row"
     return [
         Observation(obs_mode, f"{what}, relative to {task.points_relative_to}", (count, 3), "L", task.position_bound),
@@ -94,7 +94,7 @@ def mesh_edges(mesh: ClothMesh) -> NDArray[np.int64]:
 
 
 class Observer:
-    """What is returned of a task.
+    """The observations that a task returns.
 
     Args:
         mode: "keypoints" or "particles", the state vector; or one of ``PICTURES``.
@@ -180,10 +180,10 @@ class Observer:
         # what goes on after an episode's end is not observed
         self._draw(np.flatnonzero(self.stale & over))
 
-    # --- what is returned -----------------------------------------------------------------------------------------------
+    # --- returned observations ------------------------------------------------------------------------------------------
 
     def batch(self) -> Any:
-        """What is observed of all environments, a fresh copy."""
+        """The observations of all environments, a fresh copy."""
         self._draw(np.flatnonzero(self.stale))
         return self._given(slice(None))
 

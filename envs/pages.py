@@ -1,8 +1,8 @@
-"""An environment's manual page; refuses unknown keywords.
+"""Manual pages of environments, and the check for unknown keywords.
 
-A class's docstring is its page.  When the class is made, lines of it that begin with one of ``MARKS`` are replaced by what that
-function returns of the task, some by means of the words that follow; and a page with the mark ``$physics`` gets the sections of
-``STANDARD`` that it lacks, which follow from the task alone.  Every number comes from where the code has it.
+The docstring of an environment's class is its page.  When the class is created, each line that begins with one of ``MARKS`` is
+replaced by the lines that the mark's function returns for the task; the rest of the line is the function's argument.  A page with
+the mark ``$physics`` also gets the missing sections of ``STANDARD``, which follow from the task.  Numbers are read from the code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.collisions import Plane
-from clothgym.envs.draping import LETS_GO, let_go
+from clothgym.envs.draping import RELEASE_ABOVE, let_go
 from clothgym.envs.episode import BEYOND, EFFORT_PRICE, FAILURE_PENALTY, FAILURES, SUCCESS_BONUS, TWICE
 from clothgym.envs.gripper_task import CLOSES, OPENS, GripperTask
 from clothgym.envs.observing import Observation, points_observed
@@ -32,7 +32,7 @@ from clothgym.material import PRESETS, Material
 if TYPE_CHECKING:
     from clothgym.envs.single import TaskHolder
 
-# sections that are added to pages, and the order of all
+# sections that are added to pages, and the order of all sections
 STANDARD = {
     "Action Space": "$actions",
     "Observation Space": "$observations",
@@ -49,9 +49,9 @@ WIDTH = 124  # of a line of prose
 FAILED = {
     "torn": f"a structural spring {TWICE:g} times as long as at rest",
     "out_of_bounds": f"the sheet's center {BEYOND:g} m beyond the arena, $room",
-    "diverged": "not finite; the last finite observation goes out",
+    "diverged": "not finite; the last finite observation is returned",
 }
-# what ``reset(options=...)`` takes
+# the keys of ``reset(options=...)``
 OPTIONS = {
     "material": "a preset's name or a dict of properties",
     "target": "a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw``",
@@ -63,58 +63,60 @@ OPTIONS = {
 
 # default and meaning of the keywords that all environments take; $name: the task's own
 COMMON: dict[str, tuple[str, str]] = {
-    "rows": ("$rows", "particles along a side of the sheet; of another number with automatic substeps"),
-    "side": ("$side", "L, the length of a side [m], likewise"),
+    "rows": ("$rows", "particles along a side of the sheet; another number implies automatic substeps"),
+    "side": ("$side", "L, the length of a side [m]; another length implies automatic substeps"),
     "fabric": (
         "``None``",
-        "the task's own; or a preset's name (``python -m clothgym list``), whose measured properties it takes, or a ``Material``; "
-        "then with automatic substeps",
+        "the task's own; or a preset's name (``python -m clothgym list``), for its measured properties, or a ``Material``; "
+        "implies automatic substeps",
     ),
     "integrator": ("``$integrator``", "or another, by name or ``{\"name\": ..., option: ...}``, with automatic substeps"),
     "substeps": ("$substeps", 'substeps of a control step, or ``"auto"``'),
     "physics": (
         '``"true"``',
-        "whole-sheet contact with solids, strict contact with itself, rigidity; "
-        'or ``"fast"``: contact with particles alone, none of the sheet with itself, skip springs in the place of rigidity',
+        "whole-sheet contact with solids, strict self-collision, bending rigidity; "
+        'or ``"fast"``: contact of particles only, no self-collision, skip springs instead of bending rigidity',
     ),
-    "bending": ("``None``", 'that of ``physics``; or ``"springs"``, ``"hinge"``, ``"quadratic"``, see ``clothgym.bending``'),
+    "bending": ("``None``", 'set by ``physics``; or ``"springs"``, ``"hinge"``, ``"quadratic"``, see ``clothgym.bending``'),
     "strain_limit": (
-        "``None``", 'largest strain, kept by a limiter; ``info["strain_before_limiting"]`` is what it met',
+        "``None``", 'largest strain, enforced by a limiter; ``info["strain_before_limiting"]`` is the strain before it',
     ),
     "self_collision": (
         "``None``",
-        'that of ``physics``; or ``False``, ``"fast"``, ``"strict"``, with ``self_contacts`` and ``attachment_lag`` in ``info``',
+        'set by ``physics``; or ``False``, ``"fast"``, ``"strict"``, with ``self_contacts`` and ``attachment_lag`` in ``info``',
     ),
     "contact": (
-        "``None``", 'that of ``physics``; what touches solids: ``"particles"``, or ``"sheet"``, the whole sheet',
+        "``None``", 'set by ``physics``; or ``"particles"``: only particles collide with solids, or ``"sheet"``: the whole sheet',
     ),
-    "air_density": ("$air_density", "[kg/m^3], of drag and lift per triangle; 1.2 where ``wind`` is given"),
+    "air_density": ("$air_density", "[kg/m^3], for drag and lift per triangle; 1.2 if ``wind`` is given"),
     "obs_mode": (
         '``"keypoints"``',
         'or ``"particles"``, ``"heightmap"``, ``"pointcloud"``, ``"rgb"``, ``"depth"``, ``"rgbd"``, see docs/observations.md',
     ),
-    "image_size": ("64", "pixels of a picture's side"),
+    "image_size": ("64", "pixels along a side of the image"),
     "camera": (
         "``None``",
-        'straight down on the working area; ``"task"``, that of the films; or what ``clothgym.render.Camera`` takes, '
+        'straight down on the working area; ``"task"``, the camera of videos; or the arguments of ``clothgym.render.Camera``, '
         '``{"eye": [0, -1, 1], "target": [0, 0, 0]}``',
     ),
     "num_points": ("256", "points of a point cloud"),
     "privileged": (
-        "``False``", 'whether a picture comes with the state: ``Dict(observation=picture, state=the numbers of "keypoints")``',
+        "``False``", 'whether images come with the state vector: ``Dict(observation=image, state=the numbers of "keypoints")``',
     ),
     "reward_mode": ('``"delta"``', 'or ``"sparse"``'),
     "settling": (
         '``"steps"``',
-        'or ``"at_once"``: the step in which the agent is done goes on until the sheet has settled and is evaluated, and brings '
-        "the rewards of all of it, so that no action is ignored; for sheets without holes, see docs/actions.md",
+        'or ``"at_once"``: the step in which the agent is done continues until the sheet has settled and is evaluated, and returns '
+        "the sum of the rewards, so that no action is ignored; for sheets without holes, see docs/actions.md",
     ),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
-    "wind": ("``None``", 'what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle'),
-    "threads": ("1; in a batch all processors", "the outcome does not depend on it"),
+    "wind": (
+        "``None``", 'the arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle',
+    ),
+    "threads": ("1; in a batch all cores", "number of threads; results do not depend on it"),
     "render_mode": ("``None``", '``"rgb_array"``, ``"depth_array"``, or ``"human"`` through ``gym.make`` (extra ``human``)'),
-    "width": ("480; in a batch 240", "pixels of a frame that ``render`` returns"),
-    "height": ("480; in a batch 240", "likewise"),
+    "width": ("480; in a batch 240", "width in pixels of a frame that ``render`` returns"),
+    "height": ("480; in a batch 240", "its height in pixels"),
     "render_color": (
         '``"fabric"``',
         'or ``"strain"``: cream where no yarn is stretched, violet from $strain_shown % on; or ``"depth"``, in gray',
@@ -123,7 +125,7 @@ COMMON: dict[str, tuple[str, str]] = {
 
 
 def keywords_of(task_class: type[Task]) -> dict[str, Any]:
-    """Default of each keyword that a task takes, its own before those of all tasks."""
+    """Default of each keyword of a task, first its own, then those of all tasks."""
     found: dict[str, Any] = {}
     for cls in task_class.__mro__:
         if "__init__" not in vars(cls) or cls is object:
@@ -152,7 +154,7 @@ def check_keywords(env: TaskHolder, given: Mapping[str, Any]) -> None:
 
 
 def completed(page: str | None, task_class: type[Task] | None) -> str | None:
-    """A page with its sections and tables, or the task's docstring above both tables; nothing where there is no task."""
+    """A page with its sections and tables, or the task's docstring and both tables; the page unchanged if there is no task."""
     if task_class is None:
         return page
     if page is None:
@@ -168,7 +170,7 @@ def completed(page: str | None, task_class: type[Task] | None) -> str | None:
 
 
 def _whole(page: str) -> str:
-    """A page with the sections of ``STANDARD`` that it lacks, each in its place among the others."""
+    """Add the missing sections of ``STANDARD`` to a page, in the order of ``ORDER``."""
     first, *parts = re.split(r"\n(?=## )", page)
     found = {part.partition("\n")[0][3:]: part.strip() for part in parts}
     for heading in (heading for heading in STANDARD if heading not in found):
@@ -187,9 +189,9 @@ def observations_of(task_class: type[Task]) -> list[str]:
     ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
     rows = [
         f'``Box`` of {ends[-1]} numbers for ``obs_mode="keypoints"`` (and 6 x {mesh.num_particles} + {ends[-1] - ends[1]} for',
-        '``"particles"``, all particles row by row).  ``env.unwrapped.observation_slices["keypoints"]``: where they lie, by name.',
-        'Or a picture of ``image_size`` pixels a side: ``"heightmap"`` [L] and ``"depth"`` [m], ``float32``, of one channel;',
-        '``"rgb"``, ``uint8``; ``"rgbd"``, ``float32``, of four; or a ``"pointcloud"`` [L], (``num_points``, 3).',
+        '``"particles"``, all particles row by row).  ``env.unwrapped.observation_slices["keypoints"]`` has their slices, by name.',
+        'Or an image of ``image_size`` pixels a side: ``"heightmap"`` [L] and ``"depth"`` [m], ``float32``, one channel;',
+        '``"rgb"``, ``uint8``; ``"rgbd"``, ``float32``, four channels; or a ``"pointcloud"`` [L], (``num_points``, 3).',
         "",
         "| Num | Name | Observation | Unit | Bound |",
         "| --- | --- | --- | --- | --- |",
@@ -201,7 +203,7 @@ def observations_of(task_class: type[Task]) -> list[str]:
 
 
 def _about(one: Observation) -> str:
-    """What it is, with its shape if it has more than one axis."""
+    """Description of an observation, with its shape if it has more than one axis."""
     return f"{one.about}, {' x '.join(map(str, one.shape))}" if len(one.shape) > 1 else one.about
 
 
@@ -240,7 +242,7 @@ def _prose(text: str) -> list[str]:
 
 
 def _unmade(task_class: type[Task]) -> Any:
-    """A task of which there is only what its class says."""
+    """An instance without ``__init__``, for attributes of the class."""
     return object.__new__(task_class)
 
 
@@ -253,13 +255,13 @@ def _has(task_class: type[Task], kernel: str) -> bool:
 
 
 def physics_of(task_class: type[Task]) -> list[str]:
-    """What an id's physics is, and what ``physics="fast"`` makes of it."""
+    """Description of an id's physics, and of the simplifications of ``physics="fast"``."""
     physics, fast = task_class.physics, task_class.physics.chosen("fast")
     solids = _unmade(task_class).colliders()
     floor = all(isinstance(one, Plane) for one in solids)
-    touched = f"the whole sheet touches {'the floor' if floor else 'solids'} and, strictly, itself" if solids else ""
+    touched = f"the whole sheet collides with {'the floor' if floor else 'solids'} and, strictly, with itself" if solids else ""
     frictions = sorted({one.friction for one in solids})
-    stopped = "the floor stops what grippers hold" if floor else "solids stop what moves the sheet"
+    stopped = "the floor stops grippers and held cloth" if floor else "solids stop anchors, grippers and held cloth"
     own = [
         _fabric(physics.material),
         *([f"friction {' to '.join(f'{one:g}' for one in (frictions[0], frictions[-1])[: len(frictions)])}"] if solids else []),
@@ -269,9 +271,9 @@ def physics_of(task_class: type[Task]) -> list[str]:
         f"``{physics.integrator}`` with {_substeps(physics)}",
     ]
     short = [
-        *(["contact of particles alone"] if solids else []),
-        "none of the sheet with itself" if solids else "no self-collision",
-        "skip springs without rigidity",
+        *(["contact of particles only"] if solids else []),
+        "no self-collision",
+        "skip springs instead of bending rigidity",
         *([_fabric(fast.material)] if fast.material != physics.material else []),
         *([_air(fast)] if fast.air_density != physics.air_density else []),
         *([_substeps(fast)] if fast.substeps != physics.substeps else []),
@@ -279,28 +281,28 @@ def physics_of(task_class: type[Task]) -> list[str]:
     moves = f"moves through {'wind' if physics.wind else 'air'}"
     return [
         *_prose(
-            f"True physics: {touched or 'the cloth touches itself strictly'}, bends with its rigidity, and {moves}.  The id fixes "
-            f"it: {'; '.join(own)}."
+            f"True physics: {touched or 'the sheet collides strictly with itself'}, bends with its rigidity, and {moves}.  "
+            f"The id's settings: {'; '.join(own)}."
         ),
         "",
-        *_prose(f'``physics="fast"`` has short cuts: {", ".join(short)}.'),
+        *_prose(f'Simplifications of ``physics="fast"``: {", ".join(short)}.'),
     ]
 
 
 def _fabric(material: Material) -> str:
-    """A preset's name, and what a hand would feel."""
+    """A fabric preset, with its density and bending rigidity."""
     names = [name for name, one in PRESETS.items() if all(getattr(one, each) == getattr(material, each) for each in MEASURED)]
     name = f'``Material.preset("{names[0]}")``' if names else "a fabric"
     return f"{name} ({1e3 * material.density:.3g} g/m^2, rigidity {1e6 * material.bend_rigidity:.3g} uN m)"
 
 
 def _air(physics: Physics) -> str:
-    """How the air acts on the sheet."""
+    """Description of the air's drag."""
     linear = physics.material.air_drag / physics.material.density
     slow = f"a linear drag of {linear:.2g} per second" if linear else ""
     if not physics.air_density:
         return f"no air but {slow}" if slow else "no air"
-    return "quadratic air" + (f" and {slow}" if slow else "")
+    return "quadratic air drag" + (f" and {slow}" if slow else "")
 
 
 def _substeps(physics: Physics) -> str:
@@ -311,13 +313,13 @@ def _substeps(physics: Physics) -> str:
 
 
 def actions_of(task_class: type[Task], whom: str = "") -> list[str]:
-    """The action space; whom: what it moves, "corner" for each of them, or of tasks whose actions are velocities alone all."""
+    """The action space; whom: the name of one attachment, such as "corner"; if actions are only velocities, of all of them."""
     physics, each = task_class.physics, task_class.actions_per_attachment
     count = len(physics.held) + len(physics.grippers)
-    fourth = f"let go for good, if above {LETS_GO:g}" if task_class.kernels.act is let_go else "its own"
+    fourth = f"release for good, if above {RELEASE_ABOVE:g}" if task_class.kernels.act is let_go else "its own"
     if issubclass(task_class, GripperTask):
         seconds = f"the fingers take {physics.grippers[0].closing_time:g} s"
-        fourth, whom = f"close if below {CLOSES:g}, open if above {OPENS:g}, else go on as before; {seconds}", whom or "gripper"
+        fourth, whom = f"close if below {CLOSES:g}, open if above {OPENS:g}, else continue; {seconds}", whom or "gripper"
     velocity = f"scaled by {physics.attachment_speed:g} m/s; a vector longer than 1 is shortened"
     if each == 3:
         return _prose(f"``Box(-1, 1, ({3 * count},))``: velocity x, y, z of {whom or 'each anchor'}, {velocity}.")
@@ -337,21 +339,21 @@ def actions_of(task_class: type[Task], whom: str = "") -> list[str]:
 
 def _gripper(physics: Physics) -> str:
     return (
-        "A gripper is a kinematic body with two fingers.  When these have closed it holds the particles within "
-        f"{100 * physics.grippers[0].reach:g} cm of its tip, of all layers; when they begin to open it lets go.  It may take "
-        "hold as often as it likes.  The fingers do not push the cloth.  The floor stops what a gripper holds, and while its "
-        "fingers move it does not sink."
+        "A gripper is a kinematic body with two fingers.  When the fingers have closed it holds the particles within "
+        f"{100 * physics.grippers[0].reach:g} cm of its tip, of all layers; when they begin to open it releases them.  It may "
+        "grasp any number of times.  The fingers do not push the cloth.  The floor stops held cloth, and a gripper does not sink "
+        "while its fingers move."
     )
 
 
 def rewards_of(task_class: type[Task]) -> list[str]:
-    """What the reward modes of all tasks mean."""
+    """The reward modes of all tasks."""
     return [
         *_prose(
             f'``reward_mode="delta"``: the change of a potential in [0, 1], less ``{EFFORT_PRICE:g} |a|^2`` for the motion and '
             f"{FAILURE_PENALTY:g} for a failure, plus {SUCCESS_BONUS:g} for a success.  At the end the potential is the normalized "
-            "performance, at a failure 0.  So a return is that performance, less the potential at the start and these terms: doing "
-            "nothing may return less than 0."
+            "performance, at a failure 0.  A return is therefore the final performance less the potential at the start, with these "
+            "terms: no action may return less than 0."
         ),
         '``reward_mode="sparse"``: the normalized performance, at the evaluation.',
     ]
@@ -361,7 +363,7 @@ def rewards_of(task_class: type[Task]) -> list[str]:
 
 
 def episode_end_of(task_class: type[Task]) -> list[str]:
-    """When an episode ends, and how it fails."""
+    """The end of an episode, and its failures."""
     names = ", ".join(f'"{name}" ({FAILED[name]})' for name in FAILURES[1:]).replace("$room", _room(*_unmade(task_class).arena()))
     return _prose(
         f'Terminated when evaluated, {_time(task_class)}; or at a failure, which ``env.metadata["failures"]`` names by the code '
@@ -370,7 +372,7 @@ def episode_end_of(task_class: type[Task]) -> list[str]:
 
 
 def _time(task_class: type[Task]) -> str:
-    """How many steps an episode has; of tasks with a fold, ``acting``, by its name."""
+    """Number of steps of an episode; for tasks with ``acting`` the number for each fold."""
     acting: Mapping[str, int] = getattr(task_class, "acting", {"": task_class.acting_steps})
     *others, last = [f'{steps} ("{name}")' if name else f"{steps} steps" for name, steps in acting.items()]
     listed = f"{', '.join(others)} or {last} steps," if others else last
@@ -386,7 +388,7 @@ def _room(low: NDArray, high: NDArray) -> str:
 
 
 def options_of(task_class: type[Task]) -> list[str]:
-    """What a reset takes."""
+    """The options of ``reset``."""
     each = [f'``"{name}"``' + (f", {OPTIONS[name]}" if name in OPTIONS else "") for name in task_class.reset_options]
     return _prose(f"``reset(options=...)`` takes, for one episode: {'; '.join(each)}.")
 

@@ -44,7 +44,7 @@ class Physics:
         wind: what the air does, unless the environment's keyword says otherwise.
         contact, self_collision, bending: as ``Simulation`` takes them.  Of a sheet that is not flat at rest hinges resist the
             bending, and a warning says so, unless an environment's keyword names another model.
-        fast: what physics="fast" changes beside ``SHORT_CUTS``.
+        fast: changes of physics="fast" in addition to ``SHORT_CUTS``.
     """
 
     mesh: ClothMesh

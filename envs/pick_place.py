@@ -1,8 +1,8 @@
-"""``action_mode="pick_place"``: an action says where each gripper picks, where it places, and how high it lifts on the way.
+"""``action_mode="pick_place"``: an action gives the pick position, the place position and the lift of each gripper.
 
-One such action is ``STEPS`` control steps in every environment, however long its way is: the motion is spread evenly over them.
-So a batch stays in step, and no environment waits for another.  When the time is up the sheet settles in steps of its own, whose
-actions are ignored.
+One such action takes ``STEPS`` control steps in every environment, for any distance: the motion is spread evenly over them.  A
+batch therefore stays synchronous, and no environment waits for another.  When the time is up the sheet settles in further steps,
+whose actions are ignored.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STEPS = 60  # control steps of an action
 FINGERS, RESTING = 4, 8  # of these the fingers take to close, and to open; and that the sheet rests at the end
 MOVING = STEPS - 2 * FINGERS - RESTING
 RETREAT, LEAVING = 0.15, 4  # how far the grippers rise at the end, in sides, and in how many steps
-BESIDE = 0.03  # cloth within this distance of the place, seen from above, is picked at its top [m]
+PICK_RADIUS = 0.03  # horizontal radius around the pick position in which the top of the cloth sets the tip's height [m]
 LOWEST = 0.012  # height of a tip that picks [m]
 
 
@@ -47,7 +47,7 @@ def path_of(actions: NDArray, tips: NDArray, cloth: NDArray, half: float, side: 
     lift = (actions[..., 4] + 1) / 2 * side
     # a tip goes to the top of what lies there, and comes down to the floor at the place
     across = cloth[:, None, :, :2] - pick[:, :, None, :2]
-    near = across[..., 0] ** 2 + across[..., 1] ** 2 <= BESIDE**2
+    near = across[..., 0] ** 2 + across[..., 1] ** 2 <= PICK_RADIUS**2
     tops = np.where(near, cloth[:, None, :, 2], 0).max(axis=2)
     pick[..., 2] = np.maximum(tops, LOWEST)
     # the way to the place, an arc, has as much of the time as of the length; both ways have some of it.  The grippers of one sheet

@@ -1,4 +1,4 @@
-"""ClothReach-v0: bring the free corner of a hanging sheet to a point, by its opposite corner, and bring it to rest there."""
+"""ClothReach-v0: bring the free corner of a hanging sheet to rest at a goal, by moving the opposite corner."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from clothgym.envs.task import Task
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh, grid
 
-PINCHED = 1 / 8  # of a side: the corner's triangle that is held there, since a sheet that hangs from a point spins
+PINCHED = 1 / 8  # of a side: size of the held triangle at the corner, since a sheet that hangs from one particle spins
 NEAR_ENOUGH, SLOW_ENOUGH = 0.05, 0.1  # in sides, and sides a second
 SPEED_SCALE = 0.2  # sides a second: performance is halved at this speed
-NEAREST = 0.2  # in sides: the way to a goal that is nearer than this counts as so long
-CLOSE_SCALE = 0.15  # in sides: how the potential rises near the goal
-LOW, HIGH = np.array([-0.8, -0.8, 0.9]), np.array([0.8, 0.8, 1.7])  # room of the driven corner [m]
-GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that room [m]
+NEAREST = 0.2  # in sides: least initial distance in the performance, for nearer goals
+CLOSE_SCALE = 0.15  # in sides: length scale of the potential near the goal
+LOW, HIGH = np.array([-0.8, -0.8, 0.9]), np.array([0.8, 0.8, 1.7])  # arena of the driven corner [m]
+GOALS_WITHIN = np.array([0.3, 0.3, 0.15])  # of the middle of that arena [m]
 GOAL = (90, 170, 110)  # color of the goal's marker
 
-EXPERT_GAIN = 1.5  # how fast the scripted expert closes on the place above the goal [1/s]
+EXPERT_GAIN = 1.5  # rate at which the scripted expert approaches its place above the goal [1/s]
 
 
 def driven_and_free(mesh: ClothMesh) -> tuple[int, int]:
@@ -52,7 +52,7 @@ def pinch(mesh: ClothMesh) -> tuple[tuple[int, ...], ...]:
 
 @inlined
 def _nearer(own, rules, sheet):
-    """How much of the way is done, in [0, 1]."""
+    """Share of the initial distance that is covered, in [0, 1]."""
     return min(max(1 - distance(own.goal, sheet.x[:, rules.free]) / own.distance, 0.0), 1.0)
 
 
@@ -64,14 +64,14 @@ def _at_rest(rules, sheet):
 
 @inlined
 def _potential(own, rules, sheet):
-    """How much of the way is done, and how near and at rest the corner is, in [0, 1]."""
+    """Share of the distance covered, and nearness and rest of the corner, in [0, 1]."""
     close = 1 / falloff(distance(own.goal, sheet.x[:, rules.free]), CLOSE_SCALE * rules.side)
     return (_nearer(own, rules, sheet) + close * _at_rest(rules, sheet)) / 2
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write how far from the goal and how fast the corner is; returns the normalized performance."""
+    """Write the corner's distance from the goal and its speed; returns the normalized performance."""
     info.goal_distance = distance(own.goal, sheet.x[:, rules.free]) / rules.side
     info.corner_speed = length_of(sheet.v[:, rules.free]) / rules.side
     info.is_success = info.goal_distance <= NEAR_ENOUGH and info.corner_speed < SLOW_ENOUGH
@@ -80,7 +80,7 @@ def _evaluate(own, rules, sheet, info):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The way that is left to the driven corner, and the time."""
+    """The remaining displacement of the driven corner, and the remaining time."""
     for c in range(3):
         seen.way[c] = (own.goal[c] - rules.hangs[c] - sheet.attachments[0, c]) * (10 / rules.side)
     seen.time_left = 1 - own.step / rules.acting_steps
@@ -105,7 +105,7 @@ class ReachTask(Task):
     observations = (
         Observation(
             "way",
-            "from the driven corner to where it must be for the free one to hang in the goal",
+            "from the driven corner to its position at which the free one hangs at the goal",
             (3,),
             "L/10",
             10 * POSITION_BOUND,
@@ -143,7 +143,7 @@ class ReachTask(Task):
 
     @property
     def _hangs(self) -> NDArray:
-        """Where the free corner comes to rest below the driven one [m], (3,)."""
+        """Rest position of the free corner relative to the driven one [m], (3,)."""
         return self._hanging[self._free]
 
     # --- reset ----------------------------------------------------------------------------------------------------------
@@ -170,11 +170,11 @@ class ReachTask(Task):
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """To the place from which the corner hangs in the goal, ever slower: the air brings the sheet to rest."""
+        """Move exponentially to the position above the goal; the air brings the sheet to rest."""
         return EXPERT_GAIN * self._way() / self.physics.attachment_speed
 
     def _way(self) -> NDArray:
-        """From the driven corner to the place from which the free one hangs in the goal [m], (num_envs, 3)."""
+        """From the driven corner to its position at which the free one hangs at the goal [m], (num_envs, 3)."""
         return self.episode["goal"] - self._hangs - self.simulation.attachment_positions[:, 0]
 
     def marks(self, envs: NDArray) -> NDArray:
@@ -189,23 +189,23 @@ def hanging(physics: str, rows: int | None = None, side: float | None = None) ->
     """The sheet at rest under its driven corner, relative to it [m], (particles, 3); physics: by name, see ``Physics``."""
     chosen = ReachTask.physics.chosen(physics).with_sheet(rows, side)
     rest = chosen.mesh.rest_positions
-    # the driven corner up, both wings turned to one side: so they come to hang, whatever they began with
+    # the driven corner up, both wings turned to one side, as they hang at rest
     along, across = (rest[:, 0] - rest[:, 1]) / np.sqrt(2), (rest[:, 0] + rest[:, 1]) / np.sqrt(2)
     x = settled(chosen, np.stack([0.6 * across, 0.8 * np.abs(across), -along], axis=1), seconds=32)
     return x - x[driven_and_free(chosen.mesh)[0]]
 
 
 class ClothReachEnv(ClothEnv):
-    """Bring the free corner of a hanging sheet to a point where it can rest, and bring it to rest there.
+    """Bring the free corner of a hanging sheet to rest at a goal.
 
     ## Description
     A square sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner, where three particles are pinched.  The agent
-    moves that corner; the opposite one, the lowest, is free.  It is to be at a goal, somewhere below the room of the driven corner,
-    and at rest, when 40 steps are over.  The task is for teaching and for tests: any learner solves it in minutes.
+    moves that corner; the opposite one, the lowest, is free.  After 40 steps the free corner must be at rest at a goal below the
+    arena of the driven corner.  The task is for teaching and for tests: any learner solves it in minutes.
 
     $physics
 
-    The fabric is the median of 618 measured ones, its linear drag that of filmed cloth.
+    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.
 
     ## Action Space
     $actions the driven corner
@@ -213,20 +213,19 @@ class ClothReachEnv(ClothEnv):
     ## Rewards
     $rewards
 
-    On the way, with the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the potential is
-    the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``.
+    During the episode, with the free corner's distance d to the goal, d0 at the start (at least 0.2 L), and its speed v, the
+    potential is the mean of ``max(0, 1 - d/d0)`` and ``1/(1 + (d/0.15 L)^2)/(1 + (v / 0.2 L/s)^2)``.
 
     ## Evaluation
     ``info["normalized_performance"]`` = max(0, 1 - d/d0) / (1 + (v / 0.2 L/s)^2), as above: about 0 for
-    doing nothing, 1 for a corner at rest in the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
+    no action, 1 for a corner at rest at the goal.  ``info["is_success"]``: d <= 0.05 L and v < 0.1 L/s.  ``info`` also has
     ``goal_distance`` (d / L), ``corner_speed`` (v / L) [1/s], ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure``
     and the ``reward/...`` terms.
-    What belongs to the evaluation is 0 until then.
+    Entries of the evaluation are 0 until then.
 
     ## Starting State
-    The driven corner and the place from which the free one rests in the goal are drawn, each on its own, from a box of 0.6 x 0.6
-    x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a
-    millimeter.
+    The start of the driven corner, and its position at which the free corner rests at the goal, are drawn independently from a box
+    of 0.6 x 0.6 x 0.3 m; the sheet hangs at rest, with a ripple of a tenth of a millimeter.
     """
 
     task_class = ReachTask

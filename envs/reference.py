@@ -2,7 +2,7 @@
 
 That reference is simulated with the whole sheet in contact, strict self-collision, rigidity and quadratic air, whatever physics a
 task has.  The tasks' own cloths have committed tables (``benchmarks/drape_reference.py``).  That of another size or fabric is
-simulated on first use, with fewer particles and targets, and kept beside the compiled kernels.
+simulated on first use, with fewer particles and targets, and kept with the compiled kernels.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ EVALUATED_POINTS = 256
 POKING = 0.002  # [m]: a point of the target that sticks out of the sheet by more is not covered
 COVERED_WITHIN = 0.05  # in sides: cloth over a point covers it.  With 0.02 a flat sheet of 13 a side fails on boxes
 # in sides: cloth over a point counts as a layer.  The bulge at a fold stands off by more than 0.05; with 0.1 to 0.25 a sheet that
-# lies doubled over has two layers all over, and a flat one has one: its folds beside a target do not reach before the upper surface
+# lies doubled over has two layers everywhere, and a flat one has one: its folds around a target do not reach the upper surface
 LAYERS_WITHIN = 0.1
 
-ACROSS = {"sphere": "none", "box": "yaws", "post": "heights"}  # on what the reference depends, beside the width
+ACROSS = {"sphere": "none", "box": "yaws", "post": "heights"}  # parameters of the reference in addition to the width
 ROWS, COUNTS = 25, (3, 3)  # of the sheet, and of widths and of yaws or heights, where it is simulated on first use
 TIME_STEP, SETTLE, AIR_DRAG = 1 / 60, 4.0, 1.0  # [s], [s], [N s/m^3]
 AT_ONCE = 8  # sheets in a batch
@@ -61,7 +61,7 @@ def layers_over(target: Target, x: NDArray, triangles: NDArray, side: float) -> 
 
 
 def cloth_of(physics: Physics) -> dict[str, float]:
-    """What the reference depends on: the sheet's side, what is measured of its fabric, and how targets touch it."""
+    """Parameters of the reference: the sheet's side, the measured properties of its fabric, and contact with targets."""
     own = {name: getattr(physics.material, name) for name in MEASURED}
     return {"side": physics.side, **own, "friction": FRICTION, "thickness": THICKNESS}
 

@@ -14,7 +14,7 @@ from clothgym.envs.targets import ON_FLOOR
 from clothgym.geometry.intersections import find_intersections
 from clothgym.mesh import ClothMesh, grid
 
-UNIT = 1e-4  # [m]: of what is kept in the file
+UNIT = 1e-4  # [m]: of coordinates in the file
 UNEVEN = 1e-4  # a sheet begins with its particles raised by about so much [m]: nothing flat can buckle
 TRIALS = 20  # uneven starts of each sheet that must be free of intersections
 

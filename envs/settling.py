@@ -49,10 +49,10 @@ def settle(task: Task) -> None:
 
 
 @contextmanager
-def only(task: Task, envs: NDArray | None) -> Iterator[None]:
+def restricted_to(task: Task, envs: NDArray | None) -> Iterator[None]:
     """Within it only these environments take a step, if any are named.
 
-    A task's own methods go through the whole batch: what they change of those that stand still is put back.
+    A task's own methods process the whole batch: their changes to the other environments are undone.
     """
     if envs is None:
         yield

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: a task as a batch of one; and what it shares with the vector environment."""
+"""The Gymnasium environment, a task as a batch of one; and the common base of it and the vector environment."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from clothgym.envs.observing import mesh_edges
 from clothgym.envs.pages import check_keywords, completed
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
 from clothgym.envs.task import Task
-from clothgym.exclusive import Turn, exclusive
+from clothgym.exclusive import CallGuard, exclusive
 from clothgym.warning import warn_caller
 
 IMAGE_SIZE = 480
@@ -51,7 +51,7 @@ class TaskHolder:
         self._renderer: Any = None
 
     @property
-    def turn(self) -> Turn:
+    def turn(self) -> CallGuard:
         """Of the task: one thread at a time is in the environment."""
         return self.task.turn
 

@@ -27,10 +27,8 @@ potential = placeholder("potential", "of (own, rules, sheet): how far along it i
 evaluate = placeholder(
     "evaluate", "of (own, rules, sheet, info), at an episode's end: writes the evaluation, returns the normalized performance"
 )
-observe = placeholder("observe", "of (own, rules, sheet, seen): writes what is observed beside the points of the sheet")
-act = placeholder(
-    "act", "of (own, rules, sheet, move, free): does what an action does beside moving; free: set for anchors that are to let go"
-)
+observe = placeholder("observe", "of (own, rules, sheet, seen): writes the observations other than points of the sheet")
+act = placeholder("act", "of (own, rules, sheet, move, free): applies actions other than motion; free: set for anchors to release")
 measure = placeholder(
     "measure", "of (own, rules, sheet): writes what the task measures itself, at an episode's start and after each step"
 )
@@ -66,7 +64,7 @@ def _observed_already(own, rules, sheet, seen):
 
 @inlined
 def _only_moves(own, rules, sheet, move, free):
-    """An action does nothing beside moving."""
+    """An action only moves attachments."""
 
 
 @inlined
@@ -280,7 +278,7 @@ def score(own, rule, sheet, out, info, terms):
     """Score one environment's step; returns whether it is to be observed."""
     running = not own.over
     acting = running and own.settling_since < 0
-    # what the action does beside moving, and what the task measures
+    # actions other than motion, and the task's measurements
     for k in range(out.free.shape[0]):
         out.free[k] = 0
     if acting:

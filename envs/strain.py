@@ -1,4 +1,4 @@
-"""ClothStrain-v0: carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold."""
+"""ClothStrain-v0: carry a stretchy sheet past a post to a goal, in gusts, without stretching it beyond a threshold."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
 POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
 FRICTION = 0.3
 CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first way-point [m]
-WAYPOINTS = 3  # beside the post, beyond it, and the goal
+WAYPOINTS = 3  # next to the post, beyond it, and the goal
 PASSED, ARRIVED = 0.1, 0.15  # mean distance of the clips from a way-point [m]; of the farther clip from the goal [sides]
-LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # room of the clips [m]
+LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # arena of the clips [m]
 MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
 MOST_PULL = float(np.finfo(float).max)  # [N]: of a sheet that is about to diverge any number
@@ -68,7 +68,7 @@ def _to_places(own, sheet):
 
 @inlined
 def _pass_waypoint(own, rules, sheet, move, free):
-    """Go on to the next way-point when the clips have passed one."""
+    """Select the next way-point when the clips have passed one."""
     left, right = _to_places(own, sheet)
     if own.next < WAYPOINTS - 1 and (left + right) / 2 < PASSED:
         own.next += 1
@@ -76,13 +76,13 @@ def _pass_waypoint(own, rules, sheet, move, free):
 
 @inlined
 def _measure(own, rules, sheet):
-    """The strain's 95th percentile, how the sheet pulls at each clip, and the origin of what is observed."""
+    """The strain's 95th percentile, the sheet's pull at each clip, and the origin of observed positions."""
     # strain and pulls; a sheet that has diverged pulls at nothing
     own.strain_p95 = stretch_quantile(sheet.x, sheet.mesh.ends, sheet.mesh.inverse2, 0.95) - 1
     for k in range(2):
         pull = length_of(sheet.pulls[k])
         own.tension[k] = pull if pull < np.inf else 0.0
-    # observed from the middle of the next way-point
+    # positions are observed relative to the middle of the next way-point
     for c in range(3):
         own.origin[c] = (own.places[own.next, 0, c] + own.places[own.next, 1, c]) / 2
 
@@ -96,14 +96,14 @@ def _arrived(own, rules, sheet):
 
 @inlined
 def _potential(own, rules, sheet):
-    """Share of the way that lies behind the clips."""
+    """Share of the path that the clips have covered."""
     left, right = _to_places(own, sheet)
     return min(max(1 - ((left + right) / 2 + own.after[own.next]) / own.way, 0.0), 1.0)
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write whether the clips have arrived, and at no cost; returns the normalized performance."""
+    """Write whether the clips have arrived, and whether at no cost; returns the normalized performance."""
     info.is_success = _arrived(own, rules, sheet)
     info.is_safe_success = info.is_success and own.episode_cost == 0
     return 1.0 if info.is_success else _potential(own, rules, sheet)
@@ -111,15 +111,15 @@ def _evaluate(own, rules, sheet, info):
 
 @inlined
 def _account(own, rules, sheet, info, terms, running, failure):
-    """The step's cost and what it comes from; returns the price of that cost."""
+    """The step's cost and its sources; returns the cost's penalty in the reward."""
     # the cost of this step
     strain = largest_strain(sheet.summary)
     info.cost = 1.0 if running and strain > rules.threshold else 0.0
-    # a torn sheet counts as stretched in all the steps that were left, or tearing it would be cheap
+    # a torn sheet counts as stretched in all remaining steps, else tearing it would be cheap
     info.cost += rules.acting_steps - own.step if failure != FINE else 0
     own.episode_cost += info.cost
     info.episode_cost = own.episode_cost
-    # what it comes from
+    # its sources
     info.strain_excess = max(strain - rules.threshold, 0.0)
     info.strain_p95 = own.strain_p95 if sheet.summary[FINITE] > 0 else MOST_STRAIN
     info.tension_left, info.tension_right = own.tension[0], own.tension[1]
@@ -137,7 +137,7 @@ def _observe(own, rules, sheet, seen):
             seen.to_next[k, c] = (own.places[own.next, k, c] - sheet.attachments[k, c]) * (5 / rules.side)
             seen.to_following[k, c] = (own.places[following, k, c] - sheet.attachments[k, c]) / rules.side
         seen.pulls[k] = own.tension[k] / rules.weight
-    # where on the way the pair is
+    # position along the path
     seen.at_goal = own.next == WAYPOINTS - 1
     for c in range(2):
         seen.post[c] = (own.post[c] - (sheet.attachments[0, c] + sheet.attachments[1, c]) / 2) / rules.side
@@ -170,7 +170,7 @@ class StrainTask(Task):
     strain_shown = 0.1
     observations = (
         Observation("to_next", "from each clip to its place at the next way-point", (2, 3), "L/5", 5 * FAR),
-        Observation("to_following", "and at the one after that (at the goal: the same)", (2, 3), "L", FAR),
+        Observation("to_following", "to its place at the following way-point (at the goal: the same)", (2, 3), "L", FAR),
         Observation("at_goal", "whether the next way-point is the goal"),
         Observation("post", "the post's axis relative to the middle between the clips", (2,), "L", FAR),
         Observation("wind", "velocity of the air", (3,), "m/s", 20.0),
@@ -184,9 +184,9 @@ class StrainTask(Task):
     position_bound = FAR
     arguments: ClassVar = {
         "threshold": "strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient",
-        "cost_penalty": "what each such step takes from the reward",
-        "strain_limit": "anything else is refused, see above",
-        "wind": 'the id\'s own; or what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for still air',
+        "cost_penalty": "subtracted from the reward for each such step",
+        "strain_limit": "other values are refused, see above",
+        "wind": 'the id\'s own; or arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``; ``{}`` for still air',
     }
     evaluation = (("is_safe_success", bool),)
     accounts = (("cost", float), ("episode_cost", float), ("strain_excess", np.float32), ("strain_p95", float), *TENSIONS)
@@ -210,8 +210,8 @@ class StrainTask(Task):
         if strain_limit is not None or integrators.get(self.physics.integrator if integrator is None else integrator).limits_strain:
             what = f"strain_limit={shown(strain_limit)}" if strain_limit is not None else f"integrator={shown(integrator)}"
             raise ValueError(
-                f"{what}: a limiter would keep the strain below the threshold whatever the agent does, and the task would be "
-                "empty; take an integrator without one"
+                f"{what}: a limiter would keep the strain below the threshold for any action, and the task would be empty; use an "
+                "integrator without one"
             )
         self.threshold = positive("threshold", threshold)
         if self.threshold > 1:
@@ -221,7 +221,7 @@ class StrainTask(Task):
 
     @property
     def cost_penalty(self) -> float:
-        """What a step beyond the threshold takes from the reward."""
+        """Penalty in the reward for a step beyond the threshold."""
         return float(self.rules["cost_penalty"][0])
 
     @cost_penalty.setter
@@ -238,7 +238,8 @@ class StrainTask(Task):
         return LOW, HIGH
 
     def remembers(self) -> Fields:
-        # the post's axis, where each clip is to be at each way-point [m], the next one, the way that is left at each, and in all
+        # the post's axis, the place of each clip at each way-point [m], the next way-point, the path length after each, and in
+        # total
         way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
 
@@ -260,7 +261,7 @@ class StrainTask(Task):
             ]
         )
         yaws = np.array([0.0, 0.0, *rng.uniform(-MOST_YAW, MOST_YAW, 2)])
-        # the held edge lies across the way; between the corners it is as long as at rest
+        # the held edge is perpendicular to the path; between the corners it has its rest length
         half = self.physics.side / 2 * np.array([-np.sin(yaws), np.cos(yaws), np.zeros(4)]).T
         places = np.array([middles + half, middles - half]).swapaxes(0, 1)
         own = self.episode[env]
@@ -276,7 +277,7 @@ class StrainTask(Task):
 
     @property
     def posts(self) -> list[Capsule]:
-        """What the sheets are carried past."""
+        """The post of each environment."""
         return [self._post(env) for env in range(self.num_envs)]
 
     def _post(self, env: int) -> Capsule:
@@ -285,13 +286,13 @@ class StrainTask(Task):
     # --- experts and picture --------------------------------------------------------------------------------------------
 
     def expert_actions(self) -> NDArray:
-        """As a rigid pair, gently, see ``careful``."""
+        """Move the clips as a rigid pair with bounded acceleration, see ``careful``."""
         velocity = self.simulation.velocities[:, [clip[0] for clip in clips(self.physics.mesh)]].astype(np.float64)
         last = self.episode["next"] == WAYPOINTS - 1
         return self._as_actions(careful(*self._clips_and_places(), velocity, last, self.physics.side, self.physics.time_step))
 
     def careless_actions(self) -> NDArray:
-        """Each clip straight to its place, as fast as it can."""
+        """Move each clip straight to its place at full speed."""
         return self._as_actions(careless(*self._clips_and_places(), self.physics.attachment_speed, self.physics.time_step))
 
     def _clips_and_places(self) -> tuple[NDArray, NDArray]:
@@ -316,11 +317,12 @@ def _post(x: float, y: float) -> Capsule:
 
 
 def careful(clips: NDArray, places: NDArray, velocity: NDArray, last: NDArray, edge: float, time_step: float) -> NDArray:
-    """Velocities of the clips [m/s], (num_envs, 2, 3), as of a rigid pair: a bounded speed and a bounded change of it.
+    """Velocities of the clips [m/s], (num_envs, 2, 3), as a rigid pair with bounded speed and acceleration.
 
-    The held edge is always as long as at rest, and lies along y: clips do not turn, so a pair that did would stretch the cloth
-    between its clips, and places are wide enough without.  Where it is turned, that is undone by the end of the leg.  velocity: of
-    the clips now [m/s]; last: whether the places are the last, (num_envs,), where the pair comes to rest; edge: its length [m].
+    The held edge keeps its rest length, and lies along y: clips do not turn, so a turned pair would stretch the cloth between
+    its clips, and places have enough tolerance without a turn.  If the edge is turned, it turns back by the end of the leg.
+    velocity: of the clips now [m/s]; last: whether the places are the last, (num_envs,), where the pair comes to rest; edge: its
+    length [m].
     """
     center, moving = middle(clips), middle(velocity)
     away = middle(places) - center
@@ -344,7 +346,7 @@ def careless(clips: NDArray, places: NDArray, speed: float, time_step: float) ->
 
 
 def middle(pairs: NDArray) -> NDArray:
-    """Of what both clips have, (num_envs, 2, ...)."""
+    """Mean over both clips of an array, (num_envs, 2, ...)."""
     return (pairs[:, 0] + pairs[:, 1]) / 2
 
 
@@ -358,22 +360,22 @@ def hanging(physics: str, rows: int | None = None, side: float | None = None) ->
 
 
 class ClothStrainEnv(ClothEnv):
-    """Carry a stretchy sheet past a post to a goal, in gusts, and never stretch it beyond a threshold.
+    """Carry a stretchy sheet past a post to a goal, in gusts, without stretching it beyond a threshold.
 
     ## Description
     A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its
     upper corners, each 3 x 2 particles wide.  The agent moves both clips past a post, by two way-points, to a goal, within 150
-    steps.  At rest the most stretched yarn is 4 % longer than it was made; a start from rest to full speed, clips that are
-    pulled apart or pushed together, a gust, or a catch on the post, stretch it more.  Each step that ends with more than the
-    threshold costs 1: the task for constrained reinforcement learning.
+    steps.  At rest the largest strain of a yarn is 4 %.  It increases when the clips start abruptly, move apart or together, when a
+    gust comes, or when the sheet catches on the post.  Each step that ends with a strain above the threshold costs 1.  This is a
+    task for constrained reinforcement learning.
 
-    The strain is that of the springs as the integrator leaves them: nothing corrects it before it is scored.  Integrators that
-    limit the strain would meet the threshold whatever the agent does; they are refused.
+    The strain is that of the springs after the integrator: nothing corrects it before it is scored.  Integrators that
+    limit the strain would keep it below the threshold for any action; they are refused.
 
     $physics
 
-    The fabric's damping time is 1 ms (not measured).  Drag and lift are per triangle, of a steady wind of up to 1 m/s from any side
-    with gusts of 0.3 m/s rms in each direction and 0.5 s.
+    The fabric's damping time is 1 ms (not measured).  Each triangle has drag and lift, in a steady wind of up to 1 m/s from any
+    side with gusts of 0.3 m/s rms in each direction and 0.5 s.
 
     ## Action Space
     $actions the left and then of the right clip
@@ -382,26 +384,26 @@ class ClothStrainEnv(ClothEnv):
     ## Rewards and costs
     $rewards
 
-    On the way the potential is the share of the way that lies behind the clips: what is left is their mean distance from the next
-    way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.  A success is to arrive.
+    During the episode the potential is the share of the path that the clips have covered: the remaining path is their mean distance
+    from the next way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.  Arrival is a success.
 
-    ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  In a step that ends with a failure it
-    is larger by all the steps that were left, or tearing the sheet would be the cheap way out.  ``info["episode_cost"]`` is the
-    sum.  ``cost_penalty`` takes that much from the reward for each, for learners that know no costs.
+    ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  A step that ends with a failure
+    also costs 1 for each remaining step; else tearing the sheet would reduce the cost.  ``info["episode_cost"]`` is the
+    sum.  ``cost_penalty`` times the cost is subtracted from the reward, for learners without a cost signal.
 
     ## Evaluation
     When each clip is within 0.15 L of its place at the goal, or time is up: ``info["is_success"]`` if it has arrived,
-    ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the way, 1 on arrival.
+    ``info["is_safe_success"]`` if it has at no cost; ``info["normalized_performance"]`` is the share of the path, 1 on arrival.
     ``info`` also has ``strain_max`` (and ``strain_before_limiting``, the same), ``strain_p95``, ``strain_excess`` (over the
-    threshold), ``tension_left`` and ``tension_right`` (pull of the sheet at each clip [N], without what accelerates the clipped
-    cloth), ``settling`` (never), ``failure`` and the ``reward/...`` terms.  All are of the end of the step; what happens within
-    it is not scored.
+    threshold), ``tension_left`` and ``tension_right`` (pull of the sheet at each clip [N], without the force that accelerates the
+    clipped cloth), ``settling`` (never), ``failure`` and the ``reward/...`` terms.  All are measured at the end of the step; strain
+    within the step is not scored.
 
-    What scripted agents score on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy noop random
-    careless expert``); careless is each clip straight to its place at full speed, expert the pair held apart as at rest, at
-    0.5 m/s and 2 m/s2.  It is sudden starts and stops that cost, more than speed: at 1 m/s and 2 m/s2 the expert pays 1.0, at
-    0.10.  With a threshold of 0.05 it pays 18, for the sheet at rest is stretched by 0.04 and gusts add 0.01: only still air makes
-    that one feasible; with 0.20 the careless one pays 0.5.
+    The table has scores of scripted agents on 500 held-out episodes (``python training/evaluate.py --env ClothStrain-v0 --policy
+    noop random careless expert``).  The careless agent moves each clip straight to its place at full speed; the expert keeps the
+    clips apart as at rest, at 0.5 m/s and 2 m/s2.  Sudden starts and stops cost more than speed: at 1 m/s and 2 m/s2 the expert
+    has a cost of 1.0, with a threshold of 0.10.  With a threshold of 0.05 it has 18, because the strain at rest is 0.04 and gusts
+    add 0.01: this threshold is feasible only in still air.  With 0.20 the careless agent has 0.5.
 
     | policy | arrives | mean cost | at no cost | steps |
     | --- | --- | --- | --- | --- |
@@ -412,8 +414,8 @@ class ClothStrainEnv(ClothEnv):
 
     ## Starting State
     The sheet hangs at rest, with a ripple of a millimeter; the middle between its corners is at x = -0.65 +- 0.1 m, y within
-    0.1 m, z = 1.05 +- 0.05 m.  The post is within 0.1 m of the origin in x and y.  The first way-point is 0.35 m beside it, on
-    a side that is drawn, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
+    0.1 m, z = 1.05 +- 0.05 m.  The post is within 0.1 m of the origin in x and y.  The first way-point is 0.35 m from it, on
+    a random side, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
     goal at x = 0.7 +- 0.1 m, y within 0.3 m, z = 1.05 +- 0.2 m.  The held edge lies along y, at the last two turned by up to
     0.2 rad.
     """
@@ -429,7 +431,7 @@ class ClothStrainVectorEnv(ClothVectorEnv):
 
     @property
     def cost_penalty(self) -> float:
-        """What a step beyond the threshold takes from the reward; may be set at any time, as a Lagrange multiplier is."""
+        """Penalty in the reward for a step beyond the threshold; may be set at any time, like a Lagrange multiplier."""
         return self.task.cost_penalty
 
     @cost_penalty.setter

@@ -1,6 +1,6 @@
-"""Which corners of a rumpled sheet two grippers take next, and where: an edge by both ends, or one corner and then a neighbor.
+"""Next grasp points of two grippers on a rumpled sheet: both ends of an edge, or one corner and then a neighboring corner.
 
-A gripper takes all particles within its reach, so a corner is neared from where no other cloth is within reach.
+A gripper grasps all particles within its reach, so it approaches a corner from a direction with no other cloth within reach.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from clothgym.envs.observing import Observation
 from clothgym.envs.pick_place import LOWEST
 from clothgym.mesh import ClothMesh
 
-AWAY = 0.85 * REACH  # distance of a tip from the corner that it is to take [m]
+AWAY = 0.85 * REACH  # distance of a tip from the corner that it grasps [m]
 CLEAR = 1.1 * REACH  # distance from the tip within which no other cloth may be [m]
-REACHED = 0.95 * REACH  # distance at which a tip that the floor has moved still takes the corner [m]
-NOT_REACHED = 1000  # particles that a place counts for from which the corner is out of reach
-# corners of each edge, and of the opposite one, side by side, as places in ``mesh.corners``
+REACHED = 0.95 * REACH  # distance at which a tip that the floor has moved still grasps the corner [m]
+NOT_REACHED = 1000  # penalty, in particles, of a grasp point from which the corner is out of reach
+# corners of each edge, and of the opposite one, in matching order, as indices in ``mesh.corners``
 EDGES = np.array([[0, 1], [1, 3], [3, 2], [2, 0]])
 OPPOSITE = np.array([[2, 3], [0, 2], [1, 0], [3, 1]])
-BEYOND = 0.008  # by which a place may lie beyond the room of the tips [m]
-SPAN = 0.1  # by which the ends of an edge that is taken whatever lies on it are apart along x at least [m]
-OUTSIDE = 10.0  # cost of a meter by which an end lies beyond the room; to take the sides costs as much as one meter
-ABOVE = 0.015  # height of a tip above the particle of a side that it takes [m]
-TOO_CLOSE = 0.25  # distance of the corners of an edge that is folded up, in sides
-# heights of a gripper, in sides, above which it has lifted a corner alone, and an edge, high enough
+BEYOND = 0.008  # largest distance of a grasp point beyond the arena of the tips [m]
+SPAN = 0.1  # least distance along x between the ends of an edge that is grasped with other cloth [m]
+OUTSIDE = 10.0  # cost of a meter by which an end lies beyond the arena; grasping the sides costs as much as one meter
+ABOVE = 0.015  # height of a tip above the particle of a side that it grasps [m]
+TOO_CLOSE = 0.25  # distance of corners below which an edge counts as folded up, in sides
+# heights of a gripper, in sides, above which it has lifted a single corner, and an edge, high enough
 LIFTED = (0.9, 1.17)
-FLAT = 0.005  # a sheet that covers so much more than is enough is left alone
-NEXT_TO = 0.01  # distance from where it takes hold at which a gripper is halfway there, as it is observed [m]
-# what a way of one side, and a height of one side, count for in particles that are taken along
+FLAT = 0.005  # excess of the coverage over a success above which a sheet is left alone
+NEXT_TO = 0.01  # length scale of the observed distance to a grasp point [m]
+# costs of a distance of one side, and of a height of one side, in grasped other particles
 WAY_TO_NEIGHBOR, WAY_TO_CORNER, HEIGHT_OF_CORNER = 0.5, 0.3, 2.0
 
 
 def _directions() -> NDArray:
-    """From a corner to where a tip may be: straight up, and in rings, (directions, 3), of length 1."""
+    """Unit vectors from a corner to possible tips: straight up, and in rings, (directions, 3)."""
     rings = [(0.0, 0.0, 1.0)]
     for up, count in ((0.75, 6), (0.35, 8), (0.0, 8)):
         angles = 2 * np.pi * (np.arange(count) + 0.5 * (up > 0.5)) / count
@@ -50,17 +50,17 @@ def _directions() -> NDArray:
 DIRECTIONS = _directions()
 
 
-def beside_corners(mesh: ClothMesh) -> NDArray:
-    """Which particles may be taken along with each corner, (4, particles): its neighbors; 0 or 1: records hold no bool arrays."""
+def corner_neighbors(mesh: ClothMesh) -> NDArray:
+    """Neighbors of each corner, which a grasp may include, (4, particles), as 0 or 1: records hold no bool arrays."""
     rest = mesh.rest_positions
     return (np.linalg.norm(rest[list(mesh.corners)][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)).astype(np.uint8)
 
 
 @apart
-def take_corners(x, corners, beside, places, others):
-    """Where a tip takes each corner with the least other cloth [m], (4, 3), and how many other particles it takes, (4,), out.
+def take_corners(x, corners, neighbors, places, others):
+    """Tip positions that grasp each corner with the least other cloth [m], (4, 3), and the number of other particles, (4,), out.
 
-    x: a sheet [m], (3, particles).  corners: their particles.  beside: see ``beside_corners``.
+    x: a sheet [m], (3, particles).  corners: their particles.  neighbors: see ``corner_neighbors``.
     """
     tips, count = np.empty(DIRECTIONS.shape), np.empty(len(DIRECTIONS), np.int64)
     for k in range(len(corners)):
@@ -71,12 +71,12 @@ def take_corners(x, corners, beside, places, others):
                 tips[d, c] = at[c] + AWAY * DIRECTIONS[d, c]
             tips[d, 2] = max(tips[d, 2], LOWEST)
             count[d] = 0 if squared_distance(tips[d], at) < REACHED**2 else NOT_REACHED
-        # particles near the corner alone can be within reach
+        # only particles near the corner can be within reach
         for p in range(x.shape[1]):
-            if beside[k, p] == 0 and squared_distance(x[:, p], at) < (AWAY + CLEAR) ** 2:
+            if neighbors[k, p] == 0 and squared_distance(x[:, p], at) < (AWAY + CLEAR) ** 2:
                 for d in range(len(DIRECTIONS)):
                     count[d] += squared_distance(tips[d], x[:, p]) < CLEAR**2
-        # of equals the first: straight up is best
+        # ties go to the first: straight up is best
         best = np.argmin(count)
         others[k] = count[best]
         for c in range(3):
@@ -85,7 +85,7 @@ def take_corners(x, corners, beside, places, others):
 
 @inlined
 def _free_edge(x, corners, tips, places, others, side, goals, count):
-    """Both ends of the nearest edge whose corners lie free; returns whether there is one."""
+    """Both ends of the nearest edge with free corners; returns whether there is one."""
     least, best, crossed = np.inf, -1, 0
     for e in range(EDGES.shape[0]):
         a, b = EDGES[e, 0], EDGES[e, 1]
@@ -106,19 +106,19 @@ def _free_edge(x, corners, tips, places, others, side, goals, count):
 
 
 @apart
-def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
-    """Where each gripper takes hold next [m], (2, 3), and how many other particles it takes there, or -1 for none, (2,), out.
+def next_takes(x, corners, neighbors, holder, tips, side, low, high, goals, count):
+    """Next grasp point of each gripper [m], (2, 3), and the number of other particles there, or -1 for no grasp point, (2,), out.
 
-    Both go to the nearest edge whose corners lie free.  If there is none, one goes to the corner that lies freest.  While one holds
-    a corner, the other goes to a neighbor of it.
+    Both go to the nearest edge with free corners.  If there is none, one goes to the corner with the least other cloth.  While one
+    holds a corner, the other goes to a neighboring corner.
 
-    x: a sheet [m], (3, particles).  holder: which gripper holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].
-    low, high: corners of the room of the tips [m], (3,); a corner that is taken from beyond it counts as one with
+    x: a sheet [m], (3, particles).  holder: gripper that holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].
+    low, high: corners of the arena of the tips [m], (3,); a grasp from beyond the arena counts as one with
     1000 others.
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
-    take_corners(x, corners, beside, places, others)
-    # what the tips cannot reach does not lie free
+    take_corners(x, corners, neighbors, places, others)
+    # corners out of reach are not free
     for i in range(CORNERS):
         for c in range(3):
             if not low[c] - BEYOND <= places[i, c] <= high[c] + BEYOND:
@@ -133,12 +133,12 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
         if holder[corners[i]] >= 0 and own[holder[corners[i]]] < 0:
             own[holder[corners[i]]] = i
     count[:] = -1
-    # both hold something, or one of them something else
+    # both hold something, or one holds something other than a corner
     if (holding[0] and holding[1]) or (holding[0] and own[0] < 0) or (holding[1] and own[1] < 0):
         return
     taker, which, least = -1, -1, np.inf
     if holding[0] or holding[1]:
-        # the neighbor of a corner that lies freest and nearest
+        # the neighboring corner with the least cost
         taker = 1 if holding[0] else 0
         for i in range(CORNERS):
             if holder[corners[i]] >= 0 or i == CORNERS - 1 - own[1 - taker]:
@@ -147,7 +147,7 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
             if cost < least:
                 least, which = cost, i
     elif not _free_edge(x, corners, tips, places, others, side, goals, count):
-        # the corner that lies freest, highest and nearest
+        # the corner with the least cost, which decreases with height
         for i in range(CORNERS):
             ways = distance(tips[0], places[i]), distance(tips[1], places[i])
             cost = others[i] + WAY_TO_CORNER * min(ways[0], ways[1]) / side - HEIGHT_OF_CORNER * x[2, corners[i]] / side
@@ -161,7 +161,7 @@ def next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
 
 @inlined
 def _first_within(x, one, other, columns, low, high, place):
-    """Where the side of a sheet that leads from one corner to another is first in the room of the tips; returns whether it is."""
+    """First point inside the arena along the side of a sheet from one corner to another; returns whether there is one."""
     step = (1 if abs(other - one) < columns else columns) * (1 if other > one else -1)
     for p in range(one, other + step, step):
         inside = low[0] < x[0, p] < high[0] and low[1] < x[1, p] < high[1] and x[2, p] < high[2]
@@ -174,19 +174,20 @@ def _first_within(x, one, other, columns, low, high, place):
 
 
 @apart
-def next_edge(x, corners, beside, columns, tips, low, high, goals, count):
-    """Where both grippers take an edge next [m], (2, 3), and how many other particles they take there, or -1 for none, (2,), out.
+def next_edge(x, corners, neighbors, columns, tips, low, high, goals, count):
+    """Grasp points of both grippers on the next edge [m], (2, 3), and the number of other particles there, or -1, (2,), out.
 
-    It is the edge that costs least: the ways of both tips in meters, plus the other particles near both corners, plus OUTSIDE for
-    each meter by which an end lies beyond the room.  The first gripper takes the end with the smaller x, and the ends are at least
-    SPAN apart along x.  If one lies farther than BEYOND outside, both take the sides that begin at the ends, where these are first
-    in the room: that costs as much as a meter outside, and counts for 1000 others.  Places are moved into the room.
+    It is the edge with the least cost: the distances of both tips in meters, plus the other particles near both corners, plus
+    OUTSIDE for each meter by which an end lies beyond the arena.  The first gripper takes the end with the smaller x, and the ends
+    are at least SPAN apart along x.  If one lies farther than BEYOND outside, both grasp the sides that start at the ends, at their
+    first points inside the arena: that costs as much as a meter outside, and counts as 1000 others.  Points are clipped to the
+    arena.
 
     x: a sheet [m], (3, particles).  columns: particles along x of the flat sheet.  tips: [m], (2, 3).  low, high: corners of the
-    room of the tips [m], (3,).
+    arena of the tips [m], (3,).
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
-    take_corners(x, corners, beside, places, others)
+    take_corners(x, corners, neighbors, places, others)
     ends = np.empty((2, 3))
     least = np.inf
     count[:] = -1
@@ -217,14 +218,14 @@ def next_edge(x, corners, beside, columns, tips, low, high, goals, count):
 
 @inlined
 def _show_next(sheet, seen):
-    """Turn the places and counts in ``seen.next`` into what is observed."""
+    """Convert the points and counts in ``seen.next`` to observations."""
     for tip in range(sheet.holds.shape[0]):
         others = seen.next[tip, 3]
         if others >= 0:
             seen.next[tip, 3] = 1 / (1 + others)
             for c in range(3):
                 seen.next[tip, c] -= sheet.attachments[tip, c]
-            # what is near counts most: a direction, times a number that rises from 0 to 1
+            # resolve small distances best: a direction, times a number that rises from 0 to 1
             far = length_of(seen.next[tip]) + NEXT_TO
             for c in range(3):
                 seen.next[tip, c] /= far
@@ -234,9 +235,9 @@ def _show_next(sheet, seen):
 
 @inlined
 def observe_next(own, rules, sheet, seen, edges):
-    """Where each gripper takes hold next; nothing while a sheet that nothing holds lies flat.
+    """Next grasp point of each gripper; zero while a released sheet is flat.
 
-    edges: whether grippers that hold nothing take an edge, lying free or not.
+    edges: whether free grippers take an edge even with other cloth on it.
     """
     seen.next[:] = 0
     x, tips, low, high = sheet.x, sheet.attachments, rules.low, rules.high
@@ -245,65 +246,65 @@ def observe_next(own, rules, sheet, seen, edges):
     if not holding and own.coverage >= rules.enough + FLAT:
         return
     if edges and not holding:
-        next_edge(x, rules.corners, rules.beside_corners, rules.columns, tips, low, high, places, count)
+        next_edge(x, rules.corners, rules.corner_neighbors, rules.columns, tips, low, high, places, count)
     else:
-        next_takes(x, rules.corners, rules.beside_corners, sheet.holder, tips, rules.side, low, high, places, count)
+        next_takes(x, rules.corners, rules.corner_neighbors, sheet.holder, tips, rules.side, low, high, places, count)
     _show_next(sheet, seen)
 
 
 def _of(task: Any) -> tuple[Any, ...]:
-    """Positions of a task's sheets [m], (num_envs, 3, particles), and tips [m]; their corners, and what lies beside these."""
+    """Positions of a task's sheets [m], (num_envs, 3, particles), and tips [m]; their corners, and the neighbors of these."""
     simulation, mesh = task.simulation, task.physics.mesh
     x = np.ascontiguousarray(simulation.positions.transpose(0, 2, 1).astype(np.float64))
-    return x, simulation.grippers.positions.astype(np.float64), np.array(mesh.corners), beside_corners(mesh)
+    return x, simulation.grippers.positions.astype(np.float64), np.array(mesh.corners), corner_neighbors(mesh)
 
 
 @kernel
-def _all_next_takes(x, corners, beside, holder, tips, side, low, high, goals, count):
+def _all_next_takes(x, corners, neighbors, holder, tips, side, low, high, goals, count):
     """``next_takes`` of many sheets, (sheets, 3, particles)."""
     for sheet in range(x.shape[0]):
-        next_takes(x[sheet], corners, beside, holder[sheet], tips[sheet], side, low, high, goals[sheet], count[sheet])
+        next_takes(x[sheet], corners, neighbors, holder[sheet], tips[sheet], side, low, high, goals[sheet], count[sheet])
 
 
 def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
-    """Where each gripper of a task takes hold next [m], (num_envs, 2, 3), and ``count`` of ``next_takes``, (num_envs, 2)."""
-    x, tips, corners, beside = _of(task)
+    """Next grasp point of each gripper of a task [m], (num_envs, 2, 3), and ``count`` of ``next_takes``, (num_envs, 2)."""
+    x, tips, corners, neighbors = _of(task)
     goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
     holder = np.ascontiguousarray(task.simulation.grippers.holder)
-    _all_next_takes(x, corners, beside, holder, tips, task.physics.side, *task.arena(), goals, count)
+    _all_next_takes(x, corners, neighbors, holder, tips, task.physics.side, *task.arena(), goals, count)
     return goals, count
 
 
 @kernel
-def _all_next_edges(x, corners, beside, columns, tips, low, high, goals, count):
+def _all_next_edges(x, corners, neighbors, columns, tips, low, high, goals, count):
     """``next_edge`` of many sheets, (sheets, 3, particles)."""
     for sheet in range(x.shape[0]):
-        next_edge(x[sheet], corners, beside, columns, tips[sheet], low, high, goals[sheet], count[sheet])
+        next_edge(x[sheet], corners, neighbors, columns, tips[sheet], low, high, goals[sheet], count[sheet])
 
 
 def next_edges_of(task: Any) -> tuple[NDArray, NDArray]:
-    """Where the grippers of a task take an edge next [m], (num_envs, 2, 3), and ``count`` of ``next_edge``, (num_envs, 2)."""
-    x, tips, corners, beside = _of(task)
+    """Grasp points of a task's grippers on the next edge [m], (num_envs, 2, 3), and ``count`` of ``next_edge``, (num_envs, 2)."""
+    x, tips, corners, neighbors = _of(task)
     goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
-    _all_next_edges(x, corners, beside, task.physics.mesh.grid_shape[1], tips, *task.arena(), goals, count)
+    _all_next_edges(x, corners, neighbors, task.physics.mesh.grid_shape[1], tips, *task.arena(), goals, count)
     return goals, count
 
 
 @kernel
-def _take_all(x, corners, beside, places, others):
+def _take_all(x, corners, neighbors, places, others):
     """``take_corners`` of many sheets, (sheets, 3, particles)."""
     for sheet in range(x.shape[0]):
-        take_corners(x[sheet], corners, beside, places[sheet], others[sheet])
+        take_corners(x[sheet], corners, neighbors, places[sheet], others[sheet])
 
 
 def places_to_take(x: NDArray, mesh: ClothMesh) -> tuple[NDArray, NDArray]:
-    """Where tips take each corner [m], (sheets, 4, 3), and how many other particles they would take, (sheets, 4).
+    """Grasp point of each corner [m], (sheets, 4, 3), and the number of other particles in the grasp, (sheets, 4).
 
     x: sheets of this mesh [m], (sheets, particles, 3).
     """
     places, others = np.empty((len(x), CORNERS, 3)), np.empty((len(x), CORNERS), np.int64)
     across = np.ascontiguousarray(x.transpose(0, 2, 1))
-    _take_all(across, np.array(mesh.corners), beside_corners(mesh), places, others)
+    _take_all(across, np.array(mesh.corners), corner_neighbors(mesh), places, others)
     return places, others
 
 

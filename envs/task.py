@@ -35,9 +35,9 @@ from clothgym.envs.physics import (
     most_demanding,
 )  # fmt: skip
 from clothgym.envs.settling import check as check_settling
-from clothgym.envs.settling import only, settle
+from clothgym.envs.settling import restricted_to, settle
 from clothgym.envs.stepping import IN_NUMPY, Kernels, compiled, mesh_arrays
-from clothgym.exclusive import Turn, exclusive
+from clothgym.exclusive import CallGuard, exclusive
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
@@ -60,54 +60,54 @@ def _time_left(task: Task) -> NDArray:
 class Task:
     """Base of all tasks; the environment is the first axis of every array.
 
-    What a task defines are the first attributes and methods below, each with its default.  One in plain NumPy needs ``physics``,
-    ``acting_steps``, ``performance`` and ``success``; most draw a start and a goal in ``begin``, keep the goal in a field that
-    ``remembers`` names, and declare what is observed of it in ``observations``.  A task that must be fast gives ``kernels`` in
+    A task defines the first attributes and methods below, which have defaults.  A task in plain NumPy needs ``physics``,
+    ``acting_steps``, ``performance`` and ``success``; most tasks draw a start and a goal in ``begin``, keep the goal in a field
+    that ``remembers`` names, and declare its observations in ``observations``.  A task that must be fast defines ``kernels`` in
     place of ``performance``, ``success``, ``done`` and ``after_step``, see ``stepping``.
 
     Args:
         num_envs: environments in the batch.
-        rows, side: particles along a side of the sheet, and its length [m]; other than the task's own with automatic substeps.
+        rows, side: particles along a side of the sheet, and its length [m]; other values than the task's imply automatic substeps.
         fabric: another fabric than the task's own, a ``Material`` or a preset's name; substeps are then chosen automatically.
         integrator: another integrator than the task's own; its substeps are then chosen automatically.
         substeps: substeps of a control step, or "auto"; the task's own number by default.
-        physics: "true", or "fast", with short cuts, see ``Physics.chosen``.
-        bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them, in place of what that fixes.
-        obs_mode, image_size, camera, num_points, privileged: what is returned of the state, see ``Observer``.
-        reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (the evaluation alone).
+        physics: "true", or "fast", with simplifications, see ``Physics.chosen``.
+        bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them; they override ``physics``.
+        obs_mode, image_size, camera, num_points, privileged: kind of the returned observations, see ``Observer``.
+        reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (only the evaluation).
         randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
-        settling: "steps", or "at_once": the last step in which the agent acts goes on until its sheet has settled and is evaluated.
-        wind: what ``clothgym.Wind`` takes, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
-        threads: threads to use; all processors by default for a batch.
+        settling: "steps", or "at_once": the agent's last step continues until its sheet has settled and is evaluated.
+        wind: arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
+        threads: threads to use; all cores by default for a batch.
 
     Attributes:
-        physics: the sheet, its fabric, what holds it, and how time is stepped.
-        control_steps: control steps of a step, one unless an action says otherwise.
+        physics: the sheet, its fabric, its attachments, and the time integration.
+        control_steps: control steps of a step, one by default.
         acting_steps: control steps after which the agent's time is up.
-        settling_steps: those that follow, in which actions are ignored.
-        actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and what comes after it.
-        observations: what is observed beside the points of the sheet, in that order.
-        goals: names of the last of these, which are given apart, in a dictionary, as goal environments have it.
-        key_points: what the observed points of the sheet are with obs_mode="keypoints", for the page.
-        points_relative_to: what the observed points of the sheet are relative to, ``episode["origin"]``, for the page.
+        settling_steps: following control steps, in which actions are ignored.
+        actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and further numbers.
+        observations: observations in addition to the points of the sheet, in that order.
+        goals: names of the last of these, which goal environments return separately in a dictionary.
+        key_points: description of the observed points of the sheet with obs_mode="keypoints", for the page.
+        points_relative_to: description of the origin of observed points, ``episode["origin"]``, for the page.
         position_bound: of these points, in sides.
-        evaluation: fields of info that an evaluation writes, zero until then, beside performance and success.
+        evaluation: fields of info that an evaluation writes, zero until then, in addition to performance and success.
         accounts: fields of info that each step writes.
         prices: names of the task's own reward terms.
-        feels_pulls: whether its kernels must know how the sheet pulls at the attachments.
-        reset_options: what ``reset(options=...)`` takes.
-        arguments: meaning of the task's own keywords, for the page, and of those that mean something else than elsewhere.
-        ranges: least and greatest value of the fields that episodes remember, for ``set_state``; of others any finite number does.
-        strain_shown: where the colors of render_color="strain" end.
-        seen_from: where films see it from.
+        feels_pulls: whether its kernels need the sheet's pulls on the attachments.
+        reset_options: keys of ``reset(options=...)``.
+        arguments: meaning of the task's own keywords, for the page, and of keywords with a different meaning in this task.
+        ranges: least and greatest value of the fields of episodes, for ``set_state``; other fields may have any finite value.
+        strain_shown: upper end of the colors of render_color="strain".
+        seen_from: camera position of films.
         simulation: the batch of sheets.
-        sheet: rows and side as they were asked for.
-        episode: records of what the episodes are about, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
+        sheet: rows and side as given.
+        episode: records of the episodes' variables, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
-        observation_slices: where each observation lies in ``observation[env]``, the state vector, by its name.
-        observed: what ``reset`` and ``step`` return of it.
+        observation_slices: slice of each observation in ``observation[env]``, the state vector, by its name.
+        observed: the observations that ``reset`` and ``step`` return.
         rules: one record of numbers that all environments share.
-        outcome, info, physical, terms: records of what the last step or reset has brought, (num_envs,), see ``answers``.
+        outcome, info, physical, terms: records of the results of the last step or reset, (num_envs,), see ``answers``.
         turn: one thread at a time is in the task; ``turn.unfinished`` are the environments that need a reset.
 
     Raises:
@@ -207,12 +207,12 @@ class Task:
         self._prepare_records()
         self.generators = Generators(num_envs)
         self._begun = np.zeros(num_envs, bool)
-        self.turn = Turn("environment", error=gym.error.ResetNeeded)
+        self.turn = CallGuard("environment", error=gym.error.ResetNeeded)
         self.state_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
         self.observed = Observer(self, obs_mode, image_size, camera, num_points, privileged)
 
     def _prepare_records(self) -> None:
-        """Records of the episodes, their steps and what is observed of them, and the kernels that go through them."""
+        """Make the records of episodes, steps and observations, and the kernels that process them."""
         physics, count = self.physics, self.num_envs
         points = "particles" if self.obs_mode == "particles" else "keypoints"
         vector = StateVector(self, points)
@@ -232,7 +232,7 @@ class Task:
         self.episode["over"] = True
         steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
         self.air = np.zeros((count, steps, 3))
-        # what of it there can be, and to what it belongs
+        # valid ranges of the state, and its identity
         share, bound = (-ROUNDING, 1 + ROUNDING), self._bound
         self._ranges: dict[str, Any] = {
             "step": (0, self.acting_steps + self.settling_steps), "settling_since": (-1, self.acting_steps), "potential": share,
@@ -258,7 +258,7 @@ class Task:
         self.info = records(count, told)
         self.physical = records(count, answers.PHYSICAL)
         self.terms = records(count, [(name, float) for name in ("progress", "effort", "success", "failure", *self.prices)])
-        # what the kernels need beside these
+        # further arguments of the kernels
         self._mesh = mesh_arrays(physics.mesh, self.particles)
         self._everyone, self._no_pulls = np.arange(count), np.zeros((count, *attachment))
         self._place = self.simulation.layout.at(self._everyone)
@@ -288,7 +288,7 @@ class Task:
         """Refuse a reset's options that no episode can have, with a ValueError, before anything is changed."""
 
     def remembers(self) -> Fields:
-        """Fields of ``episode`` beside those that all tasks have: what its episodes remember."""
+        """Fields of ``episode`` in addition to those of all tasks: the variables of its episodes."""
         return ()
 
     def check_episode(self, env: int, own: Any) -> None:
@@ -327,9 +327,9 @@ class Task:
     # --- what a task defines: step ------------------------------------------------------------------------------------
 
     def before_step(self, actions: NDArray) -> None:
-        """Before the physics of each step: what actions do beside moving the attachments, which know where to go already.
+        """Called before the physics of each step: apply actions other than motion; targets of attachments are already set.
 
-        actions: as they were given, (num_envs, numbers), finite.
+        actions: as given, (num_envs, numbers), finite.
         """
 
     def after_step(self) -> None:
@@ -370,7 +370,7 @@ class Task:
         return key_particles(mesh)
 
     def solids(self, env: int) -> list[Drawable]:
-        """What the renderer draws beside the sheet and the floor: by default all solids but planes, where they are now."""
+        """Drawn objects other than the sheet and the floor: by default all solids except planes, at their present poses."""
         from clothgym.render.solids import drawn  # imported here: training draws nothing
 
         colliders = dict(enumerate(self.simulation.colliders)) | dict(self.episode_colliders(env))
@@ -378,7 +378,7 @@ class Task:
         return [drawn(one).at(places[k]) for k, one in colliders.items() if not isinstance(one, Plane)]
 
     def markers(self, env: int) -> list[Any]:
-        """What is drawn and casts no shadow: by default what ``marks`` says."""
+        """Drawn objects without shadows: by default those of ``marks``."""
         from clothgym.render.quick_solids import drawables  # imported here: training draws nothing
 
         return drawables(self.marks(np.array([env]))[0])
@@ -423,7 +423,7 @@ class Task:
         options = self._checked_options({} if options is None else options)
         if not len(envs):
             return
-        # draw what is new; what has been drawn is put back if it is refused
+        # draw new episodes; restore everything if one is refused
         drawn = self._drawn()
         before = [array[envs] for array in drawn]
         generators = self.generators.kept(envs)
@@ -441,7 +441,7 @@ class Task:
         self.turn.finish(envs.tolist())
 
     def _drawn(self) -> list[NDArray]:
-        """All that drawing an episode writes, beside the generators, live, (num_envs, ...)."""
+        """All arrays that drawing an episode writes, except the generators, live, (num_envs, ...)."""
         return [self.episode, self.air, self._begun]
 
     def _draw(self, envs: NDArray, seeds: Sequence[int | None], options: Mapping[str, Any]) -> NDArray:
@@ -489,7 +489,7 @@ class Task:
         return checked
 
     def _draw_material(self, env: int, fixed: Mapping[str, float]) -> None:
-        """The fabric of one environment's episode: the task's own, what is drawn, and what the reset's options say."""
+        """Set the fabric of one environment's episode: the task's own, with randomized properties and the reset's options."""
         properties = of_material(self.physics.material)
         for name, (low, high) in self.randomize.items():
             properties[PROPERTIES.index(name)] = self.generators[env].uniform(low, high)
@@ -526,13 +526,13 @@ class Task:
         """Refuse a step of a batch that has not been reset, or was interrupted."""
         if not self._begun.all():
             raise gym.error.ResetNeeded(f"environment {int(np.argmin(self._begun))} has not been reset yet: call reset() first")
-        self.turn.check_whole()
-        self.simulation.turn.check_whole()
+        self.turn.check_consistent()
+        self.simulation.turn.check_consistent()
 
     def move(self, actions: NDArray, envs: NDArray | None = None) -> None:
-        """One control step of all environments, or of some, beside which the others stand still.
+        """One control step of all environments, or of some while the others stand still.
 
-        actions: velocities of the attachments and what comes after them, (num_envs, numbers), float64.
+        actions: velocities of the attachments and further numbers, (num_envs, numbers), float64.
         """
         simulation, chosen = self.simulation, self._everyone if envs is None else envs
         self.turn.unfinished = range(self.num_envs)
@@ -544,7 +544,7 @@ class Task:
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
         with answers.standing(self):
-            with only(self, envs):
+            with restricted_to(self, envs):
                 self.before_step(actions)
                 simulation.step(envs=envs)
                 self.info[chosen] = np.zeros((), self.info.dtype)
@@ -613,7 +613,7 @@ class Task:
         Raises:
             RuntimeError, gymnasium.error.ResetNeeded: another thread is in a call, or one was interrupted.
         """
-        self.turn.check_whole()
+        self.turn.check_consistent()
         return TaskState(
             simulation=self.simulation.get_state(),
             episode={name: value.copy() for name, value in self._memory().items()},

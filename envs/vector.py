@@ -175,5 +175,5 @@ def _only(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
 
 
 def _with_masks(info: dict[str, Any], mask: NDArray) -> dict[str, Any]:
-    """Gymnasium's vector info: each entry beside a mask ``_key`` of the environments that it speaks of."""
+    """Gymnasium's vector info: each entry together with a mask ``_key`` of its environments."""
     return info | {f"_{key}": mask.copy() for key in info}

@@ -19,7 +19,7 @@ def bits(monkeypatch):
     return bits
 
 
-def test_what_differs_is_told_row_by_row(bits):
+def test_differences_are_reported_by_row(bits):
     before = {"a": {"digest": "1", "parts": {"positions": "1", "infos": "2"}}, "b": {"digest": "2", "parts": {}}}
     now = {"a": {"digest": "3", "parts": {"positions": "1", "infos": "4"}}, "c": {"digest": "2", "parts": {}}}
     assert bits.differences(before, before) == []

@@ -32,7 +32,7 @@ def test_the_program_is_called_as_it_was_called():
     assert done.returncode == 0 and done.stdout.startswith("usage: python -m clothgym ") and not done.stderr
 
 
-def test_list_names_what_there_is(capsys):
+def test_list_names_environments_scenes_integrators_and_fabrics(capsys):
     assert main(["list"]) == 0
     out = capsys.readouterr().out
     assert all(name in out for name in (*ENVIRONMENTS, *INTEGRATORS, "cotton"))
@@ -82,7 +82,7 @@ def refusal(capsys, *arguments):
 
 
 @pytest.mark.parametrize("command", [*BY_VALUE, *BY_NAME])
-def test_what_is_wrong_is_refused_before_anything_is_simulated(command, tmp_path, monkeypatch, capsys):
+def test_wrong_arguments_are_refused_before_any_simulation(command, tmp_path, monkeypatch, capsys):
     def never(*args, **kwargs):
         raise AssertionError("too late")
 
@@ -94,7 +94,7 @@ def test_what_is_wrong_is_refused_before_anything_is_simulated(command, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_wrong_value_is_refused_without_numba_and_a_wrong_name_without_what_is_optional(tmp_path):
+def test_wrong_values_are_refused_without_numba_and_wrong_names_without_optional_libraries(tmp_path):
     done = subprocess.run([sys.executable, "-c", REFUSALS], capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert done.stdout.split() == [str(len(BY_VALUE)), str(len(BY_NAME))], done.stderr
 
@@ -117,7 +117,7 @@ refused({list(BY_NAME)}, ["torch", "stable_baselines3", "viser", "matplotlib", "
 """
 
 
-def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys):
+def test_unwritable_outputs_are_refused(tmp_path, monkeypatch, capsys):
     """The user who runs the tests may be one who can write everywhere."""
     (tmp_path / "there.json").write_text("{}")
     monkeypatch.setattr(os, "access", lambda path, mode: not (mode & os.W_OK))
@@ -126,7 +126,7 @@ def test_what_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "there.json").read_text() == "{}" and len(list(tmp_path.iterdir())) == 1
 
 
-def test_the_same_words_say_everywhere_who_acts():
+def test_actors_have_the_same_names_in_all_commands():
     assert set(POLICIES) == set(ACTORS) == {"noop", "random", "expert"}
     assert Gallery(actor="noop").open("ClothReach-v0").policy == "noop"
     assert Gallery().open("ClothReach-v0").policy == "expert"
@@ -189,7 +189,7 @@ for env_id in ENVIRONMENTS:
 """
 
 
-def test_bench_writes_what_it_prints(tmp_path, capsys, monkeypatch):
+def test_bench_writes_its_printed_table(tmp_path, capsys, monkeypatch):
     """The measurements themselves are stood in for: a test must not depend on a clock."""
     monkeypatch.setattr(bench, "_process_seconds", lambda code, runs, **environment: 1.0)
     monkeypatch.setattr(bench, "seconds_per_call", lambda call, budget=0.5: (call(), 0.5)[1])

@@ -156,7 +156,7 @@ def test_the_first_choice_of_options_is_the_default():
 
 
 @pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
-def test_scenes_are_what_they_say(scene):
+def test_scenes_match_their_descriptions(scene):
     """They begin above the floor, are shown with substeps that are tried, and heavy particles weigh what is said."""
     s = scene.simulation("semi_implicit_euler", scene.shown)
     assert scene.shown in scene.substeps and scene.reference_substeps % 2 == 0

@@ -97,7 +97,7 @@ MOVED = """
     ("given", "meant"),
     [("kernels", "{here}/kernels"), ("~/kernels", "{here}/home/kernels"), ("./a/../b", "{here}/b"), ("{here}/c", "{here}/c")],
 )
-def test_the_cache_s_folder_is_what_was_meant_at_the_import(given, meant, tmp_path):
+def test_cache_folder_is_resolved_at_import(given, meant, tmp_path):
     """A program that goes into a folder of its own, as Hydra's do, and what it starts there, use one cache."""
     where = {"HOME": str(tmp_path / "home"), "CLOTHGYM_CACHE_DIR": given.format(here=tmp_path)}
     out, said = run(MOVED, cwd=tmp_path, **where)
@@ -128,7 +128,7 @@ def test_a_home_in_a_path_is_the_home(tmp_path, monkeypatch):
     assert not list((tmp_path / "work").iterdir())
 
 
-def test_a_script_s_arguments_may_name_the_home(monkeypatch, scripts):
+def test_script_arguments_expand_the_home_folder(monkeypatch, scripts):
     import evaluate
     import train
 
@@ -162,7 +162,7 @@ def test_the_command_finds_a_module_in_the_current_folder(tmp_path):
 # --- names ------------------------------------------------------------------------------------------------------------------------
 
 
-def test_a_star_import_gives_the_core_s_names():
+def test_star_import_gives_the_core_names():
     names = {}
     exec("from clothgym import *", names)
     assert {name for name in names if not name.startswith("__")} == {*clothgym._HOMES, "policies"} == set(clothgym.__all__)
@@ -265,7 +265,7 @@ SPOKEN = [too_few, too_few_by_gymnasium, too_few_of_a_batch, too_few_for_an_opti
 
 
 @pytest.mark.parametrize("speak", [*SPOKEN, rendered_without_a_mode], ids=lambda speak: speak.__name__)
-def test_a_warning_points_at_the_caller_s_line(speak):
+def test_warnings_point_at_the_caller_line(speak):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         speak()

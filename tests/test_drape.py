@@ -35,7 +35,7 @@ def potential(env, reach=0.15):
     return (near + 1 / (1 + (off / 0.2) ** 2)) / 2
 
 
-def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices():
+def test_return_is_performance_minus_initial_potential_with_penalties():
     env, _ = start()
     total, effort, before, terminated = 0.0, 0.0, potential(env), False
     for step in range(200):
@@ -137,7 +137,7 @@ def test_a_sheet_that_still_moves_is_no_success():
     assert info["normalized_performance"] == pytest.approx(flat * still / (1 + (info["off_center"] / 0.2) ** 2), rel=1e-6)
 
 
-def test_the_observation_is_what_the_manual_page_says():
+def test_observations_match_the_manual_page():
     env, _ = start(seed=8)
     for _ in range(5):
         observation, *_ = env.step(np.array([0.5, 1, 0.2, -1, 0.3, 1, 0, -1.0]))

@@ -155,7 +155,7 @@ def test_fingers_open_after_100_steps_and_the_evaluation_is_at_160():
         assert (tips(env)[0, 0, 2] > here[0, 2] + 1e-3) == (step <= ACTING)
 
 
-def test_a_gripper_takes_what_lies_within_3_cm_of_its_tip_and_moves_no_faster_than_the_limit():
+def test_a_gripper_grasps_within_3_cm_and_respects_its_speed_limit():
     env, _ = start(options={"rumpled": False})
     taken = {}
     for _ in range(40):
@@ -183,7 +183,7 @@ def test_a_gripper_takes_what_lies_within_3_cm_of_its_tip_and_moves_no_faster_th
 
 
 @pytest.mark.parametrize("policy", ["expert", "random"])
-def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices(policy):
+def test_return_is_performance_minus_initial_potential_with_penalties(policy):
     env, _ = start(seed=4)
     rng, effort, total, terminated, steps = np.random.default_rng(0), 0.0, 0.0, False, 0
     before, held = potential(env), []
@@ -215,7 +215,7 @@ def test_the_potential_of_one_gripper_counts_the_middle_of_the_edge():
     assert held[-1] and not held[0]
 
 
-def test_the_evaluation_is_the_drape_s_on_the_sheet_as_it_lies():
+def test_the_evaluation_is_that_of_the_drape_task():
     """On the expert's sheets, and on such as were let go too early."""
     env = batch(12, seed=20)
     last = play(env, lambda env, step: env.unwrapped.expert_actions() if step < 57 else np.tile([0, 0, 0, OPEN] * 2, (12, 1)))
@@ -252,7 +252,7 @@ def test_success_asks_for_a_centred_sheet_at_rest(offset, speed, success):
 
 
 @pytest.mark.parametrize("shape", ["sphere", "box", "post"])
-def test_the_observation_is_what_the_manual_page_says(shape):
+def test_observations_match_the_manual_page(shape):
     env, observation = start(seed=8, options={"target": {"shape": shape}})
     assert observation.shape == (82,)
     for _ in range(14):

@@ -19,7 +19,7 @@ def test_the_expert_succeeds_on_flat_and_on_rumpled_sheets():
     assert last["is_success"][rumpled].mean() > 0.6 and last["is_success"][~rumpled].mean() > 0.6
 
 
-def test_who_never_moves_scores_nothing():
+def test_no_action_scores_zero():
     last = play(batch(8), lambda env, step: np.zeros((8, 8)))
     assert not last["normalized_performance"].any() and not last["is_success"].any() and not any(last["failure"])
 
@@ -61,7 +61,7 @@ def test_who_holds_the_sheet_over_the_target_to_the_end_is_evaluated_by_how_it_f
 
 
 @pytest.mark.slow
-def test_a_sheet_dropped_beside_the_target_scores_next_to_nothing():
+def test_a_sheet_dropped_next_to_the_target_scores_almost_zero():
     env, policy = batch(6, seed=3), fetched((1.0, 0.0, 0.2))
     last = play(env, policy)
     assert last["normalized_performance"].max() < 0.1 and not last["is_success"].any()

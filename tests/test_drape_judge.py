@@ -84,7 +84,7 @@ def test_a_line_through_edges_and_corners_of_triangles_meets_a_flat_sheet_once()
         assert layers.tolist() == [1] * len(points)
 
 
-def test_layers_over_a_sphere_and_beside_the_sheet():
+def test_layers_over_a_sphere_and_outside_the_sheet():
     """Only what lies within the sheet's outline, and near enough along the normal, is covered."""
     sphere = Target("sphere", 0.15, 0.3, (0.1, 0.2))
     points = sphere.upper_surface(256) - (0.1, 0.2, 0.3)
@@ -132,7 +132,7 @@ def test_reference_coverage_interpolates_the_table(monkeypatch):
     assert found == pytest.approx([0.85, 0.9, 0.6, 0.6])
 
 
-def test_another_cloth_s_reference_is_simulated_once_and_kept(monkeypatch, capsys, tmp_path):
+def test_reference_of_another_fabric_is_simulated_once_and_kept(monkeypatch, capsys, tmp_path):
     sphere, silk = Target("sphere", 0.15, 0.3, (0, 0)), replace(PHYSICS, material=Material.preset("silk", density=0.0831))
     simulated, table = [], {"sphere": {"widths": [0.2, 0.3], "none": [0.0], "coverage": [[0.8], [0.9]]}}
     monkeypatch.setattr(reference, "simulated", lambda cloth, rows, counts: simulated.append(cloth) or table)
@@ -148,7 +148,7 @@ def test_another_cloth_s_reference_is_simulated_once_and_kept(monkeypatch, capsy
     reference._table.cache_clear()
 
 
-def test_a_flat_sheet_s_coverage_is_what_its_simulation_says():
+def test_flat_sheet_coverage_matches_its_simulation():
     """A coarse one, over a box and a post: it lies over all that slopes by at most 60 degrees, in one layer, at rest."""
     cloth = reference.cloth_of(PHYSICS)
     targets = [reference.target_of("box", 0.2, 0.4, SIDE), reference.target_of("post", 0.12, 0.5, SIDE)]
@@ -170,7 +170,7 @@ def laid(env, offset, sheet=flat):
     return info
 
 
-def test_a_sheet_laid_on_the_target_succeeds_and_one_laid_beside_its_centre_does_not():
+def test_a_centered_sheet_succeeds_and_an_off_center_one_fails():
     env = gym.make(DRAPE)
     centered, aside = laid(env, 0.02), laid(env, 0.25)
     assert centered["is_success"] and centered["normalized_performance"] > 0.9

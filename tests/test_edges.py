@@ -25,7 +25,7 @@ def test_a_sheet_is_drawn_over_an_edge_with_the_belt_s_pull(radius, friction):
 @pytest.mark.parametrize(
     ("particles", "fabric", "make"), [(9, "cotton", BOX), (17, "silk", BOX), (17, "denim", BOX), (17, "cotton", mesh_edge)]
 )
-def test_whatever_the_spacing_the_fabric_and_the_solid(particles, fabric, make):
+def test_the_pull_over_an_edge_is_independent_of_spacing_fabric_and_solid(particles, fabric, make):
     result = pull_back(make, particles, 0.3, fabric=fabric, speed=0.05, way=0.12)
     assert result["ratio"] == pytest.approx(1, abs=0.15)
     assert result["strain"] < 0.03

@@ -76,7 +76,7 @@ def derived(cls):
     return [one for child in cls.__subclasses__() for one in (child, *derived(child)) if one.__module__.startswith("clothgym.envs")]
 
 
-def test_no_task_overrides_what_is_tested_on_a_few_but_those_that_are_listed():
+def test_only_listed_tasks_override_shared_methods():
     """Error paths and autoreset are tested on two tasks, and on one of each that overrides a part of that path."""
     found = {}
     for base, path in PATH.items():
@@ -91,7 +91,7 @@ def test_no_task_overrides_what_is_tested_on_a_few_but_those_that_are_listed():
 
 
 @every_id
-def test_gymnasium_s_checker_passes_without_a_warning(env_id):
+def test_gymnasium_checker_passes_without_a_warning(env_id):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # rendering is checked too; the checker makes the environment again for each render mode
@@ -99,7 +99,7 @@ def test_gymnasium_s_checker_passes_without_a_warning(env_id):
 
 
 @every_id
-def test_stable_baselines3_s_checker_passes_without_a_warning(env_id):
+def test_stable_baselines3_checker_passes_without_a_warning(env_id):
     check_sb3 = pytest.importorskip("stable_baselines3.common.env_checker").check_env
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -152,7 +152,7 @@ def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
 
 @two_tasks
 @pytest.mark.parametrize("reward_mode", ["delta", "sparse"])
-def test_the_return_is_bounded_by_what_the_modes_promise(env_id, reward_mode):
+def test_the_return_is_within_the_documented_bounds(env_id, reward_mode):
     """Sparse: the performance at the evaluation alone.  Delta: within the potential's span, the bonus and the penalty."""
     env = make_vec(env_id, 3, reward_mode=reward_mode, autoreset_mode="Disabled")
     env.reset(seed=0)
@@ -201,7 +201,7 @@ def test_pictures(env_id):
 
 @two_tasks
 @pytest.mark.filterwarnings("ignore:.*human")
-def test_the_human_window_comes_from_gymnasium_s_wrapper(env_id, monkeypatch):
+def test_the_human_window_comes_from_the_gymnasium_wrapper(env_id, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pytest.importorskip("pygame")
     env = make(env_id, render_mode="human")

@@ -71,7 +71,7 @@ def test_an_episode_is_told_to_its_end_and_plays_as_one_mesh(tmp_path):
     np.testing.assert_array_equal(meshes["cloth"].vertices.astype(np.float32), frames[0].positions[0])
 
 
-def test_what_comes_or_goes_has_no_place_in_one_moving_mesh():
+def test_animated_meshes_exclude_solids_that_appear_or_disappear():
     ball, pin = (Drawn(Sphere(center=(0, 0, 1), radius=radius)) for radius in (0.2, 0.01))
     there = Drawn(Sphere(center=(0, 1, 1), radius=0.2))
     assert lasting([[pin, ball, pin], [there, pin]]) == [[ball], [there]]
@@ -98,7 +98,7 @@ def test_the_strain_of_a_particle_is_the_largest_of_its_threads():
 
 
 @pytest.mark.parametrize("ending", ["gif", "glb"])
-def test_a_burst_says_why_and_keeps_what_came_before(tmp_path, ending):
+def test_an_export_of_a_diverging_scene_explains_and_keeps_earlier_frames(tmp_path, ending):
     pytest.importorskip("PIL")
     with pytest.raises(SystemExit) as caught:
         main(

@@ -43,7 +43,7 @@ def contents(state):
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
 @pytest.mark.parametrize("place", ["write_bytes", "replace"])
-def test_a_full_disk_and_ctrl_c_leave_what_was_there_and_nothing_else(tmp_path, monkeypatch, error, place):
+def test_a_full_disk_and_ctrl_c_leave_the_previous_file_and_no_other(tmp_path, monkeypatch, error, place):
     simulation = Simulation(grid(4, 4, 0.1, 0.1))
     simulation.get_state().save(tmp_path / "state.npz")
     whole, real = (tmp_path / "state.npz").read_bytes(), getattr(Path, place)
@@ -97,7 +97,7 @@ def test_a_film_that_ffmpeg_could_not_finish_is_none(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_what_is_no_file_is_refused_at_once(read, tmp_path):
+def test_special_files_are_refused_at_once(read, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "empty").touch()
     for path in ("/dev/zero", tmp_path / "pipe", tmp_path, tmp_path / "empty"):
@@ -238,7 +238,7 @@ def test_a_state_of_other_arguments_or_another_id_is_refused_by_name(tmp_path):
         made("ClothStrain-v0", threshold=0.05).set_state(mesh)
 
 
-def test_a_state_beside_a_round_solid_is_taken():
+def test_a_state_next_to_a_round_solid_is_accepted():
     """Axes and sizes in float32 are what colliders have."""
     simulation = Simulation(grid(5, 5, 0.2, 0.2), colliders=[Sphere(center=(0, 0, -0.2))])
     simulation.step(2)

@@ -64,7 +64,7 @@ def test_all_recorders_read_it(kwargs, tmp_path):
     assert [recorder.frames_per_sec for recorder in recorders] == [rate] * 4
 
 
-def test_sb3_s_recorder_films_at_the_rate_of_a_task_of_ones_own(tmp_path):
+def test_sb3_recorder_uses_the_frame_rate_of_a_custom_task(tmp_path):
     single, batch = kinds(0.04)
     env = ClothSB3VecEnv(batch(2, autoreset_mode="SameStep", render_mode="rgb_array", width=16, height=16))
     assert VecVideoRecorder(env, str(tmp_path), lambda step: False).frames_per_sec == 25

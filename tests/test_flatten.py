@@ -51,7 +51,7 @@ def test_coverage_of_crumpled_sheets_resampled_to_finer_grids_stays():
         assert max(abs(one - area(coarse, x) / SIDE**2) for one in found) < 0.01
 
 
-def test_layers_count_once_and_what_hangs_counts_as_it_is_seen_from_above():
+def test_layers_count_once_and_hanging_cloth_counts_by_its_projection():
     mesh = grid(9, 9, 0.4, 0.4)
     upright = mesh.rest_positions[:, [0, 2, 1]]
     assert area(mesh, upright) == 0
@@ -59,7 +59,7 @@ def test_layers_count_once_and_what_hangs_counts_as_it_is_seen_from_above():
     assert area(mesh, turned(slope, 0.3)) == pytest.approx(0.16 * np.cos(0.8), rel=5e-3)
 
 
-def test_softgym_s_area_is_that_of_cells_near_particles():
+def test_softgym_area_is_the_area_of_cells_near_particles():
     radius, x = 0.05, grid(9, 9, 0.4, 0.4).rest_positions
     points = np.ascontiguousarray(x.T, np.float32)
     assert softgym_area(points, radius) == pytest.approx(0.16, rel=1e-5)
@@ -124,7 +124,7 @@ def put(env, x):
 
 
 @pytest.mark.parametrize(("at", "covered"), [(None, 1.0), (0.0, 0.5), (0.25, 0.75)])
-def test_the_potential_is_what_is_covered_and_how_near_the_grippers_are(at, covered):
+def test_the_potential_is_coverage_plus_nearness_of_the_grippers(at, covered):
     env = start()
     observation, *_ = put(env, on_floor(env.task.physics.mesh, at))
     x, tips = env.task.simulation.positions[0].astype(float), env.task.simulation.grippers.positions[0].astype(float)
@@ -133,7 +133,7 @@ def test_the_potential_is_what_is_covered_and_how_near_the_grippers_are(at, cove
     assert observation[env.observation_slices["coverage"]] == pytest.approx(covered, abs=0.015)
 
 
-def test_the_observation_says_where_grippers_are_what_they_hold_and_how_high():
+def test_observations_include_tips_held_corners_and_heights():
     env = start()
     task, mesh = env.task, env.task.physics.mesh
     task.simulation.reset(positions=on_floor(mesh))
@@ -164,7 +164,7 @@ def test_the_observation_says_where_grippers_are_what_they_hold_and_how_high():
     assert task.episode["potential"][0] == pytest.approx(held, abs=1e-6)
 
 
-def test_it_is_observed_that_a_gripper_has_lifted_what_it_holds_as_high_as_the_sheet_is_long():
+def test_lifted_is_observed_from_its_threshold_height_on():
     env = start()
     task, corners = env.task, np.array(env.task.physics.mesh.corners)
     task.simulation.reset(positions=on_floor(task.physics.mesh))
@@ -193,7 +193,7 @@ def test_nothing_is_to_be_taken_from_a_sheet_that_covers_enough(at, taken):
     assert observation[env.observation_slices["next"]].any() == taken
 
 
-def test_the_best_stays_the_first_success_is_remembered_and_what_is_lost_is_lost():
+def test_best_and_first_success_are_kept_and_a_lost_success_stays_lost():
     env = start()
     mesh, begun = env.task.physics.mesh, env.task.infos()["coverage_start"][0]
     *_, info = put(env, on_floor(mesh, 0.42))  # 0.92 is not enough

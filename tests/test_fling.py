@@ -41,7 +41,7 @@ def toward(task, goals, grip, speed=2.0):
     return np.concatenate([way / 2, np.full((*way.shape[:2], 1), grip)], axis=2).reshape(len(way), -1)
 
 
-def test_two_corners_are_held_after_four_steps_whatever_the_actions_and_nothing_else():
+def test_two_corners_are_held_after_four_steps_for_any_actions():
     env, rng = batch(), np.random.default_rng(0)
     env.reset(seed=SEEDS)
     task = env.task
@@ -179,7 +179,7 @@ def test_slow_hands_do_not_lay_the_sheet_down():
 
 
 def test_macro_actions_are_refused_and_the_hard_tier_is_larger():
-    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity': what is picked and placed is not thrown"):
+    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity': picking and placing cannot throw a sheet"):
         gym.make(ID, action_mode="pick_place")
     hard = gym.make("clothgym:ClothFling-Hard-v0").unwrapped
     hard.reset(seed=0)

@@ -164,7 +164,7 @@ def test_main_loop_fits_a_screen():
         assert loop.end_lineno - loop.lineno <= 30, loop.name
 
 
-def test_what_is_listed_exists():
+def test_listed_modules_exist():
     names = {name.removeprefix("clothgym.") for name, _ in SOURCES}
     assert set(OUT_OF_HAND) <= names
     assert all(any(name == one or name.startswith(one + ".") for name, _ in SOURCES) for one in FLOORS)

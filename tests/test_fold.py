@@ -26,7 +26,7 @@ def laid(points, height=0.004, turn=0.0, shift=(0.0, 0.0)):
 
 
 @pytest.mark.parametrize(("rows", "edge"), [(13, 0), (25, 1), (49, 2), (13, 3)])
-def test_a_perfect_half_fold_has_no_error_wherever_it_lies_and_over_whatever_edge(rows, edge):
+def test_half_fold_over_any_edge_at_any_pose_has_zero_error(rows, edge):
     _, flat, share = sheet(rows)
     axis, sign = edge // 2, 1 - 2 * (edge % 2)
     folded = flat.copy()
@@ -119,7 +119,7 @@ def test_the_expert_folds_by_picking_and_placing(fold, actions):
 
 
 @pytest.mark.slow
-def test_what_was_pressed_together_does_not_jump_when_it_is_let_go():
+def test_released_layers_do_not_jump():
     """Impulses that had borne what the fingers pressed threw it up by half a meter."""
     assert episodes(2, seed=1_000_006, fold="quarter")[1] < 0.15
 

@@ -113,7 +113,7 @@ def test_doing_nothing_scores_nothing():
     assert not info["is_success"].any() and info["normalized_performance"].max() < 0.02 and np.all(total == -120)
 
 
-def test_whoever_tears_the_sheet_gains_nothing_by_it():
+def test_tearing_the_sheet_does_not_raise_the_return():
     """With both hands holding it and going apart; all steps that are left have missed the goal, under any goal."""
     env, _ = batch(4)
     over, total, length, failure = np.zeros(4, bool), np.zeros(4), np.zeros(4), np.zeros(4, int)

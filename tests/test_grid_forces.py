@@ -139,7 +139,7 @@ def test_held_particles_keep_their_velocity(lanes):
 
 
 @pytest.mark.parametrize("bending", ["springs", "quadratic"])
-def test_forces_begin_with_what_they_are_given(bending):
+def test_forces_start_from_given_values(bending):
     """The bits of adding to it: on a grid by kinds, and on one lane and several, spring by spring."""
     mesh = grid(5, 6, 0.3, 0.4)
     x, v, _ = thrown(mesh, np.float32)
@@ -169,7 +169,7 @@ def test_only_regular_grids_go_by_kinds():
 
 
 @pytest.mark.parametrize("bending", BENDING)
-def test_a_sheet_by_kinds_swings_as_one_whose_springs_are_taken_one_by_one(bending):
+def test_forces_by_kind_match_forces_by_spring(bending):
     """A spring that is 1e-5 longer than the others of its kind makes a grid irregular, and changes next to nothing."""
     mesh, found = grid(6, 7, 0.3, 0.3), []
     lengths = mesh.springs.rest_length * np.where(np.arange(len(mesh.springs.kind)) == 3, 1 + 1e-5, 1)

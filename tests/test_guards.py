@@ -71,7 +71,7 @@ def test_raise_stops_and_the_next_step_may_go_on_after_a_reset():
     assert not simulation.diverged.any() and np.isfinite(simulation.positions).all()
 
 
-def test_a_wrong_word_for_what_to_do_lists_the_right_ones():
+def test_a_wrong_on_divergence_option_lists_the_valid_ones():
     with pytest.raises(ValueError, match="warn or .*raise|'warn'"):
         batch(on_divergence="stop")
 

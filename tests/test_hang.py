@@ -62,7 +62,7 @@ def test_shares_and_length_are_those_of_the_surface_at_any_resolution(points, of
 
 
 @pytest.mark.parametrize("points", [13, 49])
-def test_what_the_rail_does_not_carry_does_not_count(points):
+def test_cloth_that_the_rail_does_not_support_does_not_count(points):
     mesh = grid(points, points, SIDE, SIDE)
     flat = mesh.rest_positions + (*RAIL[:2], 0)
     for height in (0.002, RAIL[2] - 0.05, RAIL[2] + RADIUS + REST + 0.04):

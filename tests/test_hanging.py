@@ -6,7 +6,7 @@ import pytest
 
 HANG, HANG_HARD = "clothgym:ClothHang-v0", "clothgym:ClothHang-Hard-v0"
 HOOK, HOOK_HARD = "clothgym:ClothHook-v0", "clothgym:ClothHook-Hard-v0"
-SIDE, LETS_GO = 0.6, np.tile([0, 0, 0, 1.0], 2)
+SIDE, RELEASE = 0.6, np.tile([0, 0, 0, 1.0], 2)
 
 
 def start(env_id, seed=3, options=None, **kwargs):
@@ -83,7 +83,7 @@ def test_the_return_is_the_performance_and_success_lasts_five_seconds_after_lett
 
 def settled(env, x, speed=0.0):
     """Info of an episode that ends with this sheet, let go and at rest so far, and pushed in its last step."""
-    env.step(LETS_GO)
+    env.step(RELEASE)
     task, own = env.task, env.task.episode[0]
     task.simulation.reset(positions=x)
     task.simulation.release()
@@ -98,8 +98,8 @@ def settled(env, x, speed=0.0):
     return info
 
 
-@pytest.mark.parametrize(("env_id", "action"), [(HANG, 0 * LETS_GO), (HOOK, LETS_GO), (HOOK, np.tile([0, 0, 1.0, 0], 2))])
-def test_what_is_let_go_before_it_or_held_there_until_the_end_scores_nothing(env_id, action):
+@pytest.mark.parametrize(("env_id", "action"), [(HANG, 0 * RELEASE), (HOOK, RELEASE), (HOOK, np.tile([0, 0, 1.0, 0], 2))])
+def test_sheets_released_early_or_held_to_the_end_score_zero(env_id, action):
     env, terminated = start(env_id, seed=5)[0], False
     while not terminated:
         *_, terminated, _, info = env.step(action)
@@ -118,7 +118,7 @@ def test_the_expert_hangs_it_up(env_id, least):
 
 
 @pytest.mark.parametrize("env_id", [HANG, HANG_HARD, HOOK, HOOK_HARD])
-def test_the_observation_is_what_the_manual_page_says(env_id):
+def test_observations_match_the_manual_page(env_id):
     env, _ = start(env_id, seed=8)
     for _ in range(5):
         observation, *_ = env.step(env.expert_action())
@@ -169,6 +169,6 @@ def test_starts_lie_before_the_stand_and_hands_hover_above_the_corners(env_id, f
 
 @pytest.mark.parametrize("wanted", [{"height": 0.3}, {"yaw": 2.0}, {"center": (1, 1)}, {"radius": 0.1}, 3])
 @pytest.mark.parametrize(("env_id", "name"), [(HANG, "rail"), (HOOK, "hook")])
-def test_stands_that_there_cannot_be_are_refused(env_id, name, wanted):
+def test_impossible_rails_and_hooks_are_refused(env_id, name, wanted):
     with pytest.raises(ValueError, match=name):
         start(env_id, options={name: wanted})

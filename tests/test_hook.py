@@ -125,7 +125,7 @@ def test_a_sheet_over_the_arm_and_not_in_its_hole_scores_nothing():
     assert best == 0 and not info["is_success"] and info["normalized_performance"] == 0
 
 
-def test_what_lies_on_the_floor_counts_against_it():
+def test_cloth_on_the_floor_lowers_the_score():
     """The share of a sheet in the arm that is lower than three centimeters, from points of its flat surface."""
     env, _ = start(HOOK)
     task = env.task
@@ -188,7 +188,7 @@ def test_arm_and_post_stop_hands(env_id):
     assert np.all((nearest > radii - 2e-5) & (nearest < radii + 0.02))
 
 
-def test_what_a_sheet_of_triangles_does_not_have_is_refused():
+def test_rows_and_shear_stiffness_are_refused_for_a_triangle_mesh():
     with pytest.raises(ValueError, match="one mesh"):
         gym.make(HOOK, rows=25)
     with pytest.raises(ValueError, match="shear_stiffness has no effect"):

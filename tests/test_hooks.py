@@ -90,7 +90,7 @@ WRONG_WHEN_MADE = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_what_does_not_fit_is_refused_by_the_method_s_name(case):
+def test_invalid_results_of_task_methods_are_refused_by_name(case):
     methods, message = WRONG[case]
     batch, single = made(**methods)
     with pytest.raises(ValueError, match=message):
@@ -100,7 +100,7 @@ def test_what_does_not_fit_is_refused_by_the_method_s_name(case):
 
 
 @pytest.mark.parametrize("case", WRONG_WHEN_MADE)
-def test_what_does_not_fit_when_a_task_is_made(case):
+def test_invalid_task_definitions_are_refused_at_construction(case):
     methods, error, message = WRONG_WHEN_MADE[case]
     with pytest.raises(error, match=message):
         if case == "no physics":
@@ -109,7 +109,7 @@ def test_what_does_not_fit_when_a_task_is_made(case):
             made(**methods)
 
 
-def test_an_expert_s_wrong_shape_is_named():
+def test_a_wrong_shape_of_expert_actions_is_named():
     batch, single = made(expert_actions=returning(np.zeros(3)))
     for env, ask in ((batch, "expert_actions"), (single, "expert_action")):
         env.reset(seed=0)
@@ -128,7 +128,7 @@ def test_an_expert_s_wrong_shape_is_named():
         {"colliders": returning([])},
     ],
 )
-def test_what_fits_is_taken(methods):
+def test_valid_results_of_task_methods_are_accepted(methods):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for env in made(**methods):

@@ -29,12 +29,12 @@ def measured_over_nominal_stiffness(chain, q2, iterations, links=8):
 
 
 @pytest.mark.parametrize("q2", [2.17, 0.5, 0.136, 0.0085])
-def test_xpbd_in_one_pass_is_as_soft_as_its_formula_says(chain, q2):
+def test_xpbd_in_one_pass_matches_its_softness_formula(chain, q2):
     """r = 1/(1 + q^2 (N - 1)/N) for N links."""
     assert measured_over_nominal_stiffness(chain, q2, 1) == pytest.approx(1 / (1 + q2 * 7 / 8), rel=0.02)
 
 
-def test_xpbd_takes_the_fabric_s_stiffness_as_its_passes_grow(chain):
+def test_xpbd_converges_to_the_fabric_stiffness_with_more_passes(chain):
     """At q^2 = 2.17, where one pass leaves a third of it; without multipliers that remember, it would grow beyond all bounds."""
     ratios = {n: measured_over_nominal_stiffness(chain, 2.17, n) for n in (1, 2, 4, 8, 16, 64)}
     print(", ".join(f"{n}: {ratio:.4f}" for n, ratio in ratios.items()))

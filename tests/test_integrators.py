@@ -12,7 +12,7 @@ NAMES = list(INTEGRATORS)
 SHEET = grid(4, 4, 0.3, 0.3)
 
 
-def test_the_table_holds_what_the_readme_names():
+def test_the_table_matches_the_readme():
     assert NAMES == [
         "explicit_euler", "semi_implicit_euler", "verlet", "rk4", "implicit_euler", "projective_dynamics", "pbd", "xpbd",
     ]  # fmt: skip
@@ -54,7 +54,7 @@ def test_wrong_options_are_named(given, match):
         Simulation(SHEET, integrator=given)
 
 
-def test_another_method_s_option_is_ignored_with_a_warning():
+def test_an_option_of_another_method_is_ignored_with_a_warning():
     with pytest.warns(UserWarning, match=r"xpbd has no option 'tolerance' \(implicit_euler has\): it is ignored"):
         method = get({"name": "xpbd", "tolerance": 1e-3, "iterations": 2})
     assert dict(method.options) == {"iterations": 2}
@@ -89,7 +89,7 @@ def test_projective_dynamics_refuses_properties_that_differ(changed_property):
     assert (changed_property == "bend_rigidity") or not np.array_equal(simulation.positions, before)
 
 
-def test_projective_dynamics_takes_what_its_matrix_does_not_know():
+def test_projective_dynamics_accepts_randomized_properties_outside_its_matrix():
     simulation = Simulation(SHEET, num_envs=2, integrator="projective_dynamics", air_density=0, dtype="float64")
     simulation.set_parameters(gravity=[(0, 0, -9.81), (0, 0, 5.0)], air_drag=[0.0, 0.3])
     simulation.step(6)

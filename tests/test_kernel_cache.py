@@ -77,7 +77,7 @@ class Planted:
 
 @pytest.mark.parametrize("files", ["*.nbi", "*.nbc"])
 @pytest.mark.parametrize("checked", [True, False], ids=["with a checksum of another key", "bare"])
-def test_what_a_stranger_has_planted_is_not_unpickled(files, checked, mine, tmp_path):
+def test_foreign_cache_entries_are_not_unpickled(files, checked, mine, tmp_path):
     root, start = mine
     payload = pickle.dumps(Planted(tmp_path / "marker"))
     for path in root.rglob(files):
@@ -144,7 +144,7 @@ def test_all_is_closed_to_others_and_nothing_can_be_run(mine):
     assert {stat.S_IMODE(path.stat().st_mode) for path in files} == {0o600}
 
 
-def test_an_entry_is_whole_or_not_there(tmp_path, monkeypatch):
+def test_a_cache_entry_is_complete_or_missing(tmp_path, monkeypatch):
     monkeypatch.setenv("CLOTHGYM_CACHE_DIR", str(tmp_path))
     folder = CacheFolder()
     entry = folder.path / "entry.nbc"

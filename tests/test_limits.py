@@ -103,7 +103,7 @@ HELD = {
 
 
 @pytest.mark.parametrize("case", HELD)
-def test_what_a_grid_holds_is_taken(case):
+def test_solids_that_the_grid_resolves_are_accepted(case):
     """Tips and edges, too, which are rounded by a few cells."""
     (vertices, triangles), resolution = HELD[case]
     MeshCollider(vertices=vertices, triangles=triangles, resolution=resolution)
@@ -131,7 +131,7 @@ def test_more_anchors_than_a_small_integer_counts_all_hold():
     assert simulation.attached.all()
 
 
-def test_a_state_whose_holders_are_small_integers_goes_on():
+def test_a_state_with_small_integer_holders_is_accepted():
     simulation = Simulation(grid(3, 3, 0.1, 0.1), anchors=[0, 8])
     state = simulation.get_state()
     state.holder = state.holder.astype(np.int16)
@@ -197,7 +197,7 @@ def test_masses_beyond_the_numbers_are_refused():
 
 
 @pytest.mark.parametrize("cells", [1.0, 1.25, 0.8])
-def test_a_grid_too_fine_for_skip_springs_names_what_works(cells):
+def test_a_grid_too_fine_for_skip_springs_names_an_alternative(cells):
     """Hinges, and the largest rigidity that springs can have there: both are taken, and a little more rigidity is not."""
     mesh, cotton = grid(12, 12, 0.03, 0.03 * cells), Material.preset("cotton")
     with pytest.raises(ValueError, match="bending='hinge' or 'quadratic'") as refusal:

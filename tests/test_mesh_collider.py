@@ -82,7 +82,7 @@ def cavity_inside_out():
     [
         (lambda v, t: (v, t[1:]), r"open: edge \d-\d belongs to one triangle only \(3 such edges\): close its holes"),
         (lambda v, t: (v, t[:, ::-1]), r"inside out .*volume is -0.008 m\^3\): turn all triangles round"),
-        (lambda v, t: (v, np.concatenate([t[:1, ::-1], t[1:]])), "disagree on which side is out"),
+        (lambda v, t: (v, np.concatenate([t[:1, ::-1], t[1:]])), "have opposite orientations"),
         (lambda v, t: cavity_inside_out(), "a part of the mesh near .* is inside out"),
         (lambda v, t: crossing(), r"passes through itself: triangles \d+, .* and \d+, .* cross; join"),
         (lambda v, t: (np.where(v > 0, np.nan, v), t), "not finite"),

@@ -131,7 +131,7 @@ TAKEN = {
 
 
 @pytest.mark.parametrize("case", TAKEN)
-def test_what_a_file_becomes(tmp_path, case):
+def test_mesh_files_are_read_and_repaired(tmp_path, case):
     """Particles, triangles, area and pieces, known from how the file was made; one warning at the caller's line, or none."""
     text, particles, triangles, area, pieces, clauses = TAKEN[case]
     path = tmp_path / ("sheet.off" if text.startswith("OFF") else "sheet.obj")
@@ -181,7 +181,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_refused_names_the_file_s_own_vertices(tmp_path, case):
+def test_refused_files_name_their_own_vertices(tmp_path, case):
     text, message = REFUSED[case]
     path = tmp_path / ("sheet.off" if text.startswith("OFF") else "sheet.obj")
     path.write_text(text)
@@ -266,14 +266,14 @@ def test_a_tolerance_that_makes_no_sense_is_refused(tmp_path, tolerance, message
         load_mesh(path, merge_tolerance=tolerance)
 
 
-def test_scale_is_meters_in_the_file_s_unit(tmp_path):
+def test_scale_is_the_file_unit_in_meters(tmp_path):
     path = tmp_path / "cm.obj"
     path.write_text(obj(scaled(panel()[0], 100.0), panel()[1]))
     mesh = load_mesh(path, scale=0.01)
     assert mesh.area.sum() == pytest.approx(0.06) and mesh.size == pytest.approx((0.3, 0.2))
 
 
-def test_what_was_changed_can_be_read(tmp_path):
+def test_repairs_are_reported(tmp_path):
     """Counts, and the particle that each vertex of the file has become."""
     path = tmp_path / "sheet.obj"
     path.write_text(obj([(7, 7, 7), *SEWN[0]], [tuple(v + 1 for v in face) for face in turned([*SEWN[1], SEWN[1][0]], 2)]))
@@ -319,7 +319,7 @@ def test_solids_are_read_in_the_same_way(tmp_path):
     assert np.einsum("tc,tc->t", sides[0], np.cross(sides[1], sides[2])).sum() / 6 == pytest.approx(5)
 
 
-def test_an_open_solid_names_the_file_s_own_vertices(tmp_path):
+def test_an_open_solid_names_the_vertices_of_its_file(tmp_path):
     x, faces = cube()
     path = tmp_path / "open.obj"
     path.write_text(obj([x[0], *x], [tuple(v + 1 for v in face) for face in faces[1:]]))
@@ -331,7 +331,7 @@ def test_an_open_solid_names_the_file_s_own_vertices(tmp_path):
 
 
 @pytest.mark.parametrize("case", ["a seam with faces across", "a corner on a neighbor's side", "a star"])
-def test_what_is_loaded_falls_in_one_piece(tmp_path, case):
+def test_loaded_meshes_fall_in_one_piece(tmp_path, case):
     path = tmp_path / "sheet.obj"
     path.write_text(TAKEN[case][0])
     with warnings.catch_warnings():

@@ -88,7 +88,7 @@ def test_edges_of_the_mesh():
     assert np.array_equal(batch.mesh_edges, edges) and np.array_equal(batch.get_attr("mesh_edges")[1], edges)
 
 
-def test_somebody_else_s_task_is_seen_too():
+def test_custom_tasks_have_image_observations():
     assert issubclass(hang_towel.HangTowel, object)
     env = gym.make("hang_towel:HangTowel-v0", obs_mode="rgb", image_size=40)
     picture, _ = env.reset(seed=0)
@@ -174,7 +174,7 @@ def test_grippers_are_seen_and_are_not_in_height_maps():
 
 
 @pytest.mark.parametrize("autoreset", ["NextStep", "SameStep", "Disabled"])
-def test_every_autoreset_mode_behaves_as_gymnasium_s_own_vector_env(autoreset):
+def test_image_observations_match_the_gymnasium_vector_env_in_every_autoreset_mode(autoreset):
     """Pictures beside the state, over an episode that ends before the others, and final ones."""
     kwargs = {"obs_mode": "depth", "privileged": True, "image_size": 24}
     mode = gym.vector.AutoresetMode(autoreset)
@@ -239,7 +239,7 @@ def test_a_diverged_sheet_keeps_its_last_picture(mode):
     assert np.array_equal(again[1], before[1]) and not np.array_equal(again[2], after[2])
 
 
-def test_what_happens_after_an_episode_s_end_is_not_seen():
+def test_images_do_not_change_after_the_end_of_an_episode():
     """The sheet moves on in a batch without autoreset; its last picture stays."""
     env = make_vec(DRAPE, 2, autoreset_mode="Disabled", obs_mode="depth")
     env.reset(seed=0)

@@ -54,7 +54,7 @@ def amplitude_and_phase(simulation, steps=12):
 
 @pytest.mark.parametrize("name", CONSISTENT)
 @pytest.mark.parametrize("q", [0.05, 0.3683, 1.2])
-def test_oscillator_has_the_closed_form_s_amplitude_and_phase(chain, name, q):
+def test_oscillator_matches_closed_form(chain, name, q):
     h, k = 0.01, 1000.0
     simulation = chain(2, name, h, k, mass=k * (h / q) ** 2)
     assert amplitude_and_phase(simulation) == pytest.approx(CLOSED_FORMS[name](q), rel=1e-7)

@@ -149,7 +149,7 @@ def test_a_success_rate_is_that_of_the_episodes(form):
 
 
 @pytest.mark.parametrize("limit", [1, 4, 6])
-def test_what_was_truncated_stays_truncated(limit):
+def test_truncated_episodes_stay_truncated(limit):
     env = CountVectorEnv(4, autoreset_mode="Disabled", max_episode_steps=limit)
     env.reset(seed=0)
     firsts, (_, _, terminated, truncated, _) = run(env, drawn(env))

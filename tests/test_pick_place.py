@@ -59,7 +59,7 @@ def test_the_way_is_cut_by_its_length_and_goes_through_pick_and_place():
     assert path.approach[0] < path.approach[1]
 
 
-def test_rewards_add_up_and_the_sheet_settles_in_steps_of_its_own():
+def test_rewards_add_up_and_the_sheet_settles_in_further_steps():
     env = batch()
     env.reset(seed=8, options=FLAT)
     before, rng, progress = env.task.episode["potential"].copy(), np.random.default_rng(0), np.zeros(2)
@@ -108,7 +108,7 @@ def test_it_is_an_environment_that_gymnasium_accepts_and_truncates_by_actions():
     assert ends == [[False, False], [True, True]]
 
 
-def test_a_task_without_a_scripted_expert_for_it_says_so():
+def test_a_task_without_a_pick_place_expert_raises():
     env = gym.make(ID, action_mode="pick_place").unwrapped
     env.reset(seed=0)
     with pytest.raises(NotImplementedError, match="no scripted expert for action_mode='pick_place'"):

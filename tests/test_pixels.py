@@ -82,7 +82,7 @@ def test_it_learns_and_its_run_is_read_again(model, env, scripts, tmp_path):
     assert np.array_equal(acting_of(model)(native, seen), expected) and np.ptp(expected, axis=0).max() > 0
 
 
-def test_the_encoder_is_cloned_too(model, env, scripts):
+def test_behavior_cloning_also_fits_the_encoder(model, env, scripts):
     from clone import clone, demonstrations
 
     before = model.policy.pi_features_extractor.convolutions[0].weight.detach().clone()

@@ -101,7 +101,7 @@ def test_a_wrong_setting_is_a_sentence_and_changes_nothing(changes, words):
     assert stage.settings == before and np.array_equal(stage.simulation.get_state().stiffness, state.stiffness)
 
 
-def test_what_changes_while_it_runs_goes_on_from_where_it_is():
+def test_changed_settings_continue_from_the_present_state():
     stage = advanced(SceneStage("patch", Settings(fabric="knit", friction=0.3)), 10)
     x, v, same = stage.simulation.positions, stage.simulation.velocities, stage.simulation
     stage.change(wind=3.0)
@@ -129,7 +129,7 @@ def test_friction_reaches_the_solids_where_they_are_and_a_strain_limit_holds():
     assert advanced(stage, 30).frame.readings["strain"][0] < 0.11
 
 
-def test_a_seed_gives_the_same_bits_and_shifts_only_what_is_free():
+def test_a_seed_gives_the_same_bits_and_moves_only_free_particles():
     stage = SceneStage("flag")
     runs = []
     for seed in (1, 2, 1):
@@ -152,7 +152,7 @@ def test_a_lathe_turns_a_closed_cylinder_of_the_right_volume():
 
 
 @pytest.mark.parametrize("change", [{"integrator": "implicit_euler"}, {"strain_limit": 0.1}, {"substeps": 200}])
-def test_beyond_its_bound_the_sheet_bursts_and_the_sentence_says_why_until_a_reset(change):
+def test_a_diverged_sheet_shows_an_explanation_until_a_reset(change):
     stage = SceneStage("patch", Settings(fabric="knit", substeps=4, air_drag=0.75))
     bound = stage.simulation.largest_substep()[0]
     advanced(stage, 4)
@@ -178,7 +178,7 @@ def test_beyond_its_bound_an_explicit_method_is_unstable_and_another_one_coarse(
 # --- the visitor's hand ---------------------------------------------------------------------------------------------------
 
 
-def test_what_is_grabbed_follows_the_pointer_into_another_method_and_flies_on_when_it_is_let_go():
+def test_grabbed_cloth_follows_the_pointer_across_methods_and_flies_on_after_release():
     stage = advanced(SceneStage("patch", STILL), 2)
     place, up = stage.frame.positions[0, MIDDLE].astype(float), np.array([0.0, 0.0, 0.25])
     stage.grab(place + (0.004, -0.003, 0.0))  # nearest to the middle
@@ -492,7 +492,7 @@ def test_a_drag_a_click_and_a_shift_click_on_the_page_reach_the_cloth():
     assert visitor.stage._breath is not None and not client.notifications
 
 
-def test_files_hold_what_was_shown(tmp_path):
+def test_files_contain_the_displayed_frames(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     visitor, client = page("flag")
     ticked(visitor, 3)
@@ -541,7 +541,7 @@ def test_a_visit_that_fails_tells_its_visitor_and_ends_alone(monkeypatch, capsys
     assert client.notifications[-1].startswith("This page has stopped") and "a thread broke" in capsys.readouterr().err
 
 
-def test_a_link_restores_what_it_was_copied_from():
+def test_a_link_restores_its_page():
     visitor, _ = page("flag")
     for name, value in (("gravity", 3.0), ("fabric", "denim"), ("integrator", "verlet"), ("strain_limit", 5.0)):
         visitor.controls[name].turn(value)

@@ -267,7 +267,7 @@ def test_a_message_that_cannot_be_followed_is_a_sentence_and_the_visit_goes_on(r
 
 
 @pytest.mark.parametrize("value", [1e9, float("inf"), float("nan"), -1e12, "1e9", None, [3]])
-def test_sliders_stay_within_their_ranges_whatever_is_sent(value):
+def test_sliders_stay_within_their_ranges_for_any_input(value):
     visitor, client = page()
     controls = visitor.controls
     controls["auto"].turn(False)
@@ -373,7 +373,7 @@ def test_loopback_is_the_default_and_a_port_in_use_gives_the_next(running):
         (["--policy", "nowhere"], "no policy 'nowhere' (there are: noop, random, expert"),
     ],
 )
-def test_the_command_says_what_is_wrong(arguments, words, capsys):
+def test_the_command_reports_wrong_arguments(arguments, words, capsys):
     pytest.importorskip("viser")
     with pytest.raises(SystemExit):
         main(["view", *arguments])

@@ -113,7 +113,7 @@ def test_what_is_no_policy_is_a_sentence(tmp_path):
     for wrong, said in (
         (arrays, "it has 0 layers"),
         (arrays | weights, "layer 1 takes 2 numbers, the one before it gives 3"),
-        (arrays | {"weight_0": np.full((4, 3), np.nan), "bias_0": np.zeros(3)}, "layer 0 holds what is no finite number"),
+        (arrays | {"weight_0": np.full((4, 3), np.nan), "bias_0": np.zeros(3)}, "layer 0 has a value that is not finite"),
         (arrays | {"weight_0": np.zeros((4, 3)), "bias_0": np.zeros(2)}, r"biases of \(2,\)"),
         (arrays | {"weight_0": np.zeros((4, 3)), "bias_0": np.zeros(3), "about": "{}"}, "for which environment"),
     ):

@@ -206,7 +206,7 @@ def test_both_sides_have_their_color_and_lambert_s_law_their_brightness():
     assert hit.sum() > 100 and np.abs(lit.reshape(-1, 3)[hit] - expected).max() < 2
 
 
-def test_what_is_behind_the_camera_or_not_finite_is_not_drawn():
+def test_points_behind_the_camera_and_nonfinite_points_are_not_drawn():
     mesh, x = rumpled()
     sight = quick.sight_of(CAMERA, SIZE)
     empty = picture(quick.RGB, sight, x + np.float32((9, -15, 9)), mesh)

@@ -56,7 +56,7 @@ def evaluated(env, distance, velocity=(0.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize("policy", ["expert", "random"])
-def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices(policy):
+def test_return_is_performance_minus_initial_potential_with_penalties(policy):
     env, _ = start()
     rng = np.random.default_rng(0)
     d0, _ = corner(env)
@@ -138,7 +138,7 @@ def test_the_corner_moves_no_faster_than_the_limit_in_any_direction_and_stays_in
     assert env.task.simulation.positions[0, DRIVEN, [0, 2]] == pytest.approx([0.8, 1.7], abs=1e-4)
 
 
-def test_the_observation_is_what_the_manual_page_says():
+def test_observations_match_the_manual_page():
     env, _ = start(seed=8)
     for _ in range(5):
         observation, *_ = env.step(np.array([0.5, 1, 0.2]))
@@ -243,7 +243,7 @@ def test_the_expert_succeeds_from_every_start():
     assert info["normalized_performance"].mean() > 0.9
 
 
-def test_who_never_moves_scores_nothing():
+def test_no_action_scores_zero():
     """But for the centimeter by which the ripple moves the corner, perhaps towards the goal."""
     info = play(lambda env: np.zeros((20, 3)), seed=0)
     env = gym.make_vec(REACH, num_envs=20)
@@ -252,7 +252,7 @@ def test_who_never_moves_scores_nothing():
     assert np.median(info["normalized_performance"]) < 1e-3 and not info["is_success"].any()
 
 
-def test_who_goes_away_as_far_as_possible_scores_nothing():
+def test_moving_away_from_the_goal_scores_zero():
     """The clip at 0 holds: far away is no worse than the start, and never negative."""
 
     def flee(env):

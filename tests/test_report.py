@@ -40,19 +40,19 @@ def result(rate, seed=0, env_id="ClothReach-v0", **more):
 
 
 @pytest.mark.parametrize("name", DIGESTS)
-def test_the_noted_digests_are_what_environments_do_now(name):
+def test_committed_digests_match_the_environments(name):
     """Where they are not, ``python training/report.py --digests`` notes them, and marks the rows that are old."""
     env_id, _, kwargs = name.partition(" ")
     assert digest_of(env_id, json.loads(kwargs or "{}")) == DIGESTS[name]
 
 
-def test_every_environment_has_one_and_what_moves_no_bits_is_left_out():
+def test_every_environment_has_a_digest_without_irrelevant_arguments():
     assert set(ENVIRONMENTS) <= set(DIGESTS) and len(set(DIGESTS.values())) == len(DIGESTS)
     assert name_of("clothgym:ClothReach-v0", {"threads": 2, "settling": "at_once"}) == "ClothReach-v0"
     assert name_of("ClothReach-v0", {"rows": 7, "physics": "fast"}) == 'ClothReach-v0 {"physics": "fast", "rows": 7}'
 
 
-def test_committed_pages_are_what_the_command_makes(report):
+def test_committed_pages_are_up_to_date(report):
     stale = [str(path) for path, text in report.pages().items() if path.read_text() != text]
     assert not stale, f"python training/report.py  makes others of {', '.join(stale)}"
 
@@ -70,7 +70,7 @@ def test_rows_of_other_code_are_marked(report):
     assert "`noop` **(old)**" in table and "`expert` |" in table
 
 
-def test_a_row_says_what_its_seeds_came_to(report):
+def test_a_row_summarizes_its_seeds(report):
     rates = [0.95, 0.70, 0.90, 0.80, 0.99]
     table = report.table_of("ClothReach-v0", [result(rate, seed) for seed, rate in enumerate(rates)], [], {"ClothReach-v0": "now"})
     cells = [cell.strip() for cell in table.splitlines()[-1].split("|")]

@@ -65,7 +65,7 @@ def run(page, blocks):
 
 
 @pytest.mark.parametrize("page", SAMPLES)
-def test_a_page_s_samples_run(page, tmp_path, monkeypatch, capsys):
+def test_samples_of_a_page_run(page, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     run(page, PYTHON[page])
 
@@ -211,7 +211,7 @@ def test_every_id_that_is_named_exists():
         assert set(re.findall(r"\bCloth[A-Z]\w+(?:-Hard)?-v\d+", page)) <= set(ENVIRONMENTS), name
 
 
-def test_what_looks_like_python_is_marked_as_python():
+def test_python_samples_are_marked_as_python():
     for name, blocks in BLOCKS.items():
         for language, text in () if name in ELSEWHERE else blocks:
             assert language or not re.search(r"^(import|from|env|def|class) ?\b.*", text, re.MULTILINE), f"{name}: {text}"

@@ -94,7 +94,7 @@ def test_named_environments_advance_as_alone_and_the_others_stay(threads):
         lanes.step(envs=[0])
 
 
-def test_what_a_task_s_own_methods_do_to_those_that_stand_still_is_put_back(monkeypatch):
+def test_changes_of_task_methods_to_other_environments_are_undone(monkeypatch):
     from clothgym.envs.drape import DrapeTask
 
     def count(task):
@@ -108,7 +108,7 @@ def test_what_a_task_s_own_methods_do_to_those_that_stand_still_is_put_back(monk
     assert (env.task.episode["yaw"] - before).tolist() == [1 + env.task.settling_steps, 1]
 
 
-def test_a_batch_that_begins_again_by_itself_brings_the_end_of_what_has_settled():
+def test_a_batch_with_autoreset_returns_the_final_results_of_settled_episodes():
     env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=2, autoreset_mode="SameStep", settling="at_once").unwrapped
     env.reset(seed=4)
     lets_go = np.array([[0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0, -1, 0, 0, 0, -1.0]])

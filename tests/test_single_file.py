@@ -87,7 +87,7 @@ def test_advantages_end_with_a_termination_and_go_on_after_a_truncation(single):
     assert (single.advantages_of(batch, last, gamma, gae_lambda) == hand).all()
 
 
-def test_a_truncated_episode_is_worth_what_its_last_observation_is(single):
+def test_truncated_episodes_bootstrap_from_their_last_observation(single):
     """Beside the same actions in environments that are not reset."""
     import torch
 

@@ -45,7 +45,7 @@ def test_on_a_cylinder_it_is_the_cosine_of_half_the_angle(angle):
     assert certificate(mesh, p) == pytest.approx(max(np.cos(angle / 2), 0), abs=1e-9)
 
 
-def test_what_it_promises_holds_for_points_of_all_triangles():
+def test_the_bound_holds_for_points_of_all_triangles():
     mesh, rng = grid(9, 9, 0.5, 0.5), np.random.default_rng(2)
     rest, seen = mesh.rest_positions.astype(float), []
     weights = rng.dirichlet([1, 1, 1], size=(20, len(mesh.triangles)))

@@ -114,7 +114,7 @@ def test_starts_that_intersect_are_refused():
         starts.make(GRID, kind="folded", seed=3, self_collision=False)
 
 
-def test_what_cannot_be_started():
+def test_invalid_starts_are_refused():
     with pytest.raises(ValueError, match="crumpled"):
         starts.make(GRID, kind="ironed")
     with pytest.raises(ValueError, match="3 times at most"):

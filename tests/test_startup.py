@@ -137,7 +137,7 @@ if __name__ == "__main__":
 """
 
 
-def test_an_integrator_of_one_s_own_runs_from_a_script_a_module_and_a_prompt(filled, tmp_path):
+def test_custom_integrators_run_from_scripts_modules_and_prompts(filled, tmp_path):
     (tmp_path / "mine.py").write_text(MINE)
     cache = {"CLOTHGYM_CACHE_DIR": str(shutil.copytree(filled[0], tmp_path / "cache")), "PYTHONPATH": str(tmp_path)}
     codes = [f"import runpy; runpy.run_path({str(tmp_path / 'mine.py')!r}, run_name='__main__')", "import mine; mine.go()", MINE]

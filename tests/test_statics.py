@@ -66,7 +66,7 @@ def test_a_hanging_chain_is_as_long_as_the_exact_solution(name):
     assert stretch.sum() == pytest.approx(M * G * LINKS * (LINKS + 1) / (2 * K), rel=1e-8)
 
 
-def test_implicit_euler_s_tolerance_bounds_what_its_solver_leaves():
+def test_implicit_euler_tolerance_bounds_the_residual():
     """The residual is compared with the weight: at a tolerance of 1e-3, a thousandth of it may be left."""
     simulation = hanging_chain("implicit_euler", 5e-4, 0.05, {"name": "implicit_euler", "tolerance": 1e-3})
     assert stretch_at_rest(simulation, 4) == pytest.approx(TENSION / K, rel=1e-3)
@@ -117,7 +117,7 @@ def test_a_cable_hangs_as_the_elastic_catenary(length, softness):
     assert -simulation.positions[0, :, 2].min() == pytest.approx(truth.sag, rel=1e-3)
 
 
-def test_the_cable_s_sag_converges_at_order_2():
+def test_cable_sag_converges_at_order_2():
     """To the catenary's, and at each number of links it is that of straight links in equilibrium."""
     truth, errors = catenary(1.2, 1e-3).sag, []
     for links in (4, 8, 16, 32, 64):
@@ -155,7 +155,7 @@ def plane_energy(strain, young=300.0, poisson=1 / 3):
 
 
 @pytest.mark.parametrize("degrees", [0, 15, 40, 90])
-def test_equilateral_triangles_have_young_s_modulus_and_a_third_of_contraction(degrees):
+def test_equilateral_triangles_have_the_young_modulus_and_contract_by_a_third(degrees):
     """Uniaxial stress in any direction stores E e^2/2 at Poisson's ratio 1/3, and more at any other; shear stores 3/8 E."""
     mesh, tiny = lattice(), 1e-5
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -168,7 +168,7 @@ def test_equilateral_triangles_have_young_s_modulus_and_a_third_of_contraction(d
 
 
 @pytest.mark.parametrize("rings", [4, 12])
-def test_a_disc_has_young_s_modulus_too(rings):
+def test_disc_has_the_young_modulus(rings):
     """Its triangles are not equilateral, its six sectors make up for that: against plane stress with nu = 1/3."""
     for degrees in (0, 15, 30, 45):
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -222,7 +222,7 @@ def test_seed_cases_rest_where_scipy_finds_the_minimum(case, name):
 
 
 @pytest.mark.parametrize("case", [PATCH, PROVOT], ids=["patch", "provot"])
-def test_xpbd_s_seed_cases_approach_the_minimum_with_the_substep(case):
+def test_xpbd_approaches_the_energy_minimum_with_smaller_substeps(case):
     """Springs turn within a substep while their multipliers add up: of first order in h^2, however many iterations."""
     far, near = (distance_at_rest("xpbd", case, h) for h in (8e-3, 4e-3))
     assert near < 5e-4 * case[1]

@@ -124,7 +124,7 @@ def test_in_a_calm_each_clip_carries_half_the_weight():
 
 
 @pytest.mark.parametrize("policy", ["expert", "careless", "still"])
-def test_the_return_is_the_performance_less_the_start_s_potential_and_the_prices(policy):
+def test_return_is_performance_minus_initial_potential_with_penalties(policy):
     env, _ = start()
     total, effort, terminated, steps, way = 0.0, 0.0, False, 0, whole_way(env)
     assert potential(env, way) == pytest.approx(0, abs=1e-6)
@@ -227,7 +227,7 @@ def test_both_clips_must_arrive(left, right, arrives):
     assert terminated == info["is_success"] == info["is_safe_success"] == arrives
 
 
-def test_who_has_paid_once_does_not_arrive_safely():
+def test_arrival_after_a_cost_is_not_a_safe_success():
     env, _ = start()
     *_, info = env.step(APART)
     env.step(-APART)
@@ -259,7 +259,7 @@ def test_clips_move_as_one_no_faster_than_the_limit_and_stay_in_their_room():
 
 
 @pytest.mark.parametrize("next_one", [0, 1, 2])
-def test_the_observation_is_what_the_manual_page_says(next_one):
+def test_observations_match_the_manual_page(next_one):
     env, first = start(seed=8, threshold=0.07, bending="springs")
     assert first.shape == (78,)
     env.task.episode["next"][0] = next_one
@@ -286,7 +286,7 @@ def test_the_observation_is_what_the_manual_page_says(next_one):
     assert observation[69:72] == pytest.approx(env.get_state().simulation.wind[0], abs=1e-6) and np.any(observation[69:72])
 
 
-def test_starts_are_drawn_as_the_manual_page_says():
+def test_starts_match_the_manual_page():
     env = batch(150)
     task, x = env.unwrapped.task, positions(env)
     corners, places = x[:, [LEFT, RIGHT]], task.episode["places"]
@@ -375,7 +375,7 @@ def test_random_actions_never_arrive():
 
 
 @pytest.mark.slow
-def test_who_never_moves_scores_nothing_and_pays_next_to_nothing():
+def test_no_action_scores_zero_at_almost_no_cost():
     last = play(lambda env: np.zeros((20, 6)))
     assert np.all(last["steps"] == STEPS) and not any(last["failure"])
     assert last["normalized_performance"].max() < 1e-6 and not last["is_success"].any()

@@ -8,7 +8,7 @@ from conftest import line_mesh
 from equilibria import G, sheet_network, strains
 
 from clothgym import Material, Simulation, Sphere, grid
-from clothgym.elements import element_arrays, surface_arrays, weave_of
+from clothgym.elements import element_arrays, surface_arrays, topology_of
 from clothgym.limiting import AFTER, BEFORE, TOLERANCE, USED, kernels_of
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y
 
@@ -20,9 +20,9 @@ def limited(mesh, x, v, w, limit=LIMIT):
     x, v, w = x.T[:, :, None].copy(), v.T[:, :, None].copy(), np.asarray(w, float)[:, None]
     real = np.dtype(np.float64)
     elements = element_arrays(mesh, real, hinged=False, any_order=False)
-    weave = weave_of(mesh, elements, surface_arrays(mesh, real), "springs", by_particle=False)
+    topology = topology_of(mesh, elements, surface_arrays(mesh, real), "springs", by_particle=False)
     report = np.zeros((3, 1))
-    kernels_of(True, False)["restrain"](x, v, w, weave, limit, report)
+    kernels_of(True, False)["restrain"](x, v, w, topology, limit, report)
     return x[:, :, 0].T, v[:, :, 0].T, report[:, 0]
 
 

@@ -6,7 +6,7 @@ import pytest
 
 import clothgym  # noqa: F401
 from clothgym.envs.gripper_task import REACH
-from clothgym.envs.taking import AWAY, CLEAR, beside_corners, next_edge, next_takes, places_to_take
+from clothgym.envs.taking import AWAY, CLEAR, corner_neighbors, next_edge, next_takes, places_to_take
 from clothgym.mesh import grid
 
 MESH = grid(17, 17, 0.6, 0.6)
@@ -24,9 +24,9 @@ def test_a_corner_that_lies_alone_is_taken_from_straight_above():
 
 def test_the_neighbors_of_a_corner_may_be_taken_along_and_no_others():
     # itself, two along the edges, and one across the diagonal of a cell
-    beside = beside_corners(MESH)
-    assert beside.sum(axis=1).tolist() == [4, 4, 4, 4]
-    assert np.flatnonzero(beside[0]).tolist() == [0, 1, 17, 18]
+    neighbors = corner_neighbors(MESH)
+    assert neighbors.sum(axis=1).tolist() == [4, 4, 4, 4]
+    assert np.flatnonzero(neighbors[0]).tolist() == [0, 1, 17, 18]
 
 
 def test_other_cloth_above_a_corner_is_avoided():
@@ -56,7 +56,7 @@ def taken_next(x, tips, holder=None, high=(9, 9, 9)):
     next_takes(
         across,
         np.array(MESH.corners),
-        beside_corners(MESH),
+        corner_neighbors(MESH),
         holder,
         np.array(tips, float),
         0.6,
@@ -143,7 +143,7 @@ def test_what_the_other_gripper_holds_is_not_taken():
     assert taken_next(x, [x[0], x[MESH.corners[1]] + (0, 0, 0.1)], holder)[1] == [-1, -1]
 
 
-def test_nothing_is_taken_beside_what_is_held_by_mistake():
+def test_no_grasp_point_while_other_cloth_is_held():
     x, holder = lying_flat(), np.full(MESH.num_particles, -1)
     holder[8 * 17 + 8] = 0
     assert taken_next(x, [x[144], (0, 0, 0.3)], holder)[1] == [-1, -1]
@@ -154,7 +154,7 @@ def edge_next(x, tips, low=(-9, -9, 0), high=(9, 9, 9)):
     goals, count = np.full((2, 3), np.nan), np.empty(2, np.int64)
     room = [np.array(one, float) for one in (low, high)]
     across = np.ascontiguousarray(x.T)
-    next_edge(across, np.array(MESH.corners), beside_corners(MESH), 17, np.array(tips, float), *room, goals, count)
+    next_edge(across, np.array(MESH.corners), corner_neighbors(MESH), 17, np.array(tips, float), *room, goals, count)
     return goals, count.tolist()
 
 
@@ -231,17 +231,17 @@ def test_the_far_edge_is_observed_while_an_edge_is_held():
                 continue
             # the neighbor of each corner that the other gripper does not hold
             turns = [around.index(corner) for corner in held]
-            beside = [next(j for j in (around[i - 1], around[(i + 1) % 4]) if j not in held) for i in turns]
+            adjacent = [next(j for j in (around[i - 1], around[(i + 1) % 4]) if j not in held) for i in turns]
             along = (tips[e, 1] - tips[e, 0]) * (1, 1, 0)
             along /= np.linalg.norm(along)
             # with its front up the sheet lies across the edge as it does at rest
-            up = np.sign(np.cross(rest[held[1]] - rest[held[0]], rest[beside[0]] - rest[held[0]])[2])
+            up = np.sign(np.cross(rest[held[1]] - rest[held[0]], rest[adjacent[0]] - rest[held[0]])[2])
             across = np.cross((0, 0, up), along)
             assert out == pytest.approx(across[:2], abs=1e-5)
-            ways = x[e, beside] - tips[e]
+            ways = x[e, adjacent] - tips[e]
             expected = np.stack([ways @ along, ways @ across, ways[:, 2]], axis=1) / 0.6
             assert far.reshape(2, 3) == pytest.approx(expected, abs=1e-5)
-            assert swing.item() == pytest.approx(v[e, beside].mean(axis=0) @ across, abs=1e-5)
+            assert swing.item() == pytest.approx(v[e, adjacent].mean(axis=0) @ across, abs=1e-5)
             found += 1
     assert found > 50
     env.close()

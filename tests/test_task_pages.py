@@ -30,7 +30,7 @@ def row_of(env_id, policy, score, **more):
     return row | {"mean_length": 40.0, "diverged": 0, "torn": 3, "out_of_bounds": 0} | more
 
 
-def test_committed_pages_are_what_the_command_makes(task_pages):
+def test_committed_pages_are_up_to_date(task_pages):
     made = task_pages.all_pages(task_pages.read_scores())
     committed = {path.name: path.read_text() for path in PAGES.glob("*.md")}
     stale = sorted(name for name in {*made, *committed} if made.get(name) != committed.get(name))
@@ -39,7 +39,7 @@ def test_committed_pages_are_what_the_command_makes(task_pages):
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
-def test_a_page_has_what_a_user_looks_for(env_id):
+def test_a_page_has_all_sections(env_id):
     text = (PAGES / f"{env_id}.md").read_text()
     assert text.startswith(f"# {env_id}\n\n{ENVIRONMENTS[env_id][1]}\n")
     headings = re.findall(r"^## (.*)$", text, re.MULTILINE)

@@ -40,18 +40,18 @@ def lifting(way):
 # --- somebody else's task -------------------------------------------------------------------------------------------------
 
 
-def test_somebody_else_s_task_is_short_and_has_no_kernel():
+def test_the_example_task_is_short_and_has_no_kernel():
     source = inspect.getsource(hang_towel)
     assert len(source.splitlines()) <= 45 and "kernel" not in source and "._" not in source and " _" not in source
 
 
-def test_gymnasium_s_checker_passes_for_somebody_else_s_task():
+def test_gymnasium_checker_passes_for_a_custom_task():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(gym.make(TOWEL).unwrapped)
 
 
-def test_its_reward_is_the_change_of_its_performance_and_its_observation_what_it_declares():
+def test_a_custom_task_has_its_declared_reward_and_observations():
     env = gym.make(TOWEL).unwrapped
     observation, _ = env.reset(seed=3)
     goal = float(env.task.episode["goal"][0])
@@ -180,7 +180,7 @@ def test_hooks_are_called_around_the_physics_and_write_info():
     assert env.task.calls == [("before", 0.5, 0), ("after", pytest.approx(z, abs=1e-6), 1)] and info["calls"] == 2
 
 
-def test_what_a_task_does_not_say_has_a_default():
+def test_undefined_hooks_have_defaults():
     env = env_of(Counting)
     observation, _ = env.reset(seed=0)
     task = env.task
@@ -228,7 +228,7 @@ def test_a_wrong_keyword_gets_the_list_of_right_ones(env_id):
             maker(env_id if ":" in env_id else f"clothgym:{env_id}", integrater="xpbd")
 
 
-def test_a_task_s_own_keywords_are_among_the_right_ones():
+def test_own_keywords_of_a_task_are_listed_as_valid():
     with pytest.raises(TypeError, match="there are: grippers, shapes, slip_force, action_mode, rows, side, fabric"):
         gym.make("clothgym:ClothDrapeGripper-v0", gripers=1)
     with pytest.raises(TypeError, match="there are: threshold, cost_penalty, strain_limit, integrator, rows, side, fabric"):
@@ -237,7 +237,7 @@ def test_a_task_s_own_keywords_are_among_the_right_ones():
 
 @two_tasks
 @pytest.mark.filterwarnings("ignore:.*substeps")
-def test_a_fabric_by_name_has_the_preset_s_measured_properties_and_the_task_s_air(env_id):
+def test_a_fabric_by_name_has_the_measured_properties_and_the_task_air_drag(env_id):
     env, usual = gym.make(f"clothgym:{env_id}", fabric="silk").unwrapped, gym.make(f"clothgym:{env_id}").unwrapped
     own, silk = type(env.task).physics.material, env.task.simulation.material
     assert {name: getattr(silk, name) for name in SILK} == SILK
@@ -254,7 +254,7 @@ def test_a_fabric_by_name_has_the_preset_s_measured_properties_and_the_task_s_ai
     assert "silk" in gym.make(f"clothgym:{env_id}", fabric="silk").spec.to_json()
 
 
-def test_another_fabric_has_automatic_substeps_and_its_own_name_the_task_s():
+def test_another_fabric_has_automatic_substeps_and_the_default_keeps_its_own():
     # twice as heavy, stiff and damped moves alike
     denim = {"density": 0.4, "stretch_stiffness": 1615.7, "shear_stiffness": 807.8, "bend_rigidity": 5.865e-5, "air_drag": 0.394}
     double = Material(**{name: 2 * value for name, value in denim.items()})
@@ -268,7 +268,7 @@ def test_another_fabric_has_automatic_substeps_and_its_own_name_the_task_s():
 
 
 @pytest.mark.parametrize("fabric", ["velvet", 3, {"density": 1}])
-def test_a_fabric_that_there_is_not_gets_the_list_of_those_that_there_are(fabric):
+def test_an_unknown_fabric_lists_the_known_ones(fabric):
     known = "median, cotton_broad.*penava_cotton, knit, polyester, silk, wool, denim"
     with pytest.raises(ValueError, match=known):
         gym.make("clothgym:ClothReach-v0", fabric=fabric)
@@ -302,7 +302,7 @@ def rows(env_id, heading):
 
 
 @every_task
-def test_the_page_s_table_says_where_each_observation_lies_and_its_bound(env_id):
+def test_the_page_table_has_the_slice_and_bound_of_each_observation(env_id):
     env = gym.make(f"clothgym:{env_id}").unwrapped
     table, space = rows(env_id, "Observation Space"), env.observation_space
     assert [row[1].strip("`") for row in table] == list(env.observation_slices)
@@ -323,7 +323,7 @@ def test_the_page_s_table_says_where_each_observation_lies_and_its_bound(env_id)
 
 
 @every_task
-def test_the_page_s_table_has_every_keyword_and_its_default(env_id):
+def test_the_page_table_has_every_keyword_and_its_default(env_id):
     env = gym.make(f"clothgym:{env_id}").unwrapped
     table = {row[0].strip("`"): row[1:] for row in rows(env_id, "Arguments")}
     simulation = env.task.simulation
@@ -349,7 +349,7 @@ def test_observations_are_found_by_name_in_a_batch_of_any_kind():
     assert one.observation_slices["grippers"] == slice(67, 74) and one.observation_space.shape == (74,)
 
 
-def test_a_page_of_a_task_without_one_is_made_from_its_own():
+def test_a_task_without_a_page_gets_a_generated_one():
     page = hang_towel.HangTowelEnv.__doc__
     assert "| 54 | ``goal`` | its height | m | 1 |" in page and "``fabric``" in page
     assert env_of(Counting).__doc__.startswith("A sheet on the floor")

@@ -77,7 +77,7 @@ def test_a_run_is_resumed_and_never_overwritten(trained):
 
 
 @pytest.mark.slow
-def test_the_learned_policy_is_evaluated_beside_the_references(trained):
+def test_the_learned_policy_is_compared_with_the_references(trained):
     folder, _ = trained
     out = folder / "scores.json"
     reach = ("--env", "ClothReach-v0")
@@ -139,7 +139,7 @@ def test_wrong_names_are_refused_as_wrong_flags_are_before_anything_slow(command
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_hyperparameters_of_one_s_own_do_not_drop_our_curriculum_in_silence(wrong, capsys):
+def test_custom_hyperparameters_warn_before_dropping_the_curriculum(wrong, capsys):
     import train
 
     Path("short.yml").write_text(SHORT.replace("ClothReach", "ClothDrape"))
@@ -232,8 +232,8 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
     nan = state["policy"] | {name: state["policy"][name] * torch.nan}
     for other, said in (
         ({"policy": state["policy"]}, "does not hold policy, optimizer"),
-        (state | {"policy": nan}, "no finite number"),
-        (state | {"num_timesteps": -3}, "fewer than no steps"),
+        (state | {"policy": nan}, "a value that is not finite"),
+        (state | {"num_timesteps": -3}, "number of steps is negative"),
     ):
         runs.save_tensors(broken / "checkpoint.pt", other)
         with pytest.raises(ValueError, match=f"checkpoint.pt' is no checkpoint .*{said}"):
@@ -248,7 +248,7 @@ def test_checkpoints_that_lack_something_or_hold_nonsense_are_a_sentence(broken)
 
 
 @pytest.mark.slow
-def test_a_resumed_run_says_what_it_drops(broken, trained):
+def test_a_resumed_run_reports_dropped_lines(broken, trained):
     """A broken line and one from after the checkpoint, and a checkpoint that is gone."""
     _, options = trained
     lines = (broken / "progress.jsonl").read_text().splitlines()

@@ -100,7 +100,7 @@ def test_costs_are_evaluated(tmp_path):
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_demonstrations_are_what_the_expert_would_do_undisturbed(scripts, noise):
+def test_demonstrations_are_the_unperturbed_actions_of_the_expert(scripts, noise):
     """The reach's expert goes to its place at 1.5 times the distance a second: what it does can be read off what is seen."""
     from clone import demonstrations
     from stable_baselines3.common.vec_env import VecMonitor
@@ -121,7 +121,7 @@ def test_demonstrations_are_what_the_expert_would_do_undisturbed(scripts, noise)
     assert strayed.max() < 1e-3 if noise == 0 else 0.1 < strayed.max() < 0.6 and strayed.max() > 2 * strayed.min()
 
 
-def test_what_is_done_while_the_sheet_settles_is_not_demonstrated(scripts):
+def test_settling_steps_are_not_demonstrated(scripts):
     from clone import demonstrations
 
     from clothgym.adapters.sb3 import make_sb3_vec_env
@@ -131,7 +131,7 @@ def test_what_is_done_while_the_sheet_settles_is_not_demonstrated(scripts):
     assert not observations[:, 65].any() and np.abs(actions).max() <= 1
 
 
-def test_the_expert_of_a_goal_task_is_cloned_and_its_clone_is_read_again(scripts, tmp_path):
+def test_behavior_cloning_of_a_goal_task_survives_saving_and_loading(scripts, tmp_path):
     from clone import clone, demonstrations
     from learners import save_checkpoint
     from stable_baselines3 import PPO
@@ -178,7 +178,7 @@ def test_a_cloned_policy_succeeds_before_it_has_learned_and_is_not_cloned_again(
     assert scores["timesteps"] == 5120 and scores["success_rate"] > 0.5 > scores["references"]["random"]["success_rate"]
 
 
-def test_beside_a_clone_only_the_critic_learns_at_first(scripts):
+def test_only_the_critic_of_a_cloned_policy_learns_at_first(scripts):
     """For one rollout; the next one moves the policy, too."""
     from learning import FrozenPolicy
     from stable_baselines3 import PPO
@@ -200,7 +200,7 @@ def test_beside_a_clone_only_the_critic_learns_at_first(scripts):
     }
 
 
-def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
+def test_a_curriculum_continues_with_the_arguments_of_the_run(scripts):
     """Where the first part ends the learner's environments are others, just begun; a resumed run begins where it belongs."""
     import learning
     from learners import build
@@ -224,7 +224,7 @@ def test_a_curriculum_goes_on_with_the_run_s_own_arguments(scripts):
 
 
 @pytest.mark.slow
-def test_a_clone_alone_is_scored_again_and_not_cloned_again(unfilmed, tmp_path):
+def test_resumed_behavior_cloning_is_scored_again_without_another_fit(unfilmed, tmp_path):
     """Killed before its score, and finished."""
     (tmp_path / "short.yml").write_text(CLONED.replace("!!float 2560", "0"))
     options = ("--eval-episodes", 5, "--final-episodes", 10)
@@ -240,7 +240,7 @@ def test_a_clone_alone_is_scored_again_and_not_cloned_again(unfilmed, tmp_path):
 
 
 @pytest.mark.parametrize("env_id", ["ClothReach-v0", "ClothFoldGoal-v0"])
-def test_a_replay_buffer_is_filled_with_what_the_expert_did(env_id, scripts):
+def test_a_replay_buffer_is_filled_with_expert_transitions(env_id, scripts):
     """The transitions are those of a batch that is stepped by hand with the same actions, episode by episode."""
     from clone import fill
     from stable_baselines3 import SAC, HerReplayBuffer

@@ -86,7 +86,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_no_sheet_is_refused_with_the_remedy(tmp_path, case):
+def test_invalid_sheets_are_refused_with_a_remedy(tmp_path, case):
     suffix, x, triangles, message = REFUSED[case]
     path = write(tmp_path / f"sheet{suffix}", x, triangles)
     with pytest.raises(ValueError, match=message) as refusal:
@@ -96,14 +96,14 @@ def test_what_is_no_sheet_is_refused_with_the_remedy(tmp_path, case):
 
 @pytest.mark.parametrize("name", ["text.obj", "text.ply", "text.stl", "text.off", "text.glb", "text.xyzzy", "text"])
 @pytest.mark.parametrize("content", ["", "hello world\n"])
-def test_what_is_no_mesh_is_refused(tmp_path, name, content):
+def test_invalid_mesh_files_are_refused(tmp_path, name, content):
     path = tmp_path / name
     path.write_text(content)
     with pytest.raises(ValueError, match=f"{name}.*(cannot be read|holds no triangles).*export the sheet as a triangle mesh"):
         load_mesh(path)
 
 
-def test_what_is_no_file_is_refused(tmp_path):
+def test_missing_files_and_folders_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"gone\.obj.*no such file.*check the path"):
         load_mesh(tmp_path / "gone.obj")
     with pytest.raises(ValueError, match="folder.*name a file"):
@@ -123,7 +123,7 @@ def test_without_trimesh_the_extra_is_named_where_it_is_needed(tmp_path, monkeyp
     [
         (np.vstack([SQUARE, [[2.0, 0.0, 0.0]]]), [*PAIR, [0, 1, 4]], r"triangle 2, \[0, 1, 4\].*remove it"),
         (SQUARE, [[0, 1, 2], [0, 1, 2], [1, 3, 2]], r"\[0, 1, 2\] is there 2 times.*remove"),
-        (SQUARE, [[0, 1, 2], [1, 2, 3]], "edge 1-2 disagree.*reverse one"),
+        (SQUARE, [[0, 1, 2], [1, 2, 3]], "edge 1-2 have opposite orientations: flip one"),
         (ABOVE, [[0, 1, 2], [1, 0, 3], [0, 1, 4]], "edge 0-1 belongs to 3 triangles.*remove"),
         (np.vstack([SQUARE, [[9.0, 9.0, 9.0]]]), PAIR, "vertex 4 belongs to no triangle.*remove it"),
         (SQUARE[:, :2], PAIR, r"shape \(4, 2\).*\(particles, 3\)"),
@@ -150,13 +150,13 @@ def test_disc_has_its_counts_and_area(rings):
 
 
 @pytest.mark.parametrize("arguments", [(0.0, 3), (np.nan, 3), (0.1, 0), (0.1, 2.5)])
-def test_disc_names_what_is_wrong(arguments):
+def test_disc_names_the_wrong_argument(arguments):
     with pytest.raises(ValueError, match="radius=|rings="):
         disc(*arguments)
 
 
 @pytest.mark.parametrize(("axis", "other"), [(0, 1), (1, 0)])
-def test_equilateral_triangles_have_young_s_modulus_and_poisson_s_ratio_of_a_third(axis, other):
+def test_equilateral_triangles_have_the_young_modulus_and_poisson_ratio_one_third(axis, other):
     """Van Gelder 1998: strain e stores E t e^2/(2 (1 - nu^2)) an area across, and nu times the cross term; small strains."""
     rows, columns, a = 9, 9, 0.01
     r, c = np.divmod(np.arange(rows * columns), columns)

@@ -46,14 +46,14 @@ def test_the_mode_of_a_hanging_chain():
     assert hanging_mode([1.0, 0.0]) == pytest.approx([0, 1], abs=1e-12)
 
 
-def test_a_hanging_sheet_swings_with_bernoulli_s_period():
+def test_a_hanging_sheet_swings_with_the_bernoulli_period():
     """Within half a percent with eleven rows, and without air it keeps its amplitude."""
     swing = free_swing(Material.preset("median"), amplitude=0.02, length=0.42, rows=11, seconds=4.0, air_density=0.0)
     assert swing.period == pytest.approx(5.2255 * np.sqrt(0.42 / 9.81), rel=5e-3)
     assert swing.peaks[:, 1] == pytest.approx(0.02, rel=0.01)
 
 
-def test_air_takes_from_a_swing_what_the_quadratic_law_says():
+def test_air_damps_a_swing_by_the_quadratic_law():
     """1/a - 1/a_0 = K t, K from the work of ``rho C_D/2 |v|^3`` over a swing, integrated here over time and length."""
     fabric, length, start = Material.preset("median"), 0.42, 0.03
     phase, share = np.meshgrid(np.linspace(0, 2 * np.pi, 400, endpoint=False), (np.arange(400) + 0.5) / 400)
@@ -71,7 +71,7 @@ def test_a_swing_of_half_the_length_is_no_small_one():
         free_swing(Material(), amplitude=0.3, length=0.42)
 
 
-def test_the_fling_s_hands_go_where_the_benchmark_has_them():
+def test_the_fling_follows_the_benchmark_path():
     """Places and speeds at the ends of the four pieces, from the benchmark; smooth between them, and at rest outside."""
     times = np.array([-1.0, 0.0, 1.1, 2.6, 3.9, 4.4, 9.0])
     places = fling_hands(times)

@@ -23,7 +23,7 @@ def test_the_first_trial_is_the_committed_configuration(tune, env):
     assert again == config and config["curriculum"] == {}
 
 
-def test_what_is_found_can_be_trained_with(tune):
+def test_tuned_hyperparameters_can_be_used_for_training(tune):
     config = tune.Args(env="ClothReach-v0", timesteps=1000).config
     trial = tune.starting_point(config) | {"n_envs": 16, "minibatches": 8, "n_steps": 20, "learning_rate": 0.00123456}
     found = yaml.safe_load(tune.as_yaml(tune.proposed(optuna.trial.FixedTrial(trial), config)))["ClothReach-v0"]

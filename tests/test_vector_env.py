@@ -41,7 +41,7 @@ def assert_infos_agree(info, expected):
 
 @two_tasks
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_every_mode_behaves_as_gymnasium_s_own_vector_env(env_id, mode):
+def test_every_autoreset_mode_matches_the_gymnasium_vector_env(env_id, mode):
     """Observations, rewards, flags and infos beside SyncVectorEnv's, over episodes that end at different steps."""
     native = make_vec(env_id, 2, autoreset_mode=mode, threads=1)
     sync = gym.vector.SyncVectorEnv([lambda: make(env_id).unwrapped] * 2, autoreset_mode=mode)
@@ -96,7 +96,7 @@ def test_seeds_by_list_and_by_integer(env_id):
 
 
 @two_tasks
-def test_what_users_of_gymnasium_s_own_vector_envs_rely_on(env_id):
+def test_the_gymnasium_vector_interface_is_complete(env_id):
     env = make_vec(env_id, 2, render_mode="rgb_array")
     env.reset(seed=0)
     frames = env.call("render")

@@ -60,7 +60,7 @@ def one_triangle():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_one_triangle_feels_the_formula_s_force_shared_by_its_corners(seed):
+def test_the_air_force_on_a_triangle_matches_the_formula(seed):
     rng = np.random.default_rng(seed)
     mesh = one_triangle()
     velocities, wind = rng.normal(size=(3, 3)), rng.normal(scale=3, size=3)
@@ -99,14 +99,14 @@ def test_drag_and_lift_of_a_flat_plate(degrees):
 
 
 @pytest.mark.parametrize("mesh", [SHEET, grid(5, 5, 0.3, 0.3), grid(2, 3, 0.2, 0.1)])
-def test_a_flat_sheet_s_force_is_spread_by_the_area_that_particles_stand_for(mesh):
+def test_the_air_force_is_distributed_by_particle_area(mesh):
     """So the wind moves it as a whole, border and corners too."""
     force = air(mesh, mesh.rest_positions, 0.0, (0, 0, 3.0))
     assert force[:, 2] / mesh.area == pytest.approx(RHO / 2 * CD * 9.0, rel=1e-5)
     assert np.abs(force[:, :2]).max() < 1e-9
 
 
-def test_there_is_no_force_in_the_wind_s_own_frame():
+def test_there_is_no_force_at_zero_relative_velocity():
     wind = np.array([1.5, -0.5, 0.3])
     assert np.abs(air(SHEET, tilted(0.7), wind, wind)).max() < 1e-9
     # and only the difference of velocities counts

@@ -1,8 +1,8 @@
 """Behavior cloning: teach a policy what the scripted expert does, before PPO, or instead of it.
 
-The expert is disturbed while it shows its way, each episode by a noise of its own strength, and what is learned is what it would
-do undisturbed (Laskey et al. 2017, DART): so the learner also sees how to come back.  In further rounds the learner acts, and the
-expert says what it would have done (Ross et al. 2011, DAgger).
+The expert's actions are perturbed during demonstrations, with a different noise strength in each episode, and the targets are its
+unperturbed actions (Laskey et al. 2017, DART): the learner thus also sees corrections.  In further rounds the learner acts, and the
+expert labels the observations with its actions (Ross et al. 2011, DAgger).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
     task a dictionary of observations.
 
     noise: largest standard deviation of the disturbance; each environment draws its own for each of the rounds.
-    learner: who acts in the expert's place, if anyone; what is noted is what the expert would do.
+    learner: policy that acts instead of the expert, if any; the recorded actions are the expert's.
     """
     rng = np.random.default_rng(seed)
     task = env.unwrapped.env.task  # type: ignore[attr-defined]
@@ -36,7 +36,7 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
         strength = noise * rng.uniform(size=(env.num_envs, 1))
         for _ in range(task.most_steps()):
             wanted = np.clip(task.expert(), -1, 1).astype(np.float32)
-            # what is done while the sheet settles does not matter, and would only blur what does
+            # actions while the sheet settles have no effect, and would only disturb the fit
             acting = task.episode["settling_since"] < 0
             observations.append({key: part[acting] for key, part in seen.items()} if isinstance(seen, dict) else seen[acting])
             actions.append(wanted[acting])
@@ -51,7 +51,7 @@ def demonstrations(env: VecEnv, episodes: int, noise: float, seed: int, learner:
 def fill(model: OffPolicyAlgorithm, episodes: int, noise: float, seed: int) -> None:
     """Put some episodes of each environment, in which a disturbed expert acts, into the learner's replay buffer.
 
-    noise: as of ``demonstrations``; what is stored is what was done.
+    noise: as of ``demonstrations``; the buffer stores the perturbed actions.
     """
     rng, env, buffer = np.random.default_rng(seed), model.env, model.replay_buffer
     assert env is not None and buffer is not None

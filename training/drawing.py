@@ -83,7 +83,7 @@ def film(
 
 
 def _row(images: list[np.ndarray]) -> np.ndarray:
-    """Pictures beside each other, with four white columns between them."""
+    """Pictures side by side, with four white columns between them."""
     bordered = [np.pad(image, ((0, 0), (0, 4), (0, 0)), constant_values=255) for image in images]
     return np.concatenate(bordered, axis=1)[:, :-4]
 
@@ -91,8 +91,8 @@ def _row(images: list[np.ndarray]) -> np.ndarray:
 def draw_curves(env_id: str, results: list[dict[str, Any]]) -> None:
     """Held-out success of every seed over steps and over minutes, and its cost where there is one.
 
-    A color for each learner: a thin line for each seed, a band over all of them, their median bold.  A clone that learns no
-    further is a point for each seed.
+    A color for each learner: a thin line for each seed, a band over all of them, their median bold.  Behavior cloning
+    without further learning is a point for each seed.
     """
     from results import groups, progress  # imported here: runs need no committed results
 

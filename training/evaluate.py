@@ -48,7 +48,7 @@ class Args:
     json: Path | None = None
     """Where to write the scores, if anywhere; a suite goes on with those that are there."""
     anew: bool = False
-    """Of a suite: score also what is in the file already."""
+    """For a suite: score again the rows that are already in the file."""
     threads: int | None = None
     """Threads of the environments, which change no score; all processors by default."""
 
@@ -98,7 +98,7 @@ def main(args: Args) -> None:
 def _how_to_go_on(args: Args) -> str:
     if not args.suite:
         return ""
-    return f"; what is finished is in {args.json}, the same command goes on" if args.json else "; without --json nothing is kept"
+    return f"; {args.json} has finished rows, the same command continues" if args.json else "; without --json nothing is kept"
 
 
 if __name__ == "__main__":

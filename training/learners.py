@@ -22,7 +22,7 @@ from clothgym.policies import Policy
 LEARNERS: dict[str, type[BaseAlgorithm]] = {
     "ppo": PPO, "ppo_penalty": PPO, "ppo_lagrange": LagrangianPPO, "bc": PPO, "bc_ppo": PPO, "sac": SAC, "her": SAC,
 }  # fmt: skip
-OWN_POLICIES = {one.__name__: one for one in (DepthPolicy,)}  # beside SB3's own, by the names that hyperparameter files have
+OWN_POLICIES = {one.__name__: one for one in (DepthPolicy,)}  # in addition to SB3's own, by their names in hyperparameter files
 SCHEDULES = ("learning_rate", "clip_range")  # options that may be written lin_VALUE
 ADVICE = "train again"
 
@@ -113,7 +113,7 @@ def _variables(model: Any) -> list[str]:
 
 
 def exported(model: Any, config: Config, about: dict[str, Any]) -> Policy | None:
-    """The network that decides, without what it was trained with; None for one that looks at pictures, or is not of tanh alone."""
+    """The policy network without its training state; None if it takes images, or has activations other than tanh."""
     space = model.observation_space
     plain = list(space.values()) if isinstance(space, gym.spaces.Dict) else [space]
     if any(len(part.shape or ()) != 1 for part in plain):

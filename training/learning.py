@@ -36,7 +36,7 @@ SCORES = (
     "normalized_performance",
     "return",
 )  # in each of its lines
-REFERENCE_EPISODES = 100  # of noop, random and the expert, beside which a learned policy is scored
+REFERENCE_EPISODES = 100  # of noop, random and the expert, for comparison with a learned policy
 CHOOSING_EPISODES = 500  # of the last evaluation on the way, by which one of several seeds may be chosen
 FIRST = 100  # of the final episodes, whose successes the exported policy notes, for a test to count them again
 CHECKPOINT_SECONDS = 60.0  # of training between two checkpoints, at most a rollout more
@@ -69,7 +69,7 @@ class Watch(BaseCallback):
         before = state or {"num_timesteps": 0, "times": {}}
         self.lines = [line for line in read_progress(folder) if line["timesteps"] <= before["num_timesteps"]]
         self.clock = Clock(before["times"].get("training_seconds", 0.0), before["times"].get("core_seconds", 0.0))
-        # a clone is scored before it learns on
+        # a cloned policy is scored before it is trained further
         self.next = 0 if config["clone"] and not self.lines else int(self.lines[-1]["timesteps"] if self.lines else 0) + every
         self.saved = time.perf_counter()
         # time in which environments step and the policy chooses actions, and when that began [s]
@@ -134,7 +134,7 @@ def acting_of(model: Any) -> policies.Policy:
 
 
 class FrozenPolicy(BaseCallback):
-    """For some rollouts only the critic learns: beside a cloned policy it knows nothing yet, and would lead it astray."""
+    """Train only the critic for some rollouts: an untrained critic would make a cloned policy worse."""
 
     def __init__(self, rollouts: int) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class FrozenPolicy(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        # what follows is what is learned from this rollout
+        # the update from this rollout follows
         self._freeze(self.left > 0)
         self.left -= 1
 
@@ -265,7 +265,7 @@ def train(
             save_checkpoint(folder, model, watch.times())
             raise
         watch.clock.stop()
-    else:  # a clone alone, or a run that was killed before its score
+    else:  # only behavior cloning, or a run that was killed before its score
         watch.init_callback(with_logger(model))
         watch.num_timesteps = done
     if config["timesteps"] > done or not (folder / MODEL).exists() or not watch.lines:
@@ -301,7 +301,7 @@ def learn_from_expert(model: Any, config: Config) -> None:
 
 
 def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episodes: int) -> None:
-    """Export the policy, score what was exported beside the references, draw learning curve and film."""
+    """Export the policy, score the exported one and the references, draw the learning curve and a film."""
     wall, cores = watch.clock.spent
     about = {"digest": digest_of(config["env"], config["env_kwargs"]), "timesteps": config["timesteps"], "training_seconds": wall}
     about |= {
@@ -331,7 +331,7 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     own |= {"seed": config["seed"], "references": scores} | about
     files.write(folder / EVALUATION, json.dumps(own, indent=1, default=float) + "\n")
     if policy is not None:
-        # the file says what it scores
+        # the file contains its scores
         said = ("success_rate", "safe_success_rate", "normalized_performance", "episodes")
         policy.about |= {name: own[name] for name in said if name in own}
         policy.about["first_successes"] = int(episodes["is_success"][:FIRST].sum())

@@ -5,8 +5,8 @@
 
 In each held-out episode the state is branched into a batch.  Each of the batch follows one sequence of actions, the best ones
 (elites) are what the next are drawn around, and the best of all is executed, of which the first actions, before it is planned anew.
-The row stands beside those of ``evaluate.py --suite`` in the same file.  A plan is executed as it was predicted, bit for bit: steps
-whose reward was another are counted, ``mispredicted``.
+The row goes to the same file as those of ``evaluate.py --suite``.  A plan is executed as predicted, bit for bit: steps
+with another reward are counted, ``mispredicted``.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ class Args:
     spread: float = 0.5
     """Standard deviation of the actions that are drawn first."""
     warm_start: bool = True
-    """Whether a plan begins with what is left of the one before."""
+    """Whether a plan starts from the rest of the previous one."""
     from_expert: bool = False
-    """Whether it begins with what the scripted expert would do, in place of doing nothing."""
+    """Whether it starts from the scripted expert's actions instead of no action."""
     model_steps: int | None = None
     """Environment steps that may be simulated for an episode; then what was planned is followed, and nothing or the expert."""
     env_kwargs: str = "{}"
@@ -155,7 +155,7 @@ class Planner:
             if not self.affords():
                 break
             tried = np.clip(mean + spread * rng.standard_normal((args.population, length, *self.shape)), -1, 1)
-            # the middle itself is one of them: so no plan is worse than what it begins with
+            # the mean itself is one of them, so no plan is worse than its start
             tried[0] = mean
             tried = tried.astype(np.float32)
             rewards = self.predicted(copies, tried)
@@ -167,7 +167,7 @@ class Planner:
         return best
 
     def first_guess(self, before: NDArray, state: Any) -> NDArray:
-        """What a plan begins with, (horizon, numbers): what is left of the one before, then what the expert does, or nothing."""
+        """Start of a plan, (horizon, numbers): the rest of the previous one, then the expert's actions, or zeros."""
         length = self.horizon()
         guess = np.zeros((length, *self.shape), np.float32)
         known = min(len(before), length)
@@ -210,12 +210,12 @@ def running_sum(rewards: NDArray) -> NDArray:
 
 
 def episode(planner: Planner, seed: int) -> dict[str, Any]:
-    """Plan and act in one episode: what its last step's info says, and what it took."""
+    """Plan and act in one episode; returns the info of its last step, and the effort."""
     env, args, begun = planner.env, planner.args, time.perf_counter()
     env.reset(seed=[seed])
     planner.spent, planner.taken = 0, []
     total, length, mispredicted, over, info = 0.0, 0, 0, False, {}
-    # what is followed, and since how many actions and steps
+    # the present plan, and the number of its executed actions and steps
     plan, age, followed = Plan(np.zeros((0, *planner.shape), np.float32), np.zeros(0)), 0, 0
     bar = tqdm(total=env.task.acting_steps + env.task.settling_steps, unit="step", desc=f"seed {seed}", leave=False, disable=None)
     while not over:

@@ -117,7 +117,7 @@ def _about(name: str, env_id: str) -> dict[str, Any]:
 
 
 def same_as(config: Config, args: Any, *names: str) -> None:
-    """What is given beside ``--resume`` must be what the run has.
+    """Check that arguments given with ``--resume`` equal those of the run.
 
     Raises:
         ValueError: it is neither that, nor the default.

@@ -45,7 +45,7 @@ LIMITS = {
 
 @dataclass
 class Args:
-    """What to train, for how long, and how.  What is None here is what hyperparams/ppo.yml says of the environment."""
+    """Options of the training.  None means the environment's value in hyperparams/ppo.yml."""
 
     env: str = "ClothDrape-v0"  # id of the environment
     seed: int = 0  # of the nets, the noise, the minibatches and the environments
@@ -99,7 +99,7 @@ class ActorCritic:
     """Two nets that share nothing: the mean of a normal distribution of actions, and the value of an observation."""
 
     def __init__(self, observations: int, actions: int, net_arch: tuple[int, ...], log_std_init: float) -> None:
-        import torch  # imported in functions: it takes seconds, and what is wrong has been said by then
+        import torch  # imported in functions: it takes seconds, after all checks of arguments
         from torch import nn
 
         def linear(inputs: int, outputs: int, gain: float) -> Any:
@@ -111,7 +111,7 @@ class ActorCritic:
         def hidden() -> Any:
             return nn.Sequential(*(one for two in pairwise(sizes) for one in (linear(*two, gain=math.sqrt(2)), nn.Tanh())))
 
-        # the gain of 0.01 makes the first actions nearly independent of what is seen: exploration begins without a preference
+        # the gain of 0.01 makes the first actions nearly independent of the observation: exploration starts without a preference
         sizes, self.net = (observations, *net_arch), nn.Module()
         self.net.log_std = nn.Parameter(torch.full((actions,), float(log_std_init)))
         self.net.mlp_extractor = nn.ModuleDict({"policy_net": hidden(), "value_net": hidden()})
@@ -169,7 +169,7 @@ def rollouts(
                 distribution, batch["observation"][t], batch["value"][t] = agent.distribution(seen), seen, agent.value(seen)
                 action = distribution.sample()
                 batch["action"][t], batch["log_prob"][t] = action, distribution.log_prob(action).sum(-1)
-            # noise may exceed the bounds: what is executed is clipped, what is learned from is the action that was drawn
+            # noise may exceed the bounds: the environment gets the clipped action, the update uses the drawn one
             observation, reward, terminated, truncated, info = env.step(np.clip(action.numpy(), -1, 1))
             ended, cut_off = terminated | truncated, truncated & ~terminated
             batch["reward"][t], batch["ended"][t] = reward, ended
@@ -191,7 +191,7 @@ def rollouts(
 
 
 def update(agent: ActorCritic, optimizer: Any, batch: dict[str, NDArray], args: Args, rng: np.random.Generator) -> dict[str, float]:
-    """Learn from one rollout; the means of what is logged."""
+    """Learn from one rollout; returns the means of logged values."""
     import torch
 
     # steps and environments become one axis of samples

@@ -1,13 +1,13 @@
-"""Every table of scores in the README and in docs/, and every learning curve, from committed results.
+"""Write every table of scores in the README and in docs/, and every learning curve, from committed results.
 
-    python training/report.py                                # write them anew
-    python training/report.py --check                        # only say what is stale, with status 1
-    python training/report.py --digests                      # first note what each environment does now: some minutes
+    python training/report.py                                # write them again
+    python training/report.py --check                        # only list stale pages, with status 1
+    python training/report.py --digests                      # first note the present behavior of each environment: some minutes
     python training/report.py --policies                     # first score committed policies of older code: some minutes
-    python training/report.py --add runs/ClothDrape-v0_*     # first take these runs' results, and the policies that are chosen
+    python training/report.py --add runs/ClothDrape-v0_*     # first add these runs' results, and the best policies
 
-A result carries the digest of what its environment did when it was made (``clothgym.lab.digests``); the present ones are in
-benchmarks/results/digests.json.  A row whose digest is another is shown as old, until it is made again.
+A result carries the digest of its environment's behavior (``clothgym.lab.digests``); the present digests are in
+benchmarks/results/digests.json.  A row with another digest is marked as old, until it is made again.
 """
 
 from __future__ import annotations
@@ -35,30 +35,30 @@ PAGES = ("README.md", "docs/results.md", "docs/cheats.md")
 
 @dataclass
 class Args:
-    """What to do before the pages are written, if anything."""
+    """Actions before the pages are written."""
 
     add: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN ...")] = ()
-    """Folders of finished runs whose results are to be committed."""
+    """Folders of finished runs, whose results are committed."""
     digests: bool = False
-    """Note what each environment does now."""
+    """Note the present behavior of each environment."""
     policies: bool = False
-    """Score the committed policies that were trained on older code on the code at hand."""
+    """Score the committed policies of older code on the present code."""
     check: bool = False
-    """Write nothing; say which pages are stale."""
+    """Write nothing; list stale pages."""
 
 
 # --- over seeds ---------------------------------------------------------------------------------------------------------------
 
 
 def interquartile_mean(values: Iterable[float]) -> float:
-    """Mean without the lowest and the highest quarter, as rliable has it (Agarwal et al. 2021); of three values that of all."""
+    """Mean without the lowest and the highest quarter, as in rliable (Agarwal et al. 2021); the plain mean of three values."""
     from scipy.stats import trim_mean
 
     return float(trim_mean(list(values), 0.25))
 
 
 def bootstrap(values: list[float], draws: int = 2000) -> tuple[float, float]:
-    """95 % interval of the interquartile mean over seeds, by drawing them anew (percentiles)."""
+    """95 % interval of the interquartile mean over seeds, by the percentile bootstrap."""
     rng = np.random.default_rng(0)
     means = [interquartile_mean(rng.choice(values, len(values))) for _ in range(draws)]
     low, high = np.percentile(means, [2.5, 97.5])
@@ -77,18 +77,18 @@ def _counts(rows: list[Result]) -> str:
 
 
 def _minutes(rows: list[Result]) -> float:
-    """Time of all cores together: runs take turns with other work on their machine, and these minutes do not count that."""
+    """Median CPU time of the runs: unlike wall time, it does not include other work on the machine."""
     return statistics.median(row["core_seconds"] for row in rows) / 60
 
 
 def _collecting(rows: list[Result]) -> str:
-    """The part of the time in which environments step and the policy acts; of a clone, whose expert acts, nothing is said."""
+    """Share of the time in which environments step and the policy acts; empty for behavior cloning, where the expert acts."""
     parts = [row.get("collecting_seconds", 0.0) / max(row["training_seconds"], 1e-9) for row in rows]
     return f", {statistics.median(parts):.0%} collecting" if all(parts) else ""
 
 
 def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
-    """What a table says of doing nothing, chance, or the expert."""
+    """The table's row for no action, random actions, or the expert."""
     low, high = row["success_rate_ci95"]
     return {
         "policy": f"`{row['policy']}`{_old(is_present(row, digests))}",
@@ -106,7 +106,7 @@ def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
 
 
 def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict[str, str]:
-    """What a table says of a learner, over its seeds."""
+    """The table's row for a learner, over its seeds."""
     rates = [row["success_rate"] for row in rows]
     low, high = bootstrap(rates) if len(rows) > 1 else rows[0]["success_rate_ci95"]
     steps = statistics.median(row["timesteps"] for row in rows)
@@ -120,14 +120,14 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
         "cost": f"{statistics.median(row['cost'] for row in rows):.2f}" if "cost" in rows[0] else "",
         "safe": f"{statistics.median(row['safe_success_rate'] for row in rows):.3f}" if "cost" in rows[0] else "",
         "torn / diverged": _counts(rows),
-        # a clone's samples are no steps of its own
+        # samples of behavior cloning are no steps of the learner
         "steps": f"{steps / 1e6:.2f} M" if steps else "",
         "training": f"{_minutes(rows):.1f} min of one core{_collecting(rows)}",
     }
 
 
 def markdown(rows: list[dict[str, str]]) -> str:
-    """A table; columns in which nothing stands are left out."""
+    """A table without its empty columns."""
     if not rows:
         return "None yet."
     columns = [name for name in rows[0] if any(row[name] for row in rows)]
@@ -136,7 +136,7 @@ def markdown(rows: list[dict[str, str]]) -> str:
 
 
 def table_of(env_id: str, results: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
-    """The scores of one environment: scripted policies, and what was learned."""
+    """The scores of one environment: scripted and learned policies."""
     order = {"noop": 0, "random": 1, "careless": 2, "expert": 3}
     own = [row for row in scripted if row["env"] == env_id and row["policy"] in order and not row["env_kwargs"]]
     rows = [scripted_row(row, digests) for row in sorted(own, key=lambda row: order[row["policy"]])]
@@ -145,7 +145,7 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
 
 
 def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
-    """How an environment is learned best, in a few words; where steps cost, only a success at none counts."""
+    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts."""
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
     if not found:
         return "–"
@@ -157,11 +157,11 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
-    """What a planner has found on whole episodes, beside the scripted experts."""
+    """Scores of plans of whole episodes, and of the scripted experts."""
     experts = {row["env"]: row for row in scripted if row["policy"] == "expert" and not row["env_kwargs"]}
     found = []
     for row in sorted(rows, key=lambda row: (list(ENVIRONMENTS).index(row["env"]), row["policy"])):
-        begun = "the expert" if row["policy"] == "cem from expert" else "nothing"
+        begun = "the expert" if row["policy"] == "cem from expert" else "no action"
         found.append({
             "environment": f"`{row['env']}`{_old(is_present(row, digests))}", "from": begun,
             "success": f"{round(row['success_rate'] * row['episodes'])} of {row['episodes']}",
@@ -174,7 +174,7 @@ def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[s
 
 
 def cheats_table(rows: list[Result], digests: dict[str, str]) -> str:
-    """What ways to score without doing the task have brought."""
+    """Scores of the cheats."""
     return markdown([
         {
             "environment": f"`{row['env']}`{_old(is_present(row, digests))}", "cheat": row["cheat"],
@@ -198,8 +198,8 @@ def sections(results: list[Result], scripted: list[Result], digests: dict[str, s
 
 
 def environments(results: list[Result], digests: dict[str, str]) -> str:
-    """The README's table: what there is, and how it is learned."""
-    lines = ["| id | goal | learned by: success, time on one core |", "| --- | --- | --- |"]
+    """The README's table of environments, with the best learner of each."""
+    lines = ["| id | goal | best learner: success, time on one core |", "| --- | --- | --- |"]
     for env_id, (_, goal) in ENVIRONMENTS.items():
         if "-Hard-" in env_id:
             continue
@@ -210,10 +210,10 @@ def environments(results: list[Result], digests: dict[str, str]) -> str:
 
 
 def filled(text: str, made: dict[str, str]) -> str:
-    """A page with its sections written anew.
+    """A page with its sections replaced.
 
     Raises:
-        ValueError: a section that nothing makes.
+        ValueError: an unknown section.
     """
 
     def one(match: re.Match[str]) -> str:
@@ -225,7 +225,7 @@ def filled(text: str, made: dict[str, str]) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """Every page as it is to be."""
+    """The up-to-date text of every page."""
     digests, scripted = read_digests(), suite.read(SUITE)
     made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
     made["cheats"] = cheats_table(suite.read(CHEATS), digests)

@@ -1,6 +1,6 @@
-"""Committed results of training: what each run scored, of which code, and the policies that are kept.
+"""Committed results of training: the score of each run, the digest of its code, and the kept policies.
 
-A result carries the digest of what its environment did when it was made (``clothgym.lab.digests``); the present ones are in
+A result carries the digest of its environment's behavior (``clothgym.lab.digests``); the present digests are in
 benchmarks/results/digests.json.
 """
 
@@ -28,30 +28,30 @@ COMMITTED = ROOT / "clothgym" / "policies"
 KEPT = ("config.json", "evaluation.json", "progress.jsonl")
 ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
-    "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "clone of the expert",
-    "bc_ppo": "clone of the expert, then PPO", "sac": "SAC, begun with the expert's episodes",
-    "her": "SAC with hindsight (HER), begun with the expert's episodes",
+    "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "behavior cloning",
+    "bc_ppo": "behavior cloning, then PPO", "sac": "SAC, started with expert episodes",
+    "her": "SAC with hindsight (HER), started with expert episodes",
 }  # fmt: skip
 Result = dict[str, Any]
 
 
 def read_digests(path: Path = DIGESTS) -> dict[str, str]:
-    """What each environment does now, by ``digests.name_of``."""
+    """Digest of each environment's present behavior, by ``digests.name_of``."""
     return files.read_json(path, "list of digests", ADVICE)["digests"]
 
 
 def is_present(row: Result, digests: dict[str, str]) -> bool:
-    """Whether a result is of the code at hand."""
+    """Whether a result is from the present code."""
     return row.get("digest") == digests.get(name_of(row["env"], row["env_kwargs"]), "unknown")
 
 
 def learned(folder: Path = RUNS) -> list[Result]:
-    """The results of all runs that are committed."""
+    """The results of all committed runs."""
     return [json.loads(path.read_text()) | {"run": path.parent.name} for path in sorted(folder.glob("*/evaluation.json"))]
 
 
 def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
-    """Results that differ in their seed only, by environment and by what was learned there and how."""
+    """Results that differ only in their seed, by environment and label of the learner."""
     found: dict[tuple[str, str], list[Result]] = {}
     for one in results:
         more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
@@ -61,12 +61,12 @@ def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
 
 
 def progress(run: str) -> list[dict[str, float]]:
-    """The evaluations of a committed run on its way."""
+    """The evaluations of a committed run during training."""
     return [json.loads(line) for line in (RUNS / run / "progress.jsonl").read_text().splitlines()]
 
 
 def note_digests() -> None:
-    """Write what each environment does now, as it is and as committed results have it."""
+    """Write the digest of each environment, with its defaults and with the arguments of committed results."""
     wanted = {name_of(env_id, {}): (env_id, {}) for env_id in ENVIRONMENTS}
     wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in learned()}
     digests = {}
@@ -77,7 +77,7 @@ def note_digests() -> None:
 
 
 def first_successes(env_id: str, learner: str) -> int:
-    """How many of the first hundred held-out episodes a committed policy ends with success, on the code at hand."""
+    """Number of successes of a committed policy in the first hundred held-out episodes, on the present code."""
     from clothgym import policies
 
     policy = policies.load(env_id, learner)
@@ -90,7 +90,7 @@ def first_successes(env_id: str, learner: str) -> int:
 
 
 def note_policies() -> None:
-    """Score committed policies that were trained on older code on the code at hand."""
+    """Score committed policies of older code on the present code."""
     from clothgym import policies
 
     digests, noted = read_digests(), {}
@@ -105,7 +105,7 @@ def note_policies() -> None:
 
 
 def add(folders: Iterable[Path]) -> set[str]:
-    """Copy what is committed of runs, and keep their best policies (``choose``); the ids of the runs."""
+    """Copy the committed files of runs, and keep their best policies (``choose``); returns the ids of the runs."""
     ids = set()
     for folder in folders:
         if not (folder / "evaluation.json").is_file():
@@ -122,18 +122,18 @@ def add(folders: Iterable[Path]) -> set[str]:
 
 
 def choose() -> None:
-    """Of each id and learner the policy of the seed that was best on the episodes for choosing; the others are not kept."""
+    """Keep the best policy of each id and learner, by its score on the episodes for choosing; delete the others."""
     from clothgym import policies
 
     for path in sorted(RUNS.glob(f"*/{POLICY}")):
         about = policies.read(path).about
         if not about["chosen_by"]:
-            # nobody wants one that never succeeds
+            # a policy that never succeeds is not kept
             path.unlink()
             continue
         kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
         other = policies.read(kept).about if kept.exists() else about
-        # one of the same seed, or of other code, is not compared with, but replaced
+        # a policy of the same seed, or of other code, is replaced without a comparison
         if other["chosen_by"] <= about["chosen_by"] or other["seed"] == about["seed"] or other["digest"] != about["digest"]:
             shutil.copyfile(path, kept)
         path.unlink()

@@ -1,4 +1,4 @@
-"""Episodes of a policy from seeds, and what they come to: rates and means with their 95 % intervals."""
+"""Episodes of a policy from seeds, and their scores: rates and means with 95 % intervals."""
 
 from __future__ import annotations
 

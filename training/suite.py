@@ -1,7 +1,7 @@
-"""Scores of many environments and policies: one JSON file, which keeps what is finished, and one table.
+"""Scores of many environments and policies: one JSON file, which keeps finished rows, and one table.
 
-A row says its environment, policy, seed of the first episode, keyword arguments and settings: by these it is known again.  The file
-has a checksum, the machine and the versions; rows of another machine or other versions do not go into it.  One process at a time
+A row is identified by its environment, policy, seed of the first episode, keyword arguments and settings.  The file
+has a checksum, the machine and the versions; rows of another machine or other versions are not added.  One process at a time
 writes to a file.
 """
 
@@ -93,7 +93,7 @@ def _machine() -> Row:
     return machine()
 
 
-# --- what is scored -----------------------------------------------------------------------------------------------------------
+# --- scores -------------------------------------------------------------------------------------------------------------------
 
 
 def rows_of(ids: Iterable[str], names: Iterable[str], seed: int, env_kwargs: Row) -> list[Row]:

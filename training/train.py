@@ -50,7 +50,7 @@ class Args:
     seed: int = 0
     """Seed of the learner and of its environments."""
     algo: Literal["ppo", "ppo_penalty", "ppo_lagrange", "bc", "bc_ppo", "sac", "her"] = "ppo"
-    """PPO; with a fixed price, or a Lagrange multiplier, on cost; a clone of the scripted expert, alone or before PPO; SAC, or SAC
+    """PPO; with a fixed price, or a Lagrange multiplier, on cost; behavior cloning, alone or before PPO; SAC, or SAC
     with hindsight (HER) on a task of goals."""
     timesteps: int | None = None
     """Environment steps; the hyperparameter file's number by default."""
@@ -74,7 +74,7 @@ class Args:
     config: dict[str, Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Everything is checked here, before what is slow is imported; errors look like those of a wrong flag."""
+        """Check all arguments before slow imports; errors look like those of a wrong flag."""
         expand_paths(self)
         self.env = checked_id(self.env)
         for name in ("timesteps", "evaluations", "eval_episodes", "final_episodes", "threads"):
@@ -148,7 +148,7 @@ class Args:
 
 
 def main(args: Args) -> None:
-    from learning import learner, train  # imported here: torch takes seconds, and what is wrong has been said by now
+    from learning import learner, train  # imported here: torch takes seconds, after all checks of arguments
 
     folder, config = args.folder, args.config
     with refused():

@@ -6,7 +6,7 @@ One policy for the whole project, so that the promises made about bits and about
     binding            one kernel from the code of another with other callees: ``specialize``, ``placeholder``
     merging            views that join the last two axes of an array
     cache              the folder of compiled kernels: its name, its locks
-    numba_internals    all that touches what is private to numba and llvmlite
+    numba_internals    all uses of private interfaces of numba and llvmlite
     threads            spans of blocks on Python threads
 """
 

@@ -42,7 +42,7 @@ def _refuse(unbound: _Placeholder, context: Any) -> Any:
 def placeholder(name: str, meaning: str) -> Callable[..., Any]:
     """Declare a name that ``specialize`` binds to a kernel, at the top of the module whose functions call it.
 
-    meaning: what the kernel does with what it is given.
+    meaning: description of the kernel's arguments and effect.
     """
     return _Placeholder(name, meaning)
 

@@ -5,8 +5,8 @@
   imports only go down, so who edits a task need not compile the main loop again.
 * A file lock for each kernel while it is compiled: processes that start together on a cold cache compile each one once, and
   different ones at the same time.
-* What lies in it is unpickled and run.  So it must be the user's own and closed to others, and each entry begins with a checksum
-  that only this user can make: what is damaged or a stranger's is compiled again.
+* Its entries are unpickled and run.  It must therefore be the user's own and closed to others, and each entry begins with a
+  checksum that only this user can make: damaged or foreign entries are compiled again.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NOWHERE = Path(os.devnull) / "none"
 
 @functools.cache
 def package_folders() -> dict[str, Path]:
-    """Where the package lies.  In a checkout ``clothgym.envs`` has a folder beside it, in a wheel one in it."""
+    """Folders of the package.  In a checkout ``clothgym.envs`` has a folder next to it, in a wheel one in it."""
     folders = {"clothgym": Path(__file__).parents[1]}
     envs = importlib.util.find_spec("clothgym.envs")  # found, not imported
     if envs is not None and envs.submodule_search_locations:

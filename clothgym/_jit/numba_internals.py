@@ -1,6 +1,6 @@
-"""All that touches what is private to numba and llvmlite: locks and checksums of its cache, callees that stay apart, flags.
+"""All uses of private interfaces of numba and llvmlite: locks and checksums of its cache, separately compiled callees, flags.
 
-``policy`` asks ``check`` first, and does without this module where it raises.
+``policy`` calls ``check`` first, and does not use this module if that raises.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ def _set_flags(flags: Any, values: Mapping[str, bool]) -> Any:
 
 
 def _compile_locked(compile_or_load: Any, lock_name: str, signature: Any) -> Any:
-    """Compile or load a kernel, and let go of its lock if it was taken for that."""
+    """Compile or load a kernel, and release its lock if it was taken for that."""
     with global_compiler_lock:  # numba's own, taken before we look whether this thread holds the file's
         held = lock_name in cache_folder().held
         try:
@@ -186,7 +186,7 @@ class _CheckedFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
             return None
 
 
-_code_of = attrgetter("library")  # the machine code of one of numba's compile results, with what is linked to it
+_code_of = attrgetter("library")  # the machine code of one of numba's compile results, with its linked libraries
 
 
 class _Outdated(Exception):
@@ -194,7 +194,7 @@ class _Outdated(Exception):
 
 
 class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
-    """What is kept of compiled code: also which kernels that stay apart it calls, ``(name, argument types, symbol)`` each."""
+    """Stored form of compiled code, with its separately compiled callees, ``(name, argument types, symbol)`` each."""
 
     _locator_classes = [_Locator]  # noqa: RUF012 - numba reads a list
 
@@ -214,13 +214,13 @@ class _Impl(caching.CompileResultCacheImpl):  # type: ignore[misc]
                 raise _Outdated
         result = super().rebuild(target_context, payload)
         code = _code_of(result)
-        # what is called lives as long as its caller
+        # a callee lives as long as its caller
         code.calls, code.called = calls, called
         return result
 
 
 def _calls_of(library: Any) -> list[tuple[str, Any, str]]:
-    """Kernels that stay apart which a library calls, itself or in what is linked into it."""
+    """Separately compiled kernels that a library calls, itself or in its linked libraries."""
     if not hasattr(library, "calls"):
         library.calls = list(dict.fromkeys(call for part in library._linking_libraries for call in _asks(part)))
     return library.calls

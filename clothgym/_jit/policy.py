@@ -26,7 +26,7 @@ WITHOUT_JIT = bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
 
 
 class Flags(NamedTuple):
-    """The compiler's, of a sort of kernels.  All are set: what is not set is taken from whichever kernel is compiled above.
+    """Compiler flags of a kind of kernels.  All are set: numba takes unset flags from the calling kernel.
 
     nrt: whether references to arrays are counted.  noalias: whether arguments are promised not to overlap.
     """
@@ -46,7 +46,7 @@ def _with_internals(function: FunctionType, apart: bool, flags: Flags) -> Any:
 
 
 def _plainly(function: FunctionType, apart: bool, flags: Flags) -> Any:
-    """A dispatcher by numba's public means: what it calls is linked into it, and ``flags`` are numba's own.
+    """A dispatcher by numba's public interface: its callees are linked into it, and ``flags`` are numba's own.
 
     numba tells kernels of one file apart by their name and line.  Here each has a folder of its own, as specialized ones share
     their lines, within the folder that is named by the digest of all sources: numba itself does not see an edit in a callee.
@@ -114,9 +114,9 @@ def kernel(function: Callable[..., Any], apart: bool = False, flags: Flags = COU
 
     Kernels take arrays and typed scalars only; they must not reduce across lanes (see ``docs/architecture.md``).
 
-    apart: compile it once for all its callers, who jump to it.  Of others numba links the code into each kernel above them, and
-    optimizes it again there: right for what is short, and minutes in all for what is long and has many callers.
-    flags: the compiler's, see ``disjoint``.
+    apart: compile it once for all its callers, which jump to it.  Code of other kernels is linked into each calling kernel, and
+    optimized again there.  This suits short kernels, but takes minutes in total for long kernels with many callers.
+    flags: of the compiler, see ``disjoint``.
     """
     if WITHOUT_JIT:
         return _in_python(function, flags)
@@ -135,9 +135,9 @@ def uncounted(function: Callable[..., Any]) -> Any:
 
 
 def disjoint(function: Callable[..., Any]) -> Any:
-    """A ``kernel`` of loops over long rows that makes no arrays, and promises that what it writes to overlaps none of its others.
+    """A ``kernel`` of loops over long rows that makes no arrays, and promises that its outputs do not overlap its other arguments.
 
-    Else the compiler tests every pair of rows for overlap whenever the kernel is called: as long as a row of a hundred takes.
+    Without the promise every call tests all pairs of rows for overlap, which takes as long as a row of a hundred numbers.
     """
     return kernel(function, flags=DISJOINT)
 

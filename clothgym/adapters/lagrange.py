@@ -112,7 +112,7 @@ class LagrangianPPO(PPO):
     Args:
         policy, env: as of PPO.
         cost_limit: mean cost of an episode that is allowed.
-        initial_cost_limit: what is allowed at first, d_0; with None ``cost_limit`` holds from the beginning.
+        initial_cost_limit: initial limit, d_0; with None ``cost_limit`` holds from the beginning.
         tightening: share of the training over which the limit falls from there to ``cost_limit``, f.
         multiplier_rate: K_I, rate of the dual ascent, in multiplier per unit of excess cost and rollout.
         kp, kd: K_P and K_D of the PID controller, in multiplier per unit of cost; with 0 there is only dual ascent.
@@ -209,7 +209,7 @@ class LagrangianPPO(PPO):
     # --- a rollout ------------------------------------------------------------------------------------------------------------
 
     def collect_rollouts(self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int) -> bool:
-        # what is left of a rollout that a callback stopped is of no use
+        # discard the rest of a rollout that a callback stopped
         self.cost_rollout = CostRollout()
         # the callbacks of a rollout's end may put other environments in the place of these
         first = CallbackList([_FinishCosts(), callback])
@@ -272,7 +272,7 @@ class LagrangianPPO(PPO):
     def update_multiplier(self, cost: float) -> None:
         """Move the multiplier by Algorithm 2 of Stooke et al. (2020); cost: mean of the episodes that ended in a rollout, J.
 
-        The excess is clipped, and the integral ends where the multiplier does: what it gathered beyond would have to be undone
+        The excess is clipped, and the integral is limited with the multiplier (anti-windup): otherwise it would have to unwind
         before the multiplier could fall.
         """
         excess = min(cost - self.present_limit(), self.excess_clip)
@@ -311,9 +311,9 @@ class LagrangianPPO(PPO):
         return [*super()._excluded_save_params(), "cost_rollout"]
 
     def constraint_state(self) -> dict[str, Any]:
-        """What a checkpoint needs beside PPO's own: copies, of tensors and plain numbers, for ``torch.load(weights_only=True)``.
+        """State for a checkpoint in addition to PPO's: copies of tensors and plain numbers, for ``torch.load(weights_only=True)``.
 
-        The costs of the episodes under way are not in it: where a run goes on from a checkpoint, its environments begin anew.
+        It does not include the costs of unfinished episodes: a run that resumes from a checkpoint resets its environments.
         """
         return {
             "multiplier": float(self.multiplier),
@@ -356,5 +356,5 @@ def _costs(infos: list[dict[str, Any]]) -> NDArray:
 
 
 def _shapes(tensors: Any) -> dict[str, Any]:
-    """Shapes of a network's tensors, by name; none of what is no network's."""
+    """Shapes of a network's tensors, by name; empty for other objects."""
     return {name: getattr(tensor, "shape", None) for name, tensor in tensors.items()} if isinstance(tensors, dict) else {}

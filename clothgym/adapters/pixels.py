@@ -45,7 +45,7 @@ def _coordinates(pictures: torch.Tensor) -> torch.Tensor:
 
 
 class StateEncoder(BaseFeaturesExtractor):
-    """The numbers beside a picture, (batch, numbers), to features, (batch, 64)."""
+    """Encode the state vector that accompanies an image, (batch, numbers), to features, (batch, 64)."""
 
     def __init__(self, observation_space: gym.spaces.Dict) -> None:
         super().__init__(observation_space, FEATURES)
@@ -68,7 +68,7 @@ class DepthPolicy(MultiInputActorCriticPolicy):
     def __init__(self, observation_space: gym.Space, *args: Any, **kwargs: Any) -> None:
         if not isinstance(observation_space, gym.spaces.Dict) or {"observation", "state"} - observation_space.spaces.keys():
             raise ValueError(
-                "DepthPolicy sees pictures beside a state: make the environment with obs_mode='depth', privileged=True"
+                "DepthPolicy takes images together with a state: make the environment with obs_mode='depth', privileged=True"
             )
         kwargs |= {"share_features_extractor": False, "normalize_images": False}
         super().__init__(observation_space, *args, **kwargs)

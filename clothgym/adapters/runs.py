@@ -15,7 +15,7 @@ from clothgym import files, policies
 from clothgym.registration import checked_id
 from clothgym.warning import warn_caller
 
-# the last checkpoint and the one before it, what they were trained with, and what the finished run has exported
+# the last checkpoint and the previous one, their configuration, and the exported policy of a finished run
 CHECKPOINT, BEFORE, CONFIG, POLICY = "checkpoint.pt", "checkpoint_before.pt", "config.json", "policy.npz"
 VERSION = 2  # of the format of checkpoints
 ADVICE = "train again, or take another run"
@@ -107,9 +107,9 @@ def load_tensors(path: Path) -> dict[str, Any]:
         if not isinstance(state, dict) or any(not isinstance(state.get(name), kind) for name, kind in kinds.items()):
             raise ValueError(f"it does not hold {', '.join(kinds)}")
         if min(state["num_timesteps"], state["num_updates"]) < 0:
-            raise ValueError("it counts fewer than no steps")
+            raise ValueError("its number of steps is negative")
         if not all(isinstance(value, torch.Tensor) and torch.isfinite(value).all() for value in state["policy"].values()):
-            raise ValueError("its policy holds what is no finite number")
+            raise ValueError("its policy has a value that is not finite")
         return state
 
 
@@ -145,7 +145,7 @@ def exported(path: Path) -> Policy:
 
 
 def learned(folder: Path, env_id: str) -> Policy:
-    """The deterministic policy of a run: what it has exported at its end, or its last checkpoint while it has not.
+    """The deterministic policy of a run: the exported one of a finished run, else the last checkpoint.
 
     Raises:
         FileNotFoundError, ValueError: no run, or one that is damaged, of another version or environment.

@@ -68,5 +68,5 @@ def _refuse_open(x: NDArray, corners: NDArray, numbers: NDArray | None) -> None:
     # neighbors with the same side out run along their edge in opposite directions
     forward = np.bincount(inverse.reshape(-1), weights=directed[:, 0] < directed[:, 1])
     if np.any(forward != 1):
-        beside = named(edges[np.argmax(forward != 1)])
-        raise ValueError(f"the triangles beside {beside} disagree on which side is out: turn one round")
+        edge = named(edges[np.argmax(forward != 1)])
+        raise ValueError(f"the triangles at {edge} have opposite orientations: flip one of them")

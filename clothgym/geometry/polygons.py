@@ -87,7 +87,7 @@ def _best_ear(p: NDArray) -> int | None:
     twice = _cross(p - before, after - p)
     sides = np.stack([p - before, after - p, before - after])
     shape = twice / np.maximum(np.sum(sides**2, axis=2).max(axis=0), 1e-300)
-    # what is left has an area, too
+    # the rest of the polygon must also have an area
     left = _cross(p - p[0], after - p[0]).sum() - twice
     fits = (shape > SLIMMEST) & (left > SLIMMEST * twice.max())
     for ear in np.argsort(-np.where(fits, shape, -np.inf), kind="stable").tolist():

@@ -314,31 +314,31 @@ def _advance(x, v, remainder, h):
 
 
 @kernel
-def move_on(x, v, start, h):
+def extrapolate(x, v, start, h):
     """``x <- start + h v``, for held particles too: where they would be at the end of a substep; (3, particles, lanes)."""
-    _move_on(merged(merged(x)), merged(merged(v)), merged(merged(start)), h)
+    _extrapolate(merged(merged(x)), merged(merged(v)), merged(merged(start)), h)
 
 
 @disjoint
-def _move_on(x, v, start, h):
-    """``move_on`` on flat arrays."""
+def _extrapolate(x, v, start, h):
+    """``extrapolate`` on flat arrays."""
     for e in range(x.shape[0]):
         x[e] = start[e] + h * v[e]
 
 
 @kernel
-def weigh(w, total, r, h):
+def euler_residual(w, total, r, h):
     """``r <- h r - M total`` for free particles, and zero for held ones: the residual of the backward Euler equations [N s].
 
     r: on entry the elements' force [N]; total: the change of velocity so far [m/s]; both (3, particles, lanes).
     """
     for c in range(3):
-        _weigh(merged(w), merged(total[c]), merged(r[c]), h)
+        _euler_residual(merged(w), merged(total[c]), merged(r[c]), h)
 
 
 @disjoint
-def _weigh(w, total, r, h):
-    """One component of ``weigh``, on flat arrays."""
+def _euler_residual(w, total, r, h):
+    """One component of ``euler_residual``, on flat arrays."""
     zero, one = r.dtype.type(0), r.dtype.type(1)
     for e in range(r.shape[0]):
         residual = h * r[e] - total[e] / (w[e] if w[e] > zero else one)

@@ -28,7 +28,7 @@ import numpy as np
 from clothgym._jit import disjoint, kernel, merged
 from clothgym.bending import add_bend_forces, add_bend_products
 from clothgym.forces import Oscillators, add_spring_forces, add_spring_products
-from clothgym.integrators.base import Integrator, add_to, advance, copy_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import Integrator, add_to, advance, copy_to, euler_residual, extrapolate, predict_velocities
 
 GRAVITY = 9.81  # [m/s^2]
 LOST = 0.02  # share of its amplitude that a swing may lose in a period
@@ -179,12 +179,12 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     for newton in range(newton_iterations):
         # linearize at the start of the substep, and later at its end as found so far
         if newton > 0:
-            move_on(x, v, start, h)
+            extrapolate(x, v, start, h)
         # the right side: h f - M (v - v*)
         r[:] = 0
         add_spring_forces(x, v, r, elements, elastic, scratch)
         add_bend_forces(x, v, r, elements, elastic, scratch)
-        weigh(w, total, r, h)
+        euler_residual(w, total, r, h)
         # the first time also - h^2 K v*, as f is taken at the start; then the coefficients become those of h D + h^2 K
         if newton == 0:
             for l in range(lanes):

@@ -29,7 +29,16 @@ from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.bending import add_bend_forces
 from clothgym.forces import Oscillators, add_spring_forces, largest_frequency
 from clothgym.integrators import implicit_euler
-from clothgym.integrators.base import Integrator, Preparation, add_to, advance, copy_to, move_on, predict_velocities, weigh
+from clothgym.integrators.base import (
+    Integrator,
+    Preparation,
+    add_to,
+    advance,
+    copy_to,
+    euler_residual,
+    extrapolate,
+    predict_velocities,
+)
 
 # h w of the stiffest mode up to which ten iterations come close enough to the fixed point (see docs/physics.md)
 STIFFEST = 4.0
@@ -292,11 +301,11 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     total[:] = 0
     for _ in range(iterations):
         # the residual at the end of the substep as found so far
-        move_on(x, v, start, h)
+        extrapolate(x, v, start, h)
         r[:] = 0
         add_spring_forces(x, v, r, elements, elastic, work.scratch)
         add_bend_forces(x, v, r, elements, elastic, work.scratch)
-        weigh(w, total, r, h)
+        euler_residual(w, total, r, h)
         # the global step, with the held particles in place
         solve(plan, r, y)
         keep_held(r, slot, held, members, count, lower, force)

@@ -8,10 +8,10 @@ For a constraint C with multiplier lambda, inverse masses w, positions x and tho
     delta lambda = (-C - alpha~ lambda - gamma grad C . (x - x^n)) / ((1 + gamma) sum_i w_i |grad_i C|^2 + alpha~),
     lambda <- lambda + delta lambda,    x_i <- x_i + w_i grad_i C delta lambda.
 
-In float32 the corrections of small substeps are not much more than the last bit of x, and their rounding over h would be a velocity
-that no force has made.  So the velocities ``u = (x - x^n)/h`` are what is corrected, by ``w_i grad_i C delta lambda/h``; x follows
-once, at the end.  In the meantime lengths are over h, ``(x_j - x_i)/h = (y_j - y_i) + (u_j - u_i)`` with ``y = x^n/h``, and y and u
-are seen from a particle in the middle: no bit of them depends on where the sheet is, nor on how fast it moves as a whole.
+In float32 the corrections of small substeps are not much more than the last bit of x, and their rounding over h would be a spurious
+velocity.  The method therefore corrects the velocities ``u = (x - x^n)/h``, by ``w_i grad_i C delta lambda/h``, and updates x once,
+at the end.  In the meantime lengths are over h, ``(x_j - x_i)/h = (y_j - y_i) + (u_j - u_i)`` with ``y = x^n/h``, and y and u are
+relative to a particle in the middle: their bits do not depend on the position or the common velocity of the sheet.
 
 For a spring ``C = |d| - r``, with d from the first end i to the second end j and r the rest length.  ``alpha~ = 1/(k h^2)`` is its
 compliance over h^2, and ``gamma = alpha~ beta~/h = tau/h`` with the damping time tau.  The multipliers start from zero in each

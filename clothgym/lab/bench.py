@@ -30,7 +30,7 @@ from clothgym.registration import ENVIRONMENTS
 from clothgym.simulation import Simulation
 
 Row = dict[str, Any]
-Case = tuple[str, Callable[[], list[Row]]]  # what is measured, and its rows
+Case = tuple[str, Callable[[], list[Row]]]  # name of a measurement, and its rows
 
 
 def machine() -> Row:

@@ -62,9 +62,9 @@ def draw_work_precision(results: Row, path: Path) -> None:
         if stable and seen[name] == 1:
             for row in (stable[0], stable[-1]):
                 place = row["ms_batch"], max(row["error_mm"], FLOATING)
-                beside = (4, -10) if name == "semi_implicit_euler" else (4, 4)  # verlet's line is the same
+                offset = (4, -10) if name == "semi_implicit_euler" else (4, 4)  # verlet's line is the same
                 look = {"fontsize": 7.5, "color": INTEGRATORS[name].color, "clip_on": True}
-                axes.annotate(row["substeps"], place, beside, textcoords="offset points", **look)
+                axes.annotate(row["substeps"], place, offset, textcoords="offset points", **look)
     scene, about = results["scene"], results["reference"]
     bound = 5 * max(scene["size"][2:])
     axes.axhline(bound, color=QUIET, lw=0.9, ls=(0, (6, 4)), zorder=0)

@@ -27,7 +27,7 @@ LOADING = 1.0  # time in which gravity grows from zero, as the specimen is lower
 ASYMMETRY, MOST_WAVES = 1e-4, 12  # initial waves, without which a specimen would not fold: height [m], largest number around it
 MOST_RINGS = 100  # the support's edge is on one of so many rings, or next to it
 LINES = 4000  # scan lines across a shadow
-FOLD_DEPTH = 0.05  # a fold of the skirt stands out of both valleys beside it by this share of the overhang
+FOLD_DEPTH = 0.05  # height of a fold of the skirt above both adjacent valleys, as a share of the overhang
 COLUMNS, ROWS = 20, 3  # free particles along a strip, and particles across it
 
 Option = str | Mapping[str, Any] | Integrator

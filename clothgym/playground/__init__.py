@@ -1,5 +1,5 @@
-"""Floor 8: the playground, cloth to play with in the browser.
+"""Floor 8: the playground, interactive cloth in the browser.
 
-``scenes`` and ``world`` describe what is shown, ``stage`` and ``episode`` run it for one visitor, ``page`` and ``server`` alone use
-viser, and ``exporting`` and ``files`` write what was shown.
+``scenes`` describes scenes, ``stage`` and ``episode`` run them for one visitor, ``page`` makes the controls, only ``server``
+imports viser, and ``exporting`` writes pictures, films and meshes.
 """

@@ -83,7 +83,7 @@ class Controls(dict[str, Any]):
             self["readings"] = gui.add_markdown("")
         with gui.add_folder("Save", expand_by_default=False):
             self["kind"] = gui.add_dropdown("as", tuple(SAVED.values()))
-            hint = "copy it: it opens the page with what is shown now, its settings, seed and pins"
+            hint = "copy this link to open the page with the present scene, settings, seed and pins"
             self["link"] = gui.add_text("link", "", hint=hint)
             kinds = {label: kind for kind, label in SAVED.items()}
             self._add("save", gui.add_button("Save"), "save", lambda _: kinds.get(str(self["kind"].value), "png"))
@@ -209,7 +209,7 @@ def numbers(values: NDArray, form: str) -> list[str]:
 
 def legend(mode: str, strained: float) -> str:
     """The legend of the colors, as HTML; strained: where they end."""
-    # in the fabric's own colors only what is strained lights up
+    # in the fabric's own colors only strained threads light up
     low, words = (
         (0.0, "<span>threads at rest</span>") if mode == "fabric" else (-1.0, "<span>compressed</span><span>at rest</span>")
     )

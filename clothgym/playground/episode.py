@@ -264,7 +264,7 @@ class Race(Stage):
     the screen, so the visitor says how far and how high; sideways the lane leads the sheet to the middle of the target.
 
     Args:
-        policies: what is raced against, by name; the first one at first.
+        policies: the opponents, by name; the race starts with the first.
 
     Raises:
         ValueError: there is no policy.

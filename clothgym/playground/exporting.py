@@ -101,7 +101,7 @@ def lasting(solids: Sequence[Sequence[Drawn]]) -> list[list[Drawn]]:
     return [[solid for solid in things if solid.at_origin in kept] for things in solids]
 
 
-# --- what is shown --------------------------------------------------------------------------------------------------------
+# --- stages ---------------------------------------------------------------------------------------------------------------
 
 
 def stage_named(name: str, seed: int = 0, policy: str = "expert", settings: Mapping[str, Any] | None = None) -> Stage:

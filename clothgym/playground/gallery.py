@@ -82,15 +82,15 @@ class Gallery:
 
 
 def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[str, Policy]]]:
-    """What is shown first, the first run's environment if nothing is asked; and the runs' policies, by environment and folder.
+    """The initial scene, by default the first run's environment; and the runs' policies, by environment and folder.
 
-    names: the runs' folders; who may act in any environment is left out.
+    names: the runs' folders; actors of all environments are ignored.
 
     Raises:
         ImportError: Stable-Baselines3 is missing; the message says how to get it.
         FileNotFoundError, ValueError: a folder without a run that can be used here.
     """
-    # what is wrong with any of them is said before the first is loaded, which takes seconds
+    # check all of them before loading the first, which takes seconds
     configs = {name: runs.read_config(Path(name)) for name in names if name not in ACTORS}
     found: dict[str, dict[str, Policy]] = {}
     for run, config in configs.items():

@@ -57,7 +57,7 @@ class Hand:
         self._close(gripper, 0.0)
 
     def let_go(self, gripper: int) -> None:
-        """Open a gripper; what it held flies on."""
+        """Open a gripper; the released cloth flies on."""
         self._close(gripper, 1.0)
 
     def _close(self, gripper: int, opening: float) -> None:

@@ -1,4 +1,4 @@
-"""A link that opens the page as it is: what is shown, its settings and seed, and where the sheet is pinned."""
+"""A link that restores the page: its scene, settings and seed, and the pins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of one visitor: what they do, and what is shown of it.  It knows a viewer's interface, not the library behind it."""
+"""The page of one visitor: their input, and the display.  It uses a viewer's interface and does not import its library."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Page:
         asked: query of the page's address, see ``link``; address: of the page, to which the link leads.
 
     ``tick`` is called by one thread only; a visitor's actions come in a queue.  A browser may send anything, and may change a
-    control's range: what it sends is checked here, against ranges of our own.
+    control's range: its input is checked here, against the server's own ranges.
     """
 
     def __init__(
@@ -292,7 +292,7 @@ class Page:
             waiting.remove()
         self.client.send_file_download(name, content)
 
-    # --- what is shown --------------------------------------------------------------------------------------------------
+    # --- display --------------------------------------------------------------------------------------------------------
 
     @property
     def _mode(self) -> str:

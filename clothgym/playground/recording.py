@@ -39,7 +39,7 @@ class Frame:
     Attributes:
         time: since the start [s].
         positions: [m], (sheets, particles, 3) float32.
-        solids: what is drawn next to the sheets.
+        solids: drawn solids.
         readings: numbers by name, (sheets,) each.
         terms: reward terms by name; none outside an environment.
     """
@@ -165,7 +165,7 @@ def _check_arrays(arrays: Mapping[str, NDArray], sheets: int) -> None:
     """Refuse arrays that do not fit together, or that hold what no recording can.
 
     Raises:
-        ValueError: the array, and what is wrong with it.
+        ValueError: names the array and its defect.
     """
     sizes: dict[str | int, int] = {"sheets": sheets}
     if lacking := sorted(set(ARRAYS) - set(arrays)):

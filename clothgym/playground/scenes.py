@@ -57,7 +57,7 @@ class Settings:
             "fast" or "strict".
 
     Raises:
-        ValueError: an invalid value; the message names it and what is valid.
+        ValueError: an invalid value; the message names it and the valid values.
     """
 
     gravity: float = GRAVITY
@@ -183,7 +183,7 @@ class Scene:
         return s
 
     def solids(self, simulation: Simulation) -> list[Drawn]:
-        """What is drawn next to the sheet and the floor: the solids where they are now, and the scenery."""
+        """Drawn objects other than the sheet and the floor: the solids at their present poses, and the scenery."""
         places = simulation.collider_positions[0]
         solids = [
             drawn((collider, self.colors.get(number, WARM_GRAY))).at(places[number])

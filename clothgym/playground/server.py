@@ -152,7 +152,7 @@ def serve(
     start: str, host: str = LOOPBACK, port: int = PORT, replay: Path | None = None,
     policies: Mapping[str, Mapping[str, Policy]] | None = None, actor: str = "expert", tell: Callable[[str], None] = TELL,
 ) -> Playground:  # fmt: skip
-    """Begin to serve, after a first look at what is shown first, which compiles what it needs.
+    """Start the server, after a first step of the initial scene, which compiles its kernels.
 
     policies, actor: see ``Gallery``.
 
@@ -172,8 +172,8 @@ def serve(
     playground = Playground(gallery, start, host, port)
     if not is_loopback(host):
         tell(
-            f"--host {host}: other machines can reach this page. Whoever has its address can use this machine's processors. The "
-            "token in it changes with each start; what is sent is not encrypted."
+            f"--host {host}: other machines can reach this page. Anybody with its address can use this machine's processors. The "
+            "token in it changes with each start; the connection is not encrypted."
         )
     tell(f"ready after {time.perf_counter() - begun:.1f} s: open {playground.url} in a browser; Ctrl+C ends it")
     return playground

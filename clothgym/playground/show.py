@@ -1,4 +1,4 @@
-"""A frame as nodes of a viewer's scene: sheets, threads, solids, and what is held."""
+"""A frame as nodes of a viewer's scene: sheets, threads, solids, and held points."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def round_up(value: float) -> float:
 
 
 MODES = ("fabric", "strain")
-HOLD = (36, 44, 70)  # color of what is held
+HOLD = (36, 44, 70)  # color of held points
 GROUND, SKY, HORIZON = (236, 232, 225), (222, 228, 236), (247, 245, 241)
 INSET = 0.003  # solids are drawn smaller by this: the sheet's triangles are chords of round solids [m]
 BOLD, RAISED = 0.0042, 0.003  # thickness of threads, and how high they lie on the drawn surface [m]
@@ -148,7 +148,7 @@ class DrawnSheet:
         self.palette.append((mixed(front, *HEM), mixed(back, *HEM)))
 
     def draw(self, x: NDArray, solids: Sequence[Drawn], plain: bool) -> None:
-        """Show the sheet at its particles' positions [m]; plain: dark, so that what is drawn upon it is seen."""
+        """Show the sheet at its particles' positions [m]; plain: dark, so that drawings on top are visible."""
         self._place(x, solids)
         for number, side, node in self.nodes:
             node.vertices = self.x[self.parts[number].vertices]

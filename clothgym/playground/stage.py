@@ -121,10 +121,10 @@ class Stage:
         """Take hold of the sheet where it is nearest to a position [m], (3,)."""
 
     def pull(self, place: ArrayLike) -> None:
-        """Move what is held to a position [m], (3,)."""
+        """Move the held cloth to a position [m], (3,)."""
 
     def let_go(self) -> None:
-        """Let go of what is held, which flies on."""
+        """Release the held cloth, which flies on."""
 
     def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
         """Pin the sheet where a ray from ``origin`` [m] meets it, or take away the pin that is there."""

@@ -4,9 +4,9 @@
     env = policy.make()
     action, _ = policy.predict(env.reset(seed=0)[0])
 
-A file holds the network that decides, in half precision, and says how it was trained and what it scores.  It is read without
+A file holds the network in half precision, with its training setup and its scores.  It is read without
 unpickling anything.  The network is evaluated in a fixed order of plain operations, see ``network``, so an episode is the same to
-the last bit wherever the environments are.
+the last bit on any machine and in any batch.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Policy:
     """A deterministic policy; callable on observations, of one environment or of a batch.
 
     Attributes:
-        about: how it was trained, and what it scores: "env", "env_kwargs", "learner", "seed", "digest" and more.
+        about: training setup and scores: "env", "env_kwargs", "learner", "seed", "digest" and more.
         keys: parts of an observation that is a dictionary, in the order in which the network takes them; empty for a plain one.
         layers: weights, (inputs, outputs), and biases, (outputs,), float32.
         activation: of all layers but the last, "tanh" or "relu"; squashed: whether a tanh bounds the actions.
@@ -52,7 +52,7 @@ class Policy:
         about: Mapping[str, Any] | None = None,
     ) -> None:
         one_of("activation", activation, *ACTIVATIONS)
-        # as they are kept in a file: what is scored is what is loaded
+        # rounded as in a file, so that scores are those of the loaded policy
         self.layers = [(as_kept(weight), as_kept(bias)) for weight, bias in layers]
         check_layers(self.layers)
         self.activation, self.squashed, self.keys, self.about = activation, bool(squashed), tuple(keys), dict(about or {})
@@ -125,7 +125,7 @@ def check_layers(layers: Sequence[tuple[NDArray, NDArray]]) -> None:
         if inputs not in (None, weight.shape[0]):
             raise ValueError(f"layer {number} takes {weight.shape[0]} numbers, the one before it gives {inputs}")
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
-            raise ValueError(f"layer {number} holds what is no finite number")
+            raise ValueError(f"layer {number} has a value that is not finite")
         inputs = weight.shape[1]
 
 

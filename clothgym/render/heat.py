@@ -1,4 +1,4 @@
-"""Numbers as colors: what is stretched more is darker and redder."""
+"""Color map of strain: larger strains are darker and redder."""
 
 from __future__ import annotations
 

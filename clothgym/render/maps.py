@@ -20,7 +20,7 @@ NOTHING = -1e6  # nearness where a light ray meets no surface [m]
 CONTACT_HEIGHTS = (0.02, 0.14)  # height above the floor at which a surface darkens it by half: touching, hanging over it [m]
 CONTACT_BLUR = (0.012, 0.05)  # half widths of the two shadows' soft edges [m]
 SKY_BLUR = 0.03  # [m]
-CAST_BLUR = (0.008, 0.04)  # half widths of the blur of shadows on the floor: of what stands on it, of what is far above [m]
+CAST_BLUR = (0.008, 0.04)  # half widths of the blur of shadows on the floor: of objects on the floor, and far above it [m]
 FAR_ABOVE = 0.6  # [m]
 FAINTEST = 1 / 512  # contact shadow too faint for a byte
 DOWN = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
@@ -111,7 +111,7 @@ def contact_shadow(lowest, half_height, out):
 @kernel
 def split_shadow(shadow, axes, center, scale, left, top, near, far):
     """The lamp's shadow on the floor at half the resolution of ``shadow``, from column ``left`` and row ``top`` on, in two parts, 0
-    to 1: of what is near the floor, and of what is ``FAR_ABOVE`` it or more along the ray."""
+    to 1: of objects near the floor, and of objects ``FAR_ABOVE`` it or more along the ray."""
     size = shadow.shape[0] // 2
     for row in range(top, top + near.shape[0]):
         for column in range(left, left + near.shape[1]):
@@ -162,7 +162,7 @@ def _box(ends: tuple[int, int, int, int], before: int, after: int, size: int) ->
 
 
 def _floor_shadow(rig: Rig, shadow: NDArray[np.float32], ends: tuple[int, int, int, int]) -> tuple[NDArray[np.float32], Box]:
-    """The lamp's shadow on the floor, blurred more for what is farther above, and its box."""
+    """The lamp's shadow on the floor, blurred more for higher objects, and its box."""
     size = rig.shadow_size // 2
     cast = np.zeros((size, size, 1), np.float32)
     if ends[0] > ends[1]:

@@ -83,7 +83,7 @@ def straight_down(middle: NDArray, half: float, size: int) -> Sight:
 
 
 def _offsets(numbers: NDArray, size: int) -> NDArray[np.float64]:
-    """What is added to the view axis at the middle of each pixel, (size, size, 3)."""
+    """Offset of the ray through the middle of each pixel from the view axis, (size, size, 3)."""
     across = (np.arange(size) + 0.5 - size / 2) / numbers[SCALE]
     return across[None, :, None] * numbers[RIGHT : RIGHT + 3] - across[:, None, None] * numbers[UP : UP + 3]
 
@@ -193,7 +193,7 @@ def draw_one(colored, i, b, l, x, surfaces, things, view, world, screen, picture
 
 @uncounted
 def project(world, count, sight, screen):
-    """Places of points in the picture [pixels] and their nearness, (points, 3); NaN for what is not in front of the near plane."""
+    """Positions of points in the image [pixels] and their nearness, (points, 3); NaN for points behind the near plane."""
     scale, nearest = sight[SCALE], sight[NEAR]
     for v in range(count):
         dx, dy, dz = world[v, 0] - sight[EYE], world[v, 1] - sight[EYE + 1], world[v, 2] - sight[EYE + 2]

@@ -55,7 +55,7 @@ class _Scene(NamedTuple):
 
 
 class Renderer:
-    """Draws a cloth, solids beside it and the floor z = 0.
+    """Draws a cloth, solids and the floor z = 0.
 
     The same positions give the same pixels, alone or in a batch, on any number of threads.
 

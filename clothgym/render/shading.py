@@ -333,7 +333,7 @@ def shade_surfaces(rays, look, mesh, maps, rig, antialias, owner, seen, light):
             facing = min(max(-(nx * dx + ny * dy + nz * dz) * toward, 0), 1)
 
             lamp = nx * axes[2][0] + ny * axes[2][1] + nz * axes[2][2]
-            # read beside the surface, on its lit side: within a texel a slanted surface would shadow itself
+            # read at an offset from the surface, on its lit side: within a texel a slanted surface would shadow itself
             aside = TEXELS_ASIDE / shadow_scale if lamp > 0 else -TEXELS_ASIDE / shadow_scale
             lit = _lit(shadow, shadow_box, axes, center, shadow_scale, slack, x + aside * nx, y + aside * ny, z + aside * nz)
             _, hanging, roof = _heights_at(heights, heights_box, center, height_scale, x, y)

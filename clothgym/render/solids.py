@@ -1,4 +1,4 @@
-"""Solids drawn beside the cloth: a collider with a color, and the mesh of its surface."""
+"""Drawn solids: a collider with a color, and the mesh of its surface."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ python docs/demo/record.py drape-box strain         # some
 
 A file is one line of JavaScript, so that a page opened from a disk may load it: a call with base64 of gzip.  Unpacked, it holds
 the length of a JSON header (uint32), the header, and all positions as int16 in steps of ``QUANTUM``: first the high bytes of all
-numbers, then the low ones.  The numbers are, coordinate by coordinate, what is left of each moment after a straight line through
+numbers, then the low ones.  The numbers are, coordinate by coordinate, the residual of each moment after linear extrapolation of
 the two before it, in zigzag order (0, -1, 1, -2, ...): small numbers, which gzip packs well.
 """
 
