@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from clothgym._jit import apart, kernel, run_spans, specialize, used
+from clothgym._jit import apart, callees_of, kernel, run_spans, specialize
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, positive, spread, vector
 from clothgym.collisions import COLLIDER_ROWS, SCRATCH_ROWS, Solids, keep_out, stop_at_solids
-from clothgym.elements import Elastic, Topology, room_for_forces
+from clothgym.elements import Elastic, Topology, scratch_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
 from clothgym.layout import Layout
@@ -462,7 +462,7 @@ def add_pulls(first, last, x, v, free_w, topology, fabric, holder, out):
     f: the forces of springs, bending and air.  Blocks ``first`` to ``last``.
     """
     stiffness, rigidity, damping_time, _, resistance, gravity, wind = fabric
-    f, scratch = np.empty(x.shape[1:], x.dtype), room_for_forces(x[first], topology.offset)
+    f, scratch = np.empty(x.shape[1:], x.dtype), scratch_for_forces(x[first], topology.offset)
     for b in range(first, last):
         # the forces on all particles of the block
         f[:] = 0
@@ -483,7 +483,9 @@ def add_pulls(first, last, x, v, free_w, topology, fabric, holder, out):
 @cache
 def pulls_with(bending: Bending, by_particle: bool) -> Any:
     """``add_pulls`` with the forces of a bending model and a memory layout."""
-    return specialize(add_pulls, f"add_pulls_{bending.name}_{by_particle}", **used(add_pulls, kernels_of(bending, by_particle)))
+    return specialize(
+        add_pulls, f"add_pulls_{bending.name}_{by_particle}", **callees_of(add_pulls, kernels_of(bending, by_particle))
+    )
 
 
 @kernel

@@ -249,7 +249,7 @@ def _hinge_families(mesh: ClothMesh) -> tuple[NDArray[np.int64], NDArray[np.floa
 
 
 @kernel
-def room_for_forces(x, offset):
+def scratch_for_forces(x, offset):
     """The ``Scratch`` of one block; x: (3, particles, lanes); offset: see ``Topology``."""
     _, particles, lanes = x.shape
     before = 0

@@ -201,9 +201,9 @@ def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
     limits: whether there is a limit.  by_particle: whether the particles of one grid are adjacent in memory.
     """
     if not limits:
-        return {"restrain": no_limit, "remeasure": no_measure}
+        return {"limit_strain": no_limit, "measure_strain": no_measure}
     largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")
     return {
-        "restrain": specialize(_limit_strain, f"limit_strain_{which}", apart=True, largest_strain=largest),
-        "remeasure": specialize(_measure_strain, f"measure_strain_{which}", apart=True, largest_strain=largest),
+        "limit_strain": specialize(_limit_strain, f"limit_strain_{which}", apart=True, largest_strain=largest),
+        "measure_strain": specialize(_measure_strain, f"measure_strain_{which}", apart=True, largest_strain=largest),
     }

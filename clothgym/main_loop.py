@@ -2,7 +2,7 @@
 
 ``advance`` takes blocks one after the other, each through all its substeps.  The kernels that it calls are the placeholders below,
 bound when a simulation is made (``compiled``), by its integrator, bending model, layout, limiter and contact.  Its scratch, which
-it cannot make itself (see ``_jit.uncounted``), is made by ``room_for_block``.
+it cannot make itself (see ``_jit.uncounted``), is made by ``scratch_for_block``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import limiting
-from clothgym._jit import placeholder, specialize, uncounted, used
+from clothgym._jit import callees_of, placeholder, specialize, uncounted
 from clothgym.bending import Bending
 from clothgym.collisions.self.step import kernels_of as self_contact_kernels
 from clothgym.collisions.solids.sheet_contact import kernels_of as contact_kernels
@@ -23,24 +23,29 @@ from clothgym.elements import Elastic
 from clothgym.forces import add_air_forces
 from clothgym.grid_forces import kernels_of
 from clothgym.guards import mark_diverged
-from clothgym.integrators.base import Work, room_for_work
+from clothgym.integrators.base import Work, scratch_for_work
 
 # of the integrator, see ``integrators.base``
 substep = placeholder("substep", "of an integrator: moves a block on by h [s] under springs, bending, gravity, drag and push")
 # of ``limiting``
-restrain = placeholder("restrain", "of (x, v, w, weave, limit, limited): pulls springs beyond the strain limit back to it")
-remeasure = placeholder("remeasure", "of (x, weave, limited): writes the largest strain at the end of a control step")
-# of ``collisions.self.step``
-press = placeholder("press", "of (x, v, w, sheet, block, step, carried): applies the impulses of contacts with itself")
-keep_apart = placeholder(
-    "keep_apart", "of (x, v, w, sheet, room, block, h, carried): corrects them, and keeps vertices in their bounds"
+limit_strain = placeholder(
+    "limit_strain", "of (x, v, w, topology, limit, strain_report): pulls springs beyond the strain limit back to it"
 )
-room_for_self_contact = placeholder("room_for_self_contact", "of (x, sheet): makes the scratch of ``keep_apart``")
+measure_strain = placeholder(
+    "measure_strain", "of (x, topology, strain_report): writes the largest strain at the end of a control step"
+)
+# of ``collisions.self.step``
+warm_start = placeholder("warm_start", "of (x, v, w, sheet, block, step, lead): applies the impulses of contacts with itself")
+solve_self_contact = placeholder(
+    "solve_self_contact", "of (x, v, w, sheet, scratch, block, h, lead): corrects them, and keeps vertices in their bounds"
+)
+scratch_for_self_contact = placeholder("scratch_for_self_contact", "of (x, sheet): makes the scratch of ``solve_self_contact``")
 # of ``collisions.solids.sheet_contact``
 resolve = placeholder(
-    "resolve", "of (x, v, w, triangles, shapes, colliders, h, carried, look, room): moves solids on, and the sheet out of them"
+    "resolve",
+    "of (x, v, w, triangles, shapes, colliders, h, lead, look, scratch): moves solids on, and the sheet out of them",
 )
-room_for_contact = placeholder("room_for_contact", "of (x, triangles, shapes): makes the scratch of ``resolve``")
+scratch_for_contact = placeholder("scratch_for_contact", "of (x, triangles, shapes): makes the scratch of ``resolve``")
 
 
 class Motion(NamedTuple):
@@ -57,23 +62,23 @@ class Motion(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """What is done when in a control step, and with what.
+    """The plan of a control step: substep, intervals, options of the integrator, strain limit.
 
-    h: a substep [s].  carried: for how long velocities have moved the positions when contact changes them [s].
+    h: a substep [s].  lead: for how long velocities have moved the positions when contact changes them [s].
     substeps: of a control step.  air_every, look_every: substeps after which the air's force is computed again, 0 for no air, and
     after which solids are looked for between particles.
-    options, plan, room: of the integrator: numbers, matrices that it has factorized, and the size of its scratch.
+    options, plan, work_shape: of the integrator: numbers, matrices that it has factorized, and the size of its scratch.
     limit: largest strain.
     """
 
     h: Any
-    carried: Any
+    lead: Any
     substeps: int
     air_every: int
     look_every: int
     options: tuple[Any, ...]
     plan: tuple[NDArray, ...]
-    room: tuple[int, int, int]
+    work_shape: tuple[int, int, int]
     limit: float
 
 
@@ -87,67 +92,69 @@ class Solid(NamedTuple):
 class Outcome(NamedTuple):
     """Strain met and left in a control step, (blocks, 3, lanes), and whether an environment has diverged, (blocks, lanes)."""
 
-    limited: NDArray
+    strain_report: NDArray
     diverged: NDArray
 
 
-def room_for_block(x, offset, room, triangles, shapes, sheet):
+def scratch_for_block(x, offset, shape, triangles, shapes, sheet):
     """Scratch of ``advance``, which its blocks share one after the other: the integrator's, the air's force [N], and those of
     contact with solids and of the sheet with itself.
 
-    x: positions of a block.  offset: see ``elements.room_for_forces``.  room: see ``Integrator.room``.
+    x: positions of a block.  offset: see ``elements.scratch_for_forces``.  shape: see ``Integrator.work_shape``.
     """
-    solids, itself = room_for_contact(x, triangles, shapes), room_for_self_contact(x, sheet)
-    return room_for_work(x, offset, room), np.zeros(x.shape, x.dtype), solids, itself
+    solids, itself = scratch_for_contact(x, triangles, shapes), scratch_for_self_contact(x, sheet)
+    return scratch_for_work(x, offset, shape), np.zeros(x.shape, x.dtype), solids, itself
 
 
-def advance(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, room):
+def advance(first, last, motion, topology, fabric, solids, sheet, schedule, outcome, scratch):
     """One control step of blocks ``first`` to ``last``: a block does all its substeps before the next, and stays in cache."""
-    h, carried, substeps, air_every, look_every, options, plan, _, limit = schedule
-    (fields, of_springs, of_bends, scratch), push, touches, near = room
+    h, lead, substeps, air_every, look_every, options, plan, _, limit = schedule
+    (fields, of_springs, of_bends, of_forces), push, of_solids, of_itself = scratch
     shapes = solids.shapes
     for b in range(first, last):
-        x, v, w, colliders, limited = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.limited[b]
-        work = Work(fields, of_springs, of_bends, scratch, motion.remainders[b])
+        x, v, w, colliders, strain_report = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.strain_report[b]
+        work = Work(fields, of_springs, of_bends, of_forces, motion.remainders[b])
         elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b])
         drag_rate, resistance, gravity, wind = fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b]
         push[:] = 0
-        limited[:] = 0
+        strain_report[:] = 0
         for step in range(substeps):
-            # the air's force is slow beside the springs': until it is computed again it is a constant push
+            # the air's force changes slowly compared with the springs': between computations it is a constant push
             if air_every > 0 and step % air_every == 0:
                 push[:] = 0
-                add_air_forces(x, v, push, weave.air, resistance, wind, x.dtype.type(air_every) * h, work.scratch)
+                add_air_forces(x, v, push, topology.air, resistance, wind, x.dtype.type(air_every) * h, work.scratch)
             # the integrator: springs, bending, gravity, drag and that push move the particles on
-            substep(x, v, w, weave.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
+            substep(x, v, w, topology.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
             # springs that are stretched beyond the limit are pulled back to it
-            restrain(x, v, w, weave, limit, limited)
+            limit_strain(x, v, w, topology, limit, strain_report)
             # contacts of the sheet with itself press as before, so that solids bear what lies on them
-            press(x, v, w, sheet, b, step, carried)
-            # solids move on, and push out what is in them
-            resolve(x, v, w, weave.triangles, shapes, colliders, h, carried, step, look_every, touches)
+            warm_start(x, v, w, sheet, b, step, lead)
+            # solids move on, and push the sheet out
+            resolve(x, v, w, topology.triangles, shapes, colliders, h, lead, step, look_every, of_solids)
             # the contacts' impulses are corrected, and no vertex leaves its displacement bound
-            keep_apart(x, v, w, sheet, near, b, h, carried)
-        remeasure(x, weave, limited)
+            solve_self_contact(x, v, w, sheet, of_itself, b, h, lead)
+        measure_strain(x, topology, strain_report)
         mark_diverged(x, v, outcome.diverged[b])
 
 
 class MainLoop:
     """``advance`` of one simulation, with the scratch of each of its threads."""
 
-    def __init__(self, kernel: Any, make_room: Any) -> None:
-        self.kernel, self.make_room = kernel, make_room
+    def __init__(self, kernel: Any, make_scratch: Any) -> None:
+        self.kernel, self.make_scratch = kernel, make_scratch
         # each thread has one, as long as it lives
-        self.rooms = local()
+        self.scratches = local()
 
     def __call__(
-        self, first: int, last: int, motion: Motion, weave: Any, fabric: Any, solids: Solid, sheet: Any, schedule: Schedule,
+        self, first: int, last: int, motion: Motion, topology: Any, fabric: Any, solids: Solid, sheet: Any, schedule: Schedule,
         outcome: Outcome,
     ) -> None:  # fmt: skip
         """One control step of blocks ``first`` to ``last``."""
-        if not hasattr(self.rooms, "own"):
-            self.rooms.own = self.make_room(motion.x[first], weave.offset, schedule.room, weave.triangles, solids.shapes, sheet)
-        self.kernel(first, last, motion, weave, fabric, solids, sheet, schedule, outcome, self.rooms.own)
+        if not hasattr(self.scratches, "own"):
+            self.scratches.own = self.make_scratch(
+                motion.x[first], topology.offset, schedule.work_shape, topology.triangles, solids.shapes, sheet
+            )
+        self.kernel(first, last, motion, topology, fabric, solids, sheet, schedule, outcome, self.scratches.own)
 
 
 @cache
@@ -156,11 +163,11 @@ def compiled(
 ) -> tuple[Any, Any]:
     """``advance`` around an integrator's substep: with the forces of a bending model and a layout, with a limiter or none, with
     contact of the sheet with itself or none, and with contact with solids (see ``sheet_contact.needed``); and its
-    ``room_for_block``."""
+    ``scratch_for_block``."""
     forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
     touching, itself = contact_kernels(contact, by_particle), self_contact_kernels(collides, by_particle)
-    parts = limiting.kernels_of(limits, by_particle) | used(advance, forces | touching | itself)
-    parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **used(substep, forces))
+    parts = limiting.kernels_of(limits, by_particle) | callees_of(advance, forces | touching | itself)
+    parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **callees_of(substep, forces))
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
-    room = specialize(room_for_block, f"room_for_block_{layout}", **used(room_for_block, touching | itself))
-    return specialize(uncounted(advance), f"advance_{which}", apart=True, **parts), room
+    scratch = specialize(scratch_for_block, f"scratch_for_block_{layout}", **callees_of(scratch_for_block, touching | itself))
+    return specialize(uncounted(advance), f"advance_{which}", apart=True, **parts), scratch

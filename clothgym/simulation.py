@@ -263,13 +263,13 @@ class Simulation:
         )
         self._schedule = Schedule(
             h=self.dtype.type(h),
-            carried=self.dtype.type(h * method.carried),
+            lead=self.dtype.type(h * method.lead),
             substeps=self.substeps,
             air_every=air_every if self._fabric.resistance[:, :2].any() else 0,
             look_every=look_every,
             options=tuple(method.options.values()),
             plan=self._plan,
-            room=method.room(len(self._elements.springs.weight), len(self._elements.bends.weight)),
+            work_shape=method.work_shape(len(self._elements.springs.weight), len(self._elements.bends.weight)),
             limit=float(self.strain_limit or 0),
         )
 

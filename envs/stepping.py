@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import inlined, placeholder, specialize, uncounted, used
+from clothgym._jit import callees_of, inlined, placeholder, specialize, uncounted
 from clothgym.envs.episode import BEYOND, DIVERGED, EFFORT_PRICE, FAILURE_PENALTY, FINE, OUT_OF_BOUNDS, SUCCESS_BONUS, TORN, TWICE
 from clothgym.envs.measures import CENTROID, FINITE, STRETCH2, SUMMARY, largest_strain, summarize
 from clothgym.mesh import SHEAR, ClothMesh
@@ -116,9 +116,9 @@ IN_NUMPY = Kernels(_performance_written, _evaluation_written, _observed_already,
 def compiled(name: str, kernels: Kernels) -> tuple[Any, Any]:
     """``apply_actions`` and ``finish_step`` with the kernels of the task of that name."""
     parts = kernels._asdict()
-    scoring = specialize(score, f"score_{name}", apart=True, **used(score, parts))
-    one = specialize(finish_one, f"finish_one_{name}", apart=True, score=scoring, **used(finish_one, parts))
-    applying = specialize(apply_actions, f"apply_actions_{name}", **used(apply_actions, parts))
+    scoring = specialize(score, f"score_{name}", apart=True, **callees_of(score, parts))
+    one = specialize(finish_one, f"finish_one_{name}", apart=True, score=scoring, **callees_of(finish_one, parts))
+    applying = specialize(apply_actions, f"apply_actions_{name}", **callees_of(apply_actions, parts))
     return applying, specialize(finish_step, f"finish_{name}", finish_one=one)
 
 

@@ -7,7 +7,16 @@ import pytest
 
 from clothgym import Material, Simulation, disc, grid
 from clothgym.bending import BENDING, add_hinge_forces, add_hinge_products, add_quadratic_forces, add_quadratic_products
-from clothgym.elements import KINDS, Elastic, element_arrays, grid_of, grid_surface_of, is_regular, room_for_forces, surface_arrays
+from clothgym.elements import (
+    KINDS,
+    Elastic,
+    element_arrays,
+    grid_of,
+    grid_surface_of,
+    is_regular,
+    scratch_for_forces,
+    surface_arrays,
+)
 from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products, set_lane_forces
 from clothgym.grid_forces import (
     add_grid_air_forces,
@@ -17,7 +26,7 @@ from clothgym.grid_forces import (
     add_grid_products,
     set_grid_forces,
 )
-from clothgym.integrators.base import Work, advance_velocities, kick_and_drift, room_for_work
+from clothgym.integrators.base import Work, advance_velocities, kick_and_drift, scratch_for_work
 
 SHAPES = [(2, 2), (2, 3), (5, 2), (4, 7), (9, 9)]
 STIFFNESS = np.array([210, 190, 0, 90, 3, 2, 0.0])
@@ -41,7 +50,7 @@ def test_a_particle_gets_the_bits_of_a_plain_loop_over_the_springs(shape):
     mesh, real = grid(*shape, 0.3, 0.5), np.float32
     x, v, f = thrown(mesh, real)
     elements = grid_of(mesh, np.dtype(real), "springs")
-    add_grid_forces(x, v, f, elements, properties(real), room_for_forces(x, elements.offset))
+    add_grid_forces(x, v, f, elements, properties(real), scratch_for_forces(x, elements.offset))
     expected = np.zeros((3, mesh.num_particles), real)
     tau, one, columns = real(2e-3), real(1), shape[1]
     weights = dict(zip(map(tuple, np.sort(mesh.springs.particles, axis=1).tolist()), mesh.springs.weight))
@@ -68,7 +77,7 @@ def test_forces_and_products_are_those_of_lanes(shape, bending):
     elastic, bend = properties(real), np.full(1, 1e-3)
     along, across = elastic.stiffness * 2, elastic.stiffness
     elements = grid_of(mesh, np.dtype(real), bending)
-    scratch = room_for_forces(x, elements.offset)
+    scratch = scratch_for_forces(x, elements.offset)
     y = np.zeros_like(f)
     add_grid_forces(x, v, f, elements, elastic, scratch)
     add_grid_products(x, v, y, elements, along, across, bend, scratch)
@@ -76,7 +85,7 @@ def test_forces_and_products_are_those_of_lanes(shape, bending):
         add_grid_hinge_forces(x, v, f, elements, elastic, scratch)
         add_grid_hinge_products(x, v, y, elements, bend, scratch)
     single = element_arrays(mesh, np.dtype(real), bending != "springs", any_order=True)
-    row, f2, y2 = room_for_forces(x, np.zeros(0, np.int64)), np.zeros_like(f), np.zeros_like(f)
+    row, f2, y2 = scratch_for_forces(x, np.zeros(0, np.int64)), np.zeros_like(f), np.zeros_like(f)
     add_lane_forces(x, v, f2, single, elastic, row)
     add_lane_products(x, v, y2, single, along, across, bend, row)
     if bending == "hinge":
@@ -95,8 +104,8 @@ def test_the_air_presses_as_it_does_on_lanes(shape):
     x, v, f = thrown(mesh, real)
     resistance, wind = np.array([[0.7], [0.05], [0.2]]), np.array([[1.0], [-2.0], [0.5]])
     offset, f2 = grid_of(mesh, np.dtype(real), "springs").offset, np.zeros_like(f)
-    add_grid_air_forces(x, v, f, grid_surface_of(mesh, np.dtype(real)), resistance, wind, 0.0, room_for_forces(x, offset))
-    add_lane_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, 0.0, room_for_forces(x, offset[:0]))
+    add_grid_air_forces(x, v, f, grid_surface_of(mesh, np.dtype(real)), resistance, wind, 0.0, scratch_for_forces(x, offset))
+    add_lane_air_forces(x, v, f2, surface_arrays(mesh, np.dtype(real)), resistance, wind, 0.0, scratch_for_forces(x, offset[:0]))
     assert np.abs(f2).max() > 1e-3 and np.allclose(f, f2, rtol=0, atol=1e-12)
 
 
@@ -105,7 +114,7 @@ def test_forces_leave_no_trace_in_their_scratch():
     mesh = grid(4, 5, 0.3, 0.3)
     x, v, f = thrown(mesh, np.float32)
     elements = grid_of(mesh, np.dtype(np.float32), "springs")
-    scratch = room_for_forces(x, elements.offset)
+    scratch = scratch_for_forces(x, elements.offset)
     add_grid_forces(x, v, f, elements, properties(np.float32), scratch)
     again = np.zeros_like(f)
     add_grid_forces(x, v, again, elements, properties(np.float32), scratch)
@@ -121,7 +130,7 @@ def test_springs_of_no_length_leave_their_neighbors_alone():
     x, v, f = thrown(mesh, np.float32)
     x[:, 4], x[:, 8] = x[:, 3], x[:, 7]
     elements = grid_of(mesh, np.dtype(np.float32), "springs")
-    add_grid_forces(x, v, f, elements, properties(np.float32), room_for_forces(x, elements.offset))
+    add_grid_forces(x, v, f, elements, properties(np.float32), scratch_for_forces(x, elements.offset))
     assert np.isfinite(f).all()
 
 
@@ -129,7 +138,7 @@ def test_springs_of_no_length_leave_their_neighbors_alone():
 def test_held_particles_keep_their_velocity(lanes):
     v, w = np.ones((3, 5, lanes), np.float32), np.repeat(np.array([1, 0, 1, 0, 1], np.float32)[:, None], lanes, 1)
     f, gravity = np.full((3, 5, lanes), 2, np.float32), np.full((3, lanes), 4, np.float32)
-    work = Work(*room_for_work(v, np.zeros(0, np.int64), (1, 0, 0)), np.zeros((2, 3, 5, lanes), np.float32))
+    work = Work(*scratch_for_work(v, np.zeros(0, np.int64), (1, 0, 0)), np.zeros((2, 3, 5, lanes), np.float32))
     x, also = np.zeros_like(v), v.copy()
     advance_velocities(v, w, f, gravity, np.full(lanes, 1, np.float32), np.float32(0.5), work)
     assert np.allclose(v[:, [0, 2, 4]], (1 + 0.5 * (2 + 4)) / 1.5) and np.array_equal(v[:, [1, 3]], np.ones((3, 2, lanes)))
@@ -146,16 +155,16 @@ def test_forces_start_from_given_values(bending):
     start = np.random.default_rng(1).normal(size=x.shape).astype(np.float32)
     elements = grid_of(mesh, np.dtype(np.float32), bending)
     added, set_to = start.copy(), np.full_like(start, np.nan)
-    add_grid_forces(x, v, added, elements, properties(np.float32), room_for_forces(x, elements.offset))
-    set_grid_forces(x, v, start, set_to, elements, properties(np.float32), room_for_forces(x, elements.offset))
+    add_grid_forces(x, v, added, elements, properties(np.float32), scratch_for_forces(x, elements.offset))
+    set_grid_forces(x, v, start, set_to, elements, properties(np.float32), scratch_for_forces(x, elements.offset))
     assert np.array_equal(added.view(np.uint32), set_to.view(np.uint32))
     single = element_arrays(mesh, np.dtype(np.float32), False, True)
     for lanes in (1, 4):
         elastic = Elastic(*(np.repeat(part, lanes, -1) for part in properties(np.float32)))
         x_l, v_l, start_l = (np.repeat(a, lanes, 2) for a in (x, v, start))
         added, set_to = start_l.copy(), np.full_like(start_l, np.nan)
-        add_lane_forces(x_l, v_l, added, single, elastic, room_for_forces(x_l, np.zeros(0, np.int64)))
-        set_lane_forces(x_l, v_l, start_l, set_to, single, elastic, room_for_forces(x_l, np.zeros(0, np.int64)))
+        add_lane_forces(x_l, v_l, added, single, elastic, scratch_for_forces(x_l, np.zeros(0, np.int64)))
+        set_lane_forces(x_l, v_l, start_l, set_to, single, elastic, scratch_for_forces(x_l, np.zeros(0, np.int64)))
         assert np.array_equal(added, set_to)
 
 

@@ -10,7 +10,7 @@ from clothgym import contact_memory
 from clothgym.collisions.self.broad_phase import Reach, enclose, far_leaves
 from clothgym.collisions.self.impulses import FASTEST, _correct
 from clothgym.collisions.self.query import query
-from clothgym.collisions.self.query_room import LEAF_PAIRS, Found, room_for_queries
+from clothgym.collisions.self.query_scratch import LEAF_PAIRS, Found, scratch_for_queries
 from clothgym.collisions.self.topology import pairs_of
 from clothgym.contact_memory import C_SIZE, G_SIZE, REPORT_SIZE
 from clothgym.starts import MANEUVERS
@@ -74,17 +74,21 @@ def pairs_by_sampling(mesh, x, points=25):
                 yield np.array([p]), triangles[t], np.sqrt(((on_triangles[t] - x[p]) ** 2).sum(axis=-1).min())
 
 
+def queried(mesh, x, reach, extra=0.0, held=False, most=4000):
+    """Scratch of a query, and the members and planes of the gap constraints that it found, with room for ``most``."""
+    pairs = pairs_of(mesh)
+    scratch = scratch_for_queries(pairs, np.empty((900, 3)))
+    scratch.p[:], scratch.ahead[:], scratch.extra[:], scratch.held[:] = x, x, extra, held
+    members, planes = np.empty((most, G_SIZE), np.int32), np.empty((most, 4))
+    found = Found(np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), members, planes, scratch.counts, np.zeros(REPORT_SIZE))
+    query(pairs, reach, scratch, found)
+    return scratch, members[: scratch.counts[1]], planes[: scratch.counts[1]]
+
+
 def looked_around(mesh, x, extra, most):
     """Bounds and limits of a query with a reach of 6 cm."""
-    pairs, reach = pairs_of(mesh), Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0, 0.0)
-    room = room_for_queries(pairs, np.empty((900, 3)))
-    room.p[:], room.ahead[:], room.extra[:], room.held[:] = x, x, extra, False
-    members = np.empty((most, G_SIZE), np.int32)
-    found = Found(
-        np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), members, np.empty((most, 4)), room.counts, np.zeros(REPORT_SIZE)
-    )
-    query(pairs, reach, room, found)
-    return room.bounds, room.limits, members[: room.counts[1]]
+    scratch, members, _ = queried(mesh, x, Reach(0.06, 0.06, 0.03, 0.03, 0.01, 0.0, 0.0, 0.0), extra, most=most)
+    return scratch.bounds, scratch.limits, members
 
 
 def crumpled_strip(seed):
@@ -136,12 +140,9 @@ def test_a_gap_constraint_keeps_more_where_something_is_held():
     mesh, x = crumpled_strip(0)
     stop, standoff = 0.012, 0.02
     held = np.random.default_rng(2).random(len(x)) < 0.15
-    room = np.empty((900, 4), np.int32), np.empty((900, C_SIZE)), np.empty((4000, G_SIZE), np.int32), np.empty((4000, 4))
-    bounds, limits, report = np.empty(len(x)), np.empty(len(x)), np.zeros(REPORT_SIZE)
-    reach = Reach(0.06, 0.06, 0.03, 0.03, 0.01, stop, standoff, 0.0)
-    _, count = query(x, x, pairs_of(mesh), reach, np.zeros(len(x)), held, bounds, limits, *room, report)
+    _, members, planes = queried(mesh, x, Reach(0.06, 0.06, 0.03, 0.03, 0.01, stop, standoff, 0.0), held=held)
     seen = set()
-    for row, (*normal, kept) in zip(room[2][:count], room[3][:count]):
+    for row, (*normal, kept) in zip(members, planes):
         own, number = row[:2]
         along = x[row[3 : 3 + number]] @ normal
         gap, most = along[:own].min() - along[own:].max(), standoff if held[row[3 : 3 + number]].any() else stop

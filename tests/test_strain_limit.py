@@ -22,7 +22,7 @@ def limited(mesh, x, v, w, limit=LIMIT):
     elements = element_arrays(mesh, real, hinged=False, any_order=False)
     topology = topology_of(mesh, elements, surface_arrays(mesh, real), "springs", by_particle=False)
     report = np.zeros((3, 1))
-    kernels_of(True, False)["restrain"](x, v, w, topology, limit, report)
+    kernels_of(True, False)["limit_strain"](x, v, w, topology, limit, report)
     return x[:, :, 0].T, v[:, :, 0].T, report[:, 0]
 
 

@@ -10,13 +10,13 @@ One policy for the whole project, so that the promises made about bits and about
     threads            spans of blocks on Python threads
 """
 
-from clothgym._jit.binding import placeholder, specialize, used
+from clothgym._jit.binding import callees_of, placeholder, specialize
 from clothgym._jit.cache import cache_folder
 from clothgym._jit.merging import merged
 from clothgym._jit.policy import WITHOUT_JIT, apart, disjoint, inlined, is_kept, kernel, uncounted
 from clothgym._jit.threads import default_threads, run_spans
 
 __all__ = [
-    "WITHOUT_JIT", "apart", "cache_folder", "default_threads", "disjoint", "inlined", "is_kept", "kernel", "merged", "placeholder",
-    "run_spans", "specialize", "uncounted", "used",
+    "WITHOUT_JIT", "apart", "cache_folder", "callees_of", "default_threads", "disjoint", "inlined", "is_kept", "kernel", "merged",
+    "placeholder", "run_spans", "specialize", "uncounted",
 ]  # fmt: skip

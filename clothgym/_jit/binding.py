@@ -47,7 +47,7 @@ def placeholder(name: str, meaning: str) -> Callable[..., Any]:
     return _Placeholder(name, meaning)
 
 
-def used(function: Any, callees: Mapping[str, Any]) -> dict[str, Any]:
+def callees_of(function: Any, callees: Mapping[str, Any]) -> dict[str, Any]:
     """Those of ``callees`` whose names ``function`` uses."""
     names = _globals_of(getattr(function, "py_func", function))
     return {name: callee for name, callee in callees.items() if name in names}

@@ -2,14 +2,14 @@
 
 The contact work of one substep, in the order of the main loop (``clothgym/main_loop.py``):
 
-1. ``press`` (``self/step.py``): contacts of the sheet with itself press as at the end of the substep before.
-2. ``resolve`` (``solids/sheet_contact.py``): solids move on and push out what is in them: every particle
+1. ``warm_start`` (``self/step.py``): contacts of the sheet with itself apply their impulses of the previous substep.
+2. ``resolve`` (``solids/sheet_contact.py``): solids move on and push cloth out: every particle
    (``solids/particle_contact.py``), and with ``contact="sheet"`` the points between particles, too
    (``solids/triangle_contact.py``).  One contact takes the inward velocity and Coulomb friction (``solids/contact_law.py``).
-3. ``keep_apart`` (``self/step.py``): impulses between what is closer than the cloth's thickness (``self/impulses.py``), then the
-   displacement bounds (``self/displacement_bounds.py``).  A vertex beyond its bound causes its gap constraints to be evaluated
-   (``self/gap_constraints.py``), or a query: which pairs are close (``self/broad_phase.py``), and how far each vertex may move from
-   here (``self/narrow_phase.py``).
+3. ``solve_self_contact`` (``self/step.py``): impulses between parts closer than the cloth's thickness (``self/impulses.py``), then
+   the displacement bounds (``self/displacement_bounds.py``).  A vertex beyond its bound causes its gap constraints to be evaluated
+   (``self/gap_constraints.py``), or a query (``self/query.py``): which pairs are close (``self/near_pairs.py``,
+   ``self/far_pairs.py``), and how far each vertex may move from here (``self/narrow_phase.py``).
 
 Once a control step anchors and grippers are stopped at solids (``solids/attachment_contact.py``).
 

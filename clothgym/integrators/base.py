@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import disjoint, kernel, merged, uncounted
 from clothgym.checks import count, number
-from clothgym.elements import Scratch, room_for_forces
+from clothgym.elements import Scratch, scratch_for_forces
 from clothgym.forces import Oscillators
 
 Properties = frozenset[str]
@@ -84,7 +84,7 @@ class Integrator:
         largest_substep: the largest substep [s] that the method should be used with, or zero if no substep will do; and the
             reason, as a clause of a sentence.
         surely_allowed: a substep [s] that is certainly no larger than that, and quick to compute.
-        carried: share of the substep for which the new velocity has already moved the positions when the substep ends.
+        lead: share of the substep for which the new velocity has already moved the positions when the substep ends.
         any_order: whether the result is independent of the order of the springs, so that a grid's particles may be adjacent in
             memory.
         safety: share of ``largest_substep`` that ``substeps="auto"`` uses.
@@ -107,7 +107,7 @@ class Integrator:
     surely_allowed: Callable[[Oscillators], float]
     any_order: bool
     safety: float = 1.0
-    carried: float = 1.0
+    lead: float = 1.0
     options: Mapping[str, int | float] = field(default_factory=lambda: MappingProxyType({}))
     fields: int = 1
     multipliers: bool = False
@@ -121,7 +121,7 @@ class Integrator:
         """Number of substeps in a control step [s], for each to be at most ``safety`` times the largest substep [s]."""
         return max(1, int(np.ceil(time_step / (self.safety * largest) - 1e-9)))
 
-    def room(self, springs: int, bends: int) -> tuple[int, int, int]:
+    def work_shape(self, springs: int, bends: int) -> tuple[int, int, int]:
         """Sizes of a ``Work``: the number of fields, and of multipliers of springs and of hinges."""
         remembers = self.multipliers and self.options["iterations"] > 1
         return (self.fields, springs, bends) if remembers else (self.fields, 0, 0)
@@ -160,18 +160,18 @@ def _rebuilt(attributes: dict[str, Any]) -> Integrator:
 
 
 @kernel
-def room_for_work(x, offset, room):
+def scratch_for_work(x, offset, shape):
     """The scratch of a ``Work`` of one block with positions ``x``, in its order.
 
-    offset: see ``elements.room_for_forces``.  room: see ``Integrator.room``.
+    offset: see ``elements.scratch_for_forces``.  shape: see ``Integrator.work_shape``.
     """
     _, particles, lanes = x.shape
-    fields, springs, bends = room
+    fields, springs, bends = shape
     return (
         np.empty((fields, 3, particles, lanes), x.dtype),
         np.empty((springs, lanes), x.dtype),
         np.empty((bends, 3, lanes), x.dtype),
-        room_for_forces(x, offset),
+        scratch_for_forces(x, offset),
     )
 
 

@@ -61,5 +61,5 @@ EXPLICIT_EULER = Integrator(
     surely_allowed=surely_allowed,
     any_order=True,
     safety=0.8,
-    carried=0.0,
+    lead=0.0,
 )

@@ -130,6 +130,6 @@ RK4 = Integrator(
     surely_allowed=surely_allowed,
     any_order=True,
     safety=0.8,
-    carried=0.5,
+    lead=0.5,
     fields=5,
 )

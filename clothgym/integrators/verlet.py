@@ -45,5 +45,5 @@ VERLET = Integrator(
     surely_allowed=surely_allowed,
     any_order=True,
     safety=0.8,
-    carried=0.5,
+    lead=0.5,
 )

@@ -132,7 +132,7 @@ def far_leaves(tree, far, ball, box, hulls, begin_node, out):
     """Find pairs of leaves without a common vertex that may be within ``far``, from a node on.  Returns how many, and the node from
     which to go on when ``out``, (room, 2), is about to be full: it must have room for ``NODE_LEAVES`` pairs for each leaf and one.
     """
-    nodes, beside, beside_nodes, beside_leaves = tree.nodes, tree.beside, tree.beside_nodes, tree.beside_leaves
+    nodes, adjacent, adjacent_nodes, adjacent_leaves = tree.nodes, tree.adjacent, tree.adjacent_nodes, tree.adjacent_leaves
     count, enough = 0, out.shape[0] - NODE_LEAVES * box.shape[1]
     for one in range(begin_node, nodes.shape[0]):
         if count >= enough:
@@ -143,7 +143,7 @@ def far_leaves(tree, far, ball, box, hulls, begin_node, out):
         begin, number = nodes[one, NODE_BEGIN], nodes[one, NODE_END] - nodes[one, NODE_BEGIN]
         # traverse the nodes from this one on, beside the list of adjacent ones, which is in the same order; a node that is out of
         # reach is skipped with its subtree
-        two, next_beside = one, beside[one]
+        two, next_adjacent = one, adjacent[one]
         while two < nodes.shape[0]:
             node, two = two, nodes[two, NODE_NEXT]
             if out_of_reach(hulls, one, hulls, node, far):
@@ -153,11 +153,11 @@ def far_leaves(tree, far, ball, box, hulls, begin_node, out):
                 two = node + 1
                 continue
             # pairs of leaves that are not searched
-            while next_beside < beside[one + 1] and beside_nodes[next_beside] < node:
-                next_beside += 1
+            while next_adjacent < adjacent[one + 1] and adjacent_nodes[next_adjacent] < node:
+                next_adjacent += 1
             excluded = 0
-            if next_beside < beside[one + 1] and beside_nodes[next_beside] == node:
-                excluded = beside_leaves[next_beside]
+            if next_adjacent < adjacent[one + 1] and adjacent_nodes[next_adjacent] == node:
+                excluded = adjacent_leaves[next_adjacent]
             # the leaves of this node that may be within reach of the other node, and then of its leaves
             first, others = nodes[node, NODE_BEGIN], nodes[node, NODE_END] - nodes[node, NODE_BEGIN]
             reached = leaves_within(box, begin, number, hulls, node, far)

@@ -252,7 +252,7 @@ def on_vertex(p, v, i, j, k, a, b, c, gap, nx, ny, nz, is_smooth, parts, smooth)
 
 @inlined
 def can_touch(p, e, i, j, nx, ny, nz, parts):
-    """Whether edge e = ij may be in contact towards n: no face beside it rises along n."""
+    """Whether edge e = ij may be in contact towards n: no adjacent face rises along n."""
     first, second = parts.edge_triangles[e, 0], parts.edge_triangles[e, 1]
     slope = SLOPE if first == second else RIDGE_SLOPE
     for t in (first, second):
@@ -277,7 +277,7 @@ def on_edges(p, e, f, i, j, k, l, s, t, gap, nx, ny, nz, parts, smooth):
         ex, ey, ez = sided(normals, q, nx, ny, nz)
         mx, my, mz = mx + share * ex, my + share * ey, mz + share * ez
     mx, my, mz = towards(mx, my, mz, nx, ny, nz)
-    # the points on each other along it; edges that are nearly parallel have none, and touch only where no face rises beside them
+    # the points on each other along it; edges that are nearly parallel have none, and touch only where no adjacent face rises
     ux, uy, uz = ahead[j, 0] - ahead[i, 0], ahead[j, 1] - ahead[i, 1], ahead[j, 2] - ahead[i, 2]
     wx, wy, wz = ahead[l, 0] - ahead[k, 0], ahead[l, 1] - ahead[k, 1], ahead[l, 2] - ahead[k, 2]
     cx, cy, cz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx

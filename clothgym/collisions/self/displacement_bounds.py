@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from clothgym._jit import disjoint, kernel, merged, uncounted
-from clothgym.collisions.self.gap_constraints import evaluate_constraints, hold_apart, is_violated, list_active, note_lag
+from clothgym.collisions.self.gap_constraints import enforce_gaps, evaluate_constraints, is_violated, list_active, note_lag
 from clothgym.collisions.self.narrow_phase import MARGIN, SHARE
 from clothgym.collisions.self.query import query
-from clothgym.collisions.self.query_room import Found
+from clothgym.collisions.self.query_scratch import Found
 from clothgym.collisions.self.spread import least_stretch
 from clothgym.contact_memory import REPORT_CLAMPED, REPORT_CONTACTS, REPORT_QUERIES, REPORT_UNCERTAIN
 
@@ -27,11 +27,11 @@ AHEAD_MOST = 1.0  # largest distance beyond the reach that it looks, as a share 
 
 
 @uncounted
-def confine(x, v, w, sheet, room, block, h):
+def clamp_displacements(x, v, w, sheet, scratch, block, h):
     """Keep those of one block's sheets in their displacement bounds that have left them, as ``memory.any_outside`` says.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  room: a ``query_room.Room``.  h: the
-    substep [s].
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  scratch: a
+    ``query_scratch.QueryScratch``.  h: the substep [s].
     """
     memory, setting = sheet.memory, sheet.setting
     for l in range(memory.used[block]):
@@ -45,12 +45,12 @@ def confine(x, v, w, sheet, room, block, h):
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                hold_apart(x, v, w, memory, block, l, outside, active, number, room.halvings)
+                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch.halvings)
                 # vertices that stayed in place have left the common motion, and so perhaps their limits
                 due = _any_beyond(x, memory.start[block], memory.limits[block], sheet.pairs.samples, l)
         # a query at the certified positions gives new bounds
         if due:
-            _query_again(x, v, w, sheet, room, block, l, h, outside)
+            _query_again(x, v, w, sheet, scratch, block, l, h, outside)
 
 
 @disjoint
@@ -62,7 +62,7 @@ def keep(row, out):
 
 @kernel
 def find_outside_in_lanes(x, start, bounds, limits, samples, outside, any_outside, query_due):
-    """Find the vertices that have left their bounds since the last query, |x - start - m| > b, beside the common motion m.
+    """Find the vertices that have left their bounds since the last query, |x - start - m| > b, with the common motion m.
 
     m, the mean displacement of the samples, changes no distance.  outside: becomes which vertices, (particles, lanes); any_outside:
     in which lanes there are some; query_due: in which lanes one has left its limit, (lanes,).  Returns whether there are any.
@@ -78,7 +78,7 @@ def find_outside_in_lanes(x, start, bounds, limits, samples, outside, any_outsid
             xs, ss = x[c, samples[s]], start[c, samples[s]]
             for l in range(lanes):
                 mean[c, l] += (xs[l] - ss[l]) * share
-    # the displacements beside it, squared
+    # the displacements relative to it, squared
     for p in range(x.shape[1]):
         bp, lp, outside_p = bounds[p], limits[p], outside[p]
         for l in range(lanes):
@@ -171,7 +171,7 @@ def catch_up(x, w, lag, l, h):
 
 
 @uncounted
-def _query_again(x, v, w, sheet, room, block, l, h, outside):
+def _query_again(x, v, w, sheet, scratch, block, l, h, outside):
     """Query lane l at its certified positions, and in strict mode clamp the vertices to their new limits.
 
     Bounds are relative to the common motion, so that a sheet in flight keeps its speed.  They are relative to the positions
@@ -180,8 +180,8 @@ def _query_again(x, v, w, sheet, room, block, l, h, outside):
 
     outside: scratch, (particles,).
     """
-    memory, particles, limits, held = sheet.memory, x.shape[1], room.squares, room.held
-    _look_around(memory.old[block], v, w, sheet, room, block, l, h)
+    memory, particles, limits, held = sheet.memory, x.shape[1], scratch.squares, scratch.held
+    _look_around(memory.old[block], v, w, sheet, scratch, block, l, h)
     if sheet.setting.strict:
         # the common motion, unless a vertex may not move, or an attached one does not share it
         start, zero = memory.start[block], x.dtype.type(0)
@@ -195,17 +195,17 @@ def _query_again(x, v, w, sheet, room, block, l, h, outside):
         if not in_common:
             mx, my, mz = zero, zero, zero
         # clamp each vertex to its limit
-        _clamp(x, v, memory, block, l, h, room.p, limits, held, mx, my, mz)
+        _clamp(x, v, memory, block, l, h, scratch.p, limits, held, mx, my, mz)
         # where that violates a gap constraint, clamp without the common motion, then enforce the constraints
         members, planes, constraints = memory.members[block, l], memory.planes[block, l], memory.constraints[block, l]
         violated = False
         for t in range(constraints):
             violated |= is_violated(x, members, planes, t, l)
         if violated:
-            _clamp(x, v, memory, block, l, h, room.p, limits, held, zero, zero, zero)
+            _clamp(x, v, memory, block, l, h, scratch.p, limits, held, zero, zero, zero)
             outside[:] = True
             active = memory.active[block, l, :constraints]
-            hold_apart(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), room.halvings)
+            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch.halvings)
         note_lag(w, memory, block, l)
 
 
@@ -214,8 +214,8 @@ def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
     """Clamp the vertices of lane l to their limits: x <- s + m + (x - s - m) min(1, b / |x - s - m|).
 
     start: positions s at the query [m], (particles, 3).  limits: b^2 [m^2], (particles,).  held: attached particles, (particles,);
-    what they lose is added to their lag.  m: common motion since the query [m].  The velocity beside m / h is shortened by the same
-    share.
+    what they lose is added to their lag.  m: common motion since the query [m].  The velocity relative to m / h is shortened by the
+    same share.
     """
     lag, report = memory.lag[block], memory.report[block, l]
     real = x.dtype.type
@@ -237,56 +237,56 @@ def _clamp(x, v, memory, block, l, h, start, limits, held, mx, my, mz):
 
 
 @uncounted
-def _look_around(x, v, w, sheet, room, block, l, h):
+def _look_around(x, v, w, sheet, scratch, block, l, h):
     """Query lane l at positions x, and farther around fast vertices.
 
-    Of ``room``, ``p``, ``squares`` and ``held`` become its positions in float64 [m], the squares of how far each vertex may move
+    Of ``scratch``, ``p``, ``squares`` and ``held`` become its positions in float64 [m], the squares of how far each vertex may move
     before the next query [m^2], and which particles are attached.  They are copies: the values of a lane lie far apart.
     """
-    memory, p, held = sheet.memory, room.p, room.held
-    start, bounds, limits, squares = memory.start[block], memory.bounds[block], memory.limits[block], room.squares
+    memory, p, held = sheet.memory, scratch.p, scratch.held
+    start, bounds, limits, squares = memory.start[block], memory.bounds[block], memory.limits[block], scratch.squares
     particles = x.shape[1]
     # copies of what the query reads; contacts are laid out where each vertex is after half of its way since the last query again
     for k in range(particles):
         held[k] = w[k, l] <= 0
         for c in range(3):
             p[k, c] = x[c, k, l]
-            room.ahead[k, c] = p[k, c] + 0.5 * (p[k, c] - start[c, k, l])
+            scratch.ahead[k, c] = p[k, c] + 0.5 * (p[k, c] - start[c, k, l])
             start[c, k, l] = x[c, k, l]
     report = memory.report[block, l]
     report[REPORT_QUERIES] += 1
     contacts, rows, impulses = memory.contacts[block, l], memory.particles[block, l], memory.impulses[block, l]
     for k in range(contacts):
         for c in range(4):
-            room.known[k, c] = rows[k, c]
+            scratch.known[k, c] = rows[k, c]
         for c in range(3):
-            room.impulses[k, c] = impulses[k, c]
+            scratch.impulses[k, c] = impulses[k, c]
     # of a sheet that is spread out nothing is within reach, and until the next query nothing comes within the thickness
     reach, least = sheet.reach, min(sheet.reach.near, sheet.reach.far)
-    found = Found(rows, memory.coefficients[block, l], memory.members[block, l], memory.planes[block, l], room.counts, report)
-    clear = least_stretch(p, sheet.pairs.parts.triangles, sheet.pairs.to_rest, room.gradients, room.smallest) * reach.at_rest
+    found = Found(rows, memory.coefficients[block, l], memory.members[block, l], memory.planes[block, l], scratch.counts, report)
+    clear = least_stretch(p, sheet.pairs.parts.triangles, sheet.pairs.to_rest, scratch.gradients, scratch.smallest) * reach.at_rest
     if clear >= max(reach.near, reach.far):
-        room.extra[:] = 0.0
-        room.bounds[:] = room.limits[:] = SHARE * (max(clear - reach.far_thickness, least) - MARGIN)
+        scratch.extra[:] = 0.0
+        scratch.bounds[:] = scratch.limits[:] = SHARE * (max(clear - reach.far_thickness, least) - MARGIN)
         found.counts[:] = 0
     # else find contacts and gap constraints, and bounds
     else:
-        _look_ahead(v, sheet.pairs.samples, reach.far, l, h, room.extra)
-        query(sheet.pairs, reach, room, found)
+        _look_ahead(v, sheet.pairs.samples, reach.far, l, h, scratch.extra)
+        query(sheet.pairs, reach, scratch, found)
     count = found.counts[0]
     memory.constraints[block, l] = found.counts[1]
     # fast mode takes no notice of distances: it queries when something may have come within reach
     if not sheet.setting.strict:
         for k in range(particles):
-            room.bounds[k] = SHARE * least
-            room.limits[k] = room.bounds[k] + 2.0 * SHARE * room.extra[k]
+            scratch.bounds[k] = SHARE * least
+            scratch.limits[k] = scratch.bounds[k] + 2.0 * SHARE * scratch.extra[k]
     # bounds are compared with squared displacements
     for k in range(particles):
-        bounds[k, l] = (INSIDE * room.bounds[k]) ** 2
-        squares[k] = (INSIDE * room.limits[k]) ** 2
+        bounds[k, l] = (INSIDE * scratch.bounds[k]) ** 2
+        squares[k] = (INSIDE * scratch.limits[k]) ** 2
         limits[k, l] = squares[k]
     # contacts found again keep their impulses
-    _keep_impulses(room.known[:contacts], room.impulses, rows, impulses, count, room.last, room.before)
+    _keep_impulses(scratch.known[:contacts], scratch.impulses, rows, impulses, count, scratch.last, scratch.before)
     memory.contacts[block, l] = count
     # a sweep is due at once
     memory.choices[block, l] = -1

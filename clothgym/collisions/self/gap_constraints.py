@@ -78,7 +78,7 @@ def evaluate_constraints(x, memory, block, l, active):
 
 
 @uncounted
-def hold_apart(x, v, w, memory, block, l, outside, active, number, halvings):
+def enforce_gaps(x, v, w, memory, block, l, outside, active, number, halvings):
     """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
     positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.
 

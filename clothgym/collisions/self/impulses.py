@@ -35,62 +35,62 @@ FASTEST = 10.0
 SOON = 0.05  # thicknesses beyond the thickness up to which a contact may act soon
 
 
-sweep = placeholder("sweep", "of (x, v, w, sheet, block, l, h, carried): one sweep over the contacts of lane l, for a layout")
+sweep = placeholder("sweep", "of (x, v, w, sheet, block, l, h, lead): one sweep over the contacts of lane l, for a layout")
 
 
 @uncounted
-def press_again(x, v, w, pressed, carried):
+def apply_kept_impulses(x, v, w, pressed, lead):
     """Apply the impulses of the last sweep to one block's sheets, v_i += w_i sum_k c_i j_k, before the solids, which so carry what
     lies on them.
 
     x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  pressed: the changes of velocities
-    [m/s], (3, particles, lanes).  carried: time for which a new velocity has already moved the positions [s].  Where no impulse
+    [m/s], (3, particles, lanes).  lead: time for which a new velocity has already moved the positions [s].  Where no impulse
     acts, no bit changes.
     """
     # adding -0 changes no bit; selecting x and v instead would keep the loop from being vectorized
     negative_zero = -x.dtype.type(0)
     for c in range(3):
-        _apply_impulses(merged(x[c]), merged(v[c]), merged(w), merged(pressed[c]), carried, negative_zero)
+        _apply_impulses(merged(x[c]), merged(v[c]), merged(w), merged(pressed[c]), lead, negative_zero)
 
 
 @disjoint
-def _apply_impulses(x, v, w, pressed, carried, negative_zero):
-    """Add one component of the impulses: v += change, x += carried change; each array (particles times lanes,)."""
+def _apply_impulses(x, v, w, pressed, lead, negative_zero):
+    """Add one component of the impulses: v += change, x += lead change; each array (particles times lanes,)."""
     zero = x.dtype.type(0)
     for e in range(x.shape[0]):
         change = pressed[e] if (w[e] > zero) & (pressed[e] != zero) else negative_zero
-        x[e] += carried * change
+        x[e] += lead * change
         v[e] += change
 
 
-def repel(x, v, w, sheet, block, h, carried):
+def solve_impulses(x, v, w, sheet, block, h, lead):
     """Correct the impulses of one block's sheets, in each lane in which a sweep is due.
 
-    x, v, w, carried: as in ``press_again``.  h: the substep [s].
+    x, v, w, lead: as in ``apply_kept_impulses``.  h: the substep [s].
     """
     memory = sheet.memory
     for l in range(memory.used[block]):
         # lanes without contacts, and those whose contacts have converged, wait
         if memory.contacts[block, l] > 0 and memory.waited[block, l] >= memory.span[block, l]:
-            sweep(x, v, w, sheet, block, l, h, carried)
+            sweep(x, v, w, sheet, block, l, h, lead)
 
 
 @uncounted
-def sweep_sheet(x, v, w, sheet, block, l, h, carried):
+def sweep_sheet(x, v, w, sheet, block, l, h, lead):
     """One sweep over the contacts of a block that is one sheet."""
-    _sweep_contacts(merged(x), merged(v), merged(w), sheet, block, l, h, carried)
+    _sweep_contacts(merged(x), merged(v), merged(w), sheet, block, l, h, lead)
 
 
 @apart
-def sweep_lane(x, v, w, sheet, block, l, h, carried):
+def sweep_lane(x, v, w, sheet, block, l, h, lead):
     """The same on a copy of lane l: contacts read each particle many times, and the values of a lane lie far apart."""
     own_x, own_v, own_w = x[:, :, l].copy(), v[:, :, l].copy(), w[:, l].copy()
-    _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, carried)
+    _sweep_contacts(own_x, own_v, own_w, sheet, block, l, h, lead)
     x[:, :, l], v[:, :, l] = own_x, own_v
 
 
 @uncounted
-def _sweep_contacts(x, v, w, sheet, block, l, h, carried):
+def _sweep_contacts(x, v, w, sheet, block, l, h, lead):
     """One sweep over the contacts of one lane; x, v: [m], [m/s], (3, particles), w: [1/kg], (particles,)."""
     memory, setting, count, waited = sheet.memory, sheet.setting, sheet.memory.contacts[block, l], sheet.memory.waited[block, l]
     particles, coefficients, impulses = memory.particles[block, l], memory.coefficients[block, l], memory.impulses[block, l]
@@ -102,7 +102,7 @@ def _sweep_contacts(x, v, w, sheet, block, l, h, carried):
     # correct their impulses, and add them up for the substeps until the next sweep
     choices = memory.choices[block, l]
     touching, largest = _correct(
-        x, v, w, particles, coefficients, impulses, chosen, choices, carried, setting.friction, setting.push * h, h, waited
+        x, v, w, particles, coefficients, impulses, chosen, choices, lead, setting.friction, setting.push * h, h, waited
     )
     _add_up(w, particles, coefficients, impulses, chosen, choices, memory.pressed[block, :, :, l])
     # the span doubles while corrections are within tolerance
@@ -123,17 +123,17 @@ def _relative(a, particles, coefficients, k, nx, ny, nz):
 
 
 @inlined
-def _push(x, v, w, particles, coefficients, k, jx, jy, jz, carried, qx, qy, qz):
-    """Apply an impulse j [N s] and a push q [kg m] to contact k's vertices: v_i += w_i c_i j and x_i += w_i c_i (carried j + q)."""
+def _push(x, v, w, particles, coefficients, k, jx, jy, jz, lead, qx, qy, qz):
+    """Apply an impulse j [N s] and a push q [kg m] to contact k's vertices: v_i += w_i c_i j and x_i += w_i c_i (lead j + q)."""
     for c in range(4):
         p = particles[k, c]
         share = w[p] * coefficients[k, c]
         v[0, p] += share * jx
         v[1, p] += share * jy
         v[2, p] += share * jz
-        x[0, p] += share * (carried * jx + qx)
-        x[1, p] += share * (carried * jy + qy)
-        x[2, p] += share * (carried * jz + qz)
+        x[0, p] += share * (lead * jx + qx)
+        x[1, p] += share * (lead * jy + qy)
+        x[2, p] += share * (lead * jz + qz)
 
 
 @kernel
@@ -174,7 +174,7 @@ def _add_up(w, particles, coefficients, impulses, chosen, choices, pressed):
 
 
 @kernel
-def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carried, friction, push, h, waited):
+def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, lead, friction, push, h, waited):
     """Correct the impulses of the last ``waited`` substeps, normal and tangential, and push apart.
 
     chosen: the active contacts, the first ``choices`` of them.  friction: coefficient.  push: largest push in a substep [m].
@@ -185,7 +185,7 @@ def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carrie
     tiny = x.dtype.type(1e-12)
     sunk, relaxed = x.dtype.type(1 - SLOP), x.dtype.type(RELAXED)
     since, most_speed = x.dtype.type(waited), x.dtype.type(FASTEST)
-    horizon = x.dtype.type(SPAN) * h + carried
+    horizon = x.dtype.type(SPAN) * h + lead
     touching, largest = 0, zero
     for c in range(choices):
         k = chosen[c]
@@ -201,7 +201,7 @@ def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carrie
         gap, _, _, _ = _relative(x, particles, coefficients, k, nx, ny, nz)
         un, ux, uy, uz = _relative(v, particles, coefficients, k, nx, ny, nz)
         # u*: the velocity of approach that closes the gap at the end of the longest span, from the position without this velocity
-        target = -max(gap - carried * un - sunk * thickness, zero) / horizon
+        target = -max(gap - lead * un - sunk * thickness, zero) / horizon
         # inactive: no impulse, not approaching too fast, and apart
         if jn_before == zero and un >= target and gap >= sunk * thickness:
             continue
@@ -225,8 +225,8 @@ def _correct(x, v, w, particles, coefficients, impulses, chosen, choices, carrie
         impulses[k, 0], impulses[k, 1], impulses[k, 2] = px / since, py / since, pz / since
         largest = max(largest, abs(jn - jn_before) * inverse_mass)
         # push apart by what is still missing after the impulse has moved the positions
-        missing = sunk * thickness - (gap + carried * (jn - jn_before) * inverse_mass)
+        missing = sunk * thickness - (gap + lead * (jn - jn_before) * inverse_mass)
         shift = since * min(relaxed * max(missing, zero), push) * mass
-        _push(x, v, w, particles, coefficients, k, px - jx, py - jy, pz - jz, carried, shift * nx, shift * ny, shift * nz)
+        _push(x, v, w, particles, coefficients, k, px - jx, py - jy, pz - jz, lead, shift * nx, shift * ny, shift * nz)
         touching += 1
     return touching, largest

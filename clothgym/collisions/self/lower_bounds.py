@@ -11,7 +11,7 @@ import numpy as np
 
 from clothgym._jit import disjoint, inlined, uncounted
 
-# rows of ``Room.near``
+# rows of ``QueryScratch.near``
 N_EXTRA, N_WIDE, N_STRETCH = 3, 4, 5
 EPSILON = float(np.finfo(np.float32).eps)
 # share of a bound that is kept, as directions are not quite of unit length, and what rounding may take, per extent of the sheet
@@ -120,7 +120,7 @@ def _keep(pairs, lower, number, reach):
 def keep_vertices(number, reach, extent, triangles, near, pairs, ends, lower):
     """Of the first ``number`` vertices and triangles of a batch, keep those that may be within reach [m].  Returns how many.
 
-    reach: without the extras.  extent, near: see ``round_positions``.  pairs, ends, lower: see ``query_room.Room``.
+    reach: without the extras.  extent, near: see ``round_positions``.  pairs, ends, lower: see ``query_scratch.QueryScratch``.
     """
     for m in range(number):
         t = pairs[1, m]

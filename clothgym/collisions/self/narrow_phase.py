@@ -174,29 +174,29 @@ def far_distances(reach):
 
 
 @uncounted
-def vertex_contacts(number, distances, parts, extent, smooth, room, found):
+def vertex_contacts(number, distances, parts, extent, smooth, scratch, found):
     """Evaluate a batch of vertices and triangles: certify their distances, lower the bounds of their vertices, and write contacts
     and gap constraints.
 
-    number: of the pairs in ``room.pairs``: vertex, triangle and pair of leaves, -1 for near pairs.  extent: of the sheet [m].
+    number: of the pairs in ``scratch.pairs``: vertex, triangle and pair of leaves, -1 for near pairs.  extent: of the sheet [m].
     smooth: see ``contact_normals``; contacts between different pieces of a mesh are those of smooth sheets.
 
-    ``room.extra``: how much farther than the reach pairs matter around each vertex, which is also how much more than its share it
-    may move [m].  ``room.bounds``, ``room.limits``: become the smallest distances of each vertex, of all its pairs and of those
-    without a constraint [m].  ``room.closest``: becomes the smallest distance in each pair of leaves [m] and its direction.
+    ``scratch.extra``: how much farther than the reach pairs matter around each vertex, which is also how much more than its share
+    it may move [m].  ``scratch.bounds``, ``scratch.limits``: become the smallest distances of each vertex, of all its pairs and of
+    those without a constraint [m].  ``scratch.closest``: becomes the smallest distance in each pair of leaves [m] and its direction.
     """
     p, extra, held, bounds, limits, batch, closest = (
-        room.p,
-        room.extra,
-        room.held,
-        room.bounds,
-        room.limits,
-        room.pairs,
-        room.closest,
+        scratch.p,
+        scratch.extra,
+        scratch.held,
+        scratch.bounds,
+        scratch.limits,
+        scratch.pairs,
+        scratch.closest,
     )
     particles, members, report, counts = found.particles, found.members, found.report, found.counts
     within, thickness, least, margin, close, stop, standoff = distances
-    for m in range(keep_vertices(number, within, extent, parts.triangles, room.near, batch, room.ends, room.lower)):
+    for m in range(keep_vertices(number, within, extent, parts.triangles, scratch.near, batch, scratch.ends, scratch.lower)):
         # the closest points, and whether they are within reach
         v, t, group = batch[0, m], batch[1, m], batch[2, m]
         i, j, k = parts.triangles[t, 0], parts.triangles[t, 1], parts.triangles[t, 2]
@@ -248,17 +248,17 @@ def vertex_contacts(number, distances, parts, extent, smooth, room, found):
 
 
 @uncounted
-def edge_contacts(number, distances, parts, extent, smooth, room, found):
+def edge_contacts(number, distances, parts, extent, smooth, scratch, found):
     """The same for a batch of two edges.
 
     Only ridges whose closest points both lie inside become contacts: elsewhere vertices and triangles cover the same contact.
     Nothing pushes them apart.  Where cloth is pinched, close edges become ridges and stop being ridges: what pushed them would
     never rest.
     """
-    p, extra, held, bounds, limits, batch = room.p, room.extra, room.held, room.bounds, room.limits, room.pairs
+    p, extra, held, bounds, limits, batch = scratch.p, scratch.extra, scratch.held, scratch.bounds, scratch.limits, scratch.pairs
     particles, members, report, counts = found.particles, found.members, found.report, found.counts
     within, thickness, _, margin, close, stop, standoff = distances
-    for m in range(keep_edges(number, within, extent, parts.edges, room.near, batch, room.ends, room.lower)):
+    for m in range(keep_edges(number, within, extent, parts.edges, scratch.near, batch, scratch.ends, scratch.lower)):
         # the closest points, and whether they are within reach
         e, f = batch[0, m], batch[1, m]
         i, j, k, l = parts.edges[e, 0], parts.edges[e, 1], parts.edges[f, 0], parts.edges[f, 1]
@@ -288,7 +288,7 @@ def edge_contacts(number, distances, parts, extent, smooth, room, found):
         inside = s > 0.0 and s < 1.0 and t > 0.0 and t < 1.0
         if not (inside and certified > 0.0 and certified <= thickness + margin):
             continue
-        if not (is_ridge(room.faces, parts.edge_triangles, e) and is_ridge(room.faces, parts.edge_triangles, f)):
+        if not (is_ridge(scratch.faces, parts.edge_triangles, e) and is_ridge(scratch.faces, parts.edge_triangles, f)):
             continue
         so, to, mx, my, mz, gap, rise = s, t, nx, ny, nz, certified, 0.0
         if parts.piece[i] != parts.piece[k]:
@@ -307,17 +307,17 @@ def edge_contacts(number, distances, parts, extent, smooth, room, found):
 
 
 @uncounted
-def constrain_layers(number, first, corners, distances, room, found):
+def constrain_layers(number, first, corners, distances, scratch, found):
     """Replace the gap constraints between the vertices and triangles of two leaves by one, where a plane between the leaves
     certifies about the same distance.
 
-    number: of the pairs in ``room.leaves``.  first: the first gap constraint of their vertices and triangles.  corners: of leaves,
-    (leaves, 4).  ``room.gaps``: the best distance certified by a plane of either leaf [m] and its normal; the plane normal to the
-    closest pair of vertex and triangle, ``room.closest``, may certify more.  ``room.layered``: becomes which pairs of leaves have
-    such a plane.
+    number: of the pairs in ``scratch.leaves``.  first: the first gap constraint of their vertices and triangles.  corners: of
+    leaves, (leaves, 4).  ``scratch.gaps``: the best distance certified by a plane of either leaf [m] and its normal; the plane
+    normal to the closest pair of vertex and triangle, ``scratch.closest``, may certify more.  ``scratch.layered``: becomes which
+    pairs of leaves have such a plane.
     """
-    p, extra, held, bounds, limits = room.p, room.extra, room.held, room.bounds, room.limits
-    leaves, gaps, closest, layered = room.leaves, room.gaps, room.closest, room.layered
+    p, extra, held, bounds, limits = scratch.p, scratch.extra, scratch.held, scratch.bounds, scratch.limits
+    leaves, gaps, closest, layered = scratch.leaves, scratch.gaps, scratch.closest, scratch.layered
     members, planes, report, counts = found.members, found.planes, found.report, found.counts
     close, stop, standoff = distances.close, distances.stop, distances.standoff
     # the pairs of leaves with such a plane

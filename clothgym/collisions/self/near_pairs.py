@@ -13,7 +13,7 @@ import numpy as np
 from clothgym._jit import disjoint, uncounted
 from clothgym.collisions.self.lower_bounds import EPSILON, N_EXTRA, N_STRETCH, N_WIDE, UPWARDS
 from clothgym.collisions.self.narrow_phase import edge_contacts, vertex_contacts
-from clothgym.collisions.self.query_room import BATCH
+from clothgym.collisions.self.query_scratch import BATCH
 
 LARGER = 1e-4  # a, see above
 ERROR2 = (4 * EPSILON) ** 2 / LARGER  # e^2 (1 + 1/a), per square of the sheet's extent
@@ -70,34 +70,34 @@ def _come_close_at(x, y, z, wide, stretch, xs, ys, zs, wides, stretches, slack, 
 
 
 @uncounted
-def find_close(parts, near, reach, extent, room):
-    """Mark the pairs of vertices that may be close in ``room.close``; reach: [m], extent: of the sheet [m]."""
-    rows, around, error2 = room.near, room.around, np.float32(ERROR2 * extent * extent)
+def find_close(parts, near, reach, extent, scratch):
+    """Mark the pairs of vertices that may be close in ``scratch.close``; reach: [m], extent: of the sheet [m]."""
+    rows, around, error2 = scratch.near, scratch.around, np.float32(ERROR2 * extent * extent)
     x, y, z, wide, stretch = rows[0], rows[1], rows[2], rows[N_WIDE], rows[N_STRETCH]
-    _stretches(x, y, z, parts.edges, parts.rest_edges, error2, room.stretch)
-    _around_triangles(rows[N_EXTRA], room.stretch, parts.triangles, parts.triangle_edges, around[0], around[1])
+    _stretches(x, y, z, parts.edges, parts.rest_edges, error2, scratch.stretch)
+    _around_triangles(rows[N_EXTRA], scratch.stretch, parts.triangles, parts.triangle_edges, around[0], around[1])
     wide[:] = np.float32(0)
     stretch[:] = np.float32(1)
     for k in range(near.neighbors.shape[0]):
         _around_vertices(around[0], around[1], near.neighbors[k], wide, stretch)
     within, number = np.float32(reach * UPWARDS), x.shape[0]
     if near.offsets.shape[0] == 0:
-        _come_close(x, y, z, wide, stretch, near.first, near.second, near.slack, within, error2, room.close)
+        _come_close(x, y, z, wide, stretch, near.first, near.second, near.slack, within, error2, scratch.close)
     for k in range(near.offsets.shape[0]):
         o = near.offsets[k]
         begin, end = k * number, (k + 1) * number - o
         _come_close_at(
             x, y, z, wide, stretch, x[o:], y[o:], z[o:], wide[o:], stretch[o:], near.slack[begin:end], within, error2,
-            room.close[begin:end],
+            scratch.close[begin:end],
         )  # fmt: skip
 
 
 @uncounted
-def near_contacts(pairs, distances, extent, smooth, room, found):
+def near_contacts(pairs, distances, extent, smooth, scratch, found):
     """Contacts and gap constraints of near pairs, first of vertices and triangles, then of edges, in their order; arguments as in
     ``narrow_phase.vertex_contacts``."""
-    near, close, seen = pairs.near, room.close, room.seen
-    find_close(pairs.parts, near, distances.within, extent, room)
+    near, close, seen = pairs.near, scratch.close, scratch.seen
+    find_close(pairs.parts, near, distances.within, extent, scratch)
     # the primitives of all close vertices; eight pairs at a time, as in most places none is close
     seen[:] = False
     eights = close.view(np.uint64)
@@ -109,28 +109,28 @@ def near_contacts(pairs, distances, extent, smooth, room, found):
                         seen[near.which[m]] = True
     for edges in range(2):
         begin, end = (near.vertex_triangles, seen.shape[0]) if edges else (0, near.vertex_triangles)
-        _judge_seen(edges, begin, end, pairs, distances, extent, smooth, room, found)
+        _judge_seen(edges, begin, end, pairs, distances, extent, smooth, scratch, found)
 
 
 @uncounted
-def _judge_seen(edges, begin, end, pairs, distances, extent, smooth, room, found):
+def _judge_seen(edges, begin, end, pairs, distances, extent, smooth, scratch, found):
     """The near pairs that were seen, in batches: whether of edges, and the range of them, in multiples of eight."""
-    batch, seen, primitives, number = room.pairs, room.seen, pairs.near.primitives, np.int64(0)
+    batch, seen, primitives, number = scratch.pairs, scratch.seen, pairs.near.primitives, np.int64(0)
     eights = seen.view(np.uint64)
     for eight in range(begin // 8, end // 8):
         if eights[eight] == 0:
             continue
         if number > BATCH - 9:
             if edges:
-                edge_contacts(number, distances, pairs.parts, extent, smooth, room, found)
+                edge_contacts(number, distances, pairs.parts, extent, smooth, scratch, found)
             else:
-                vertex_contacts(number, distances, pairs.parts, extent, smooth, room, found)
+                vertex_contacts(number, distances, pairs.parts, extent, smooth, scratch, found)
             number = 0
         for n in range(8 * eight, 8 * eight + 8):
             # written without a branch: the next one takes the place of one that was not seen
             batch[0, number], batch[1, number], batch[2, number] = primitives[n, 0], primitives[n, 1], -1
             number += seen[n]
     if edges:
-        edge_contacts(number, distances, pairs.parts, extent, smooth, room, found)
+        edge_contacts(number, distances, pairs.parts, extent, smooth, scratch, found)
     else:
-        vertex_contacts(number, distances, pairs.parts, extent, smooth, room, found)
+        vertex_contacts(number, distances, pairs.parts, extent, smooth, scratch, found)

@@ -1,4 +1,4 @@
-"""Self-collision of a batch: its options, its memory, and what it tells."""
+"""Self-collision of a batch: its options, its memory, and its report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from clothgym.collisions.self.far_pairs import far_contacts
 from clothgym.collisions.self.impulses import TOLERANCE
 from clothgym.collisions.self.lower_bounds import round_positions
 from clothgym.collisions.self.narrow_phase import MARGIN, Distances, gap_of_edges, gap_of_vertex
-from clothgym.collisions.self.query_room import Found, room_for_queries
+from clothgym.collisions.self.query_scratch import Found, scratch_for_queries
 from clothgym.collisions.self.spread import spread_out
 from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
 from clothgym.collisions.self.topology import Pairs, pairs_of
@@ -281,15 +281,15 @@ def least_far(p, pairs, distances, particles, coefficients, members, planes, rep
     distances: without any thickness.  particles, coefficients, members, planes: without rows, so that nothing is kept;
     report: scratch.
     """
-    room = room_for_queries(pairs, coefficients)
-    room.p[:] = p
-    room.bounds[:] = distances.within
-    room.held[:] = False
-    faces_of(p, pairs.parts.triangles, room.faces)
-    extent = round_positions(p, room.extra, room.near)
-    found = Found(particles, coefficients, members, planes, room.counts, report)
-    far_contacts(pairs, distances, extent, SmoothSheet(room.p, room.normals, room.kinds), room, found)
-    return room.bounds.min()
+    scratch = scratch_for_queries(pairs, coefficients)
+    scratch.p[:] = p
+    scratch.bounds[:] = distances.within
+    scratch.held[:] = False
+    faces_of(p, pairs.parts.triangles, scratch.faces)
+    extent = round_positions(p, scratch.extra, scratch.near)
+    found = Found(particles, coefficients, members, planes, scratch.counts, report)
+    far_contacts(pairs, distances, extent, SmoothSheet(scratch.p, scratch.normals, scratch.kinds), scratch, found)
+    return scratch.bounds.min()
 
 
 def reach_of(mesh: ClothMesh, pairs: Pairs, thickness: float | None, dtype: np.dtype) -> Reach:

@@ -1,4 +1,4 @@
-"""A query: which parts of one sheet are close, and how far each of its vertices may move before the next (see ``narrow_phase``)."""
+"""A query: the close pairs of one sheet, and how far each vertex may move before the next query (see ``narrow_phase``)."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from clothgym.contact_memory import REPORT_GAP
 
 
 @uncounted
-def query(pairs, reach, room, found):
-    """Find what is close in one sheet: contacts and gap constraints go to ``found``, a ``query_room.Found``.
+def query(pairs, reach, scratch, found):
+    """Find the close pairs of one sheet: contacts and gap constraints go to ``found``, a ``query_scratch.Found``.
 
-    Of ``room`` it reads ``p``, ``ahead``, ``extra`` and ``held``.  ``bounds`` becomes how far each vertex may move before its gap
-    constraints are evaluated; ``limits``: before a query is due [m].
+    It reads ``p``, ``ahead``, ``extra`` and ``held`` of ``scratch``.  ``bounds`` becomes how far each vertex may move before its
+    gap constraints are evaluated; ``limits``: before a query is due [m].
     """
-    extra, bounds, limits = room.extra, room.bounds, room.limits
+    extra, bounds, limits = scratch.extra, scratch.bounds, scratch.limits
     # pairs that are not found are farther apart than the least reach
     least_reach = min(reach.near, reach.far)
     bounds[:] = least_reach
     limits[:] = least_reach
     found.counts[:] = 0
     # unit normals, and smooth sheets where there are several pieces
-    faces_of(room.p, pairs.parts.triangles, room.faces)
-    smooth = SmoothSheet(room.ahead, room.normals, room.kinds)
+    faces_of(scratch.p, pairs.parts.triangles, scratch.faces)
+    smooth = SmoothSheet(scratch.ahead, scratch.normals, scratch.kinds)
     several = False
     for v in range(bounds.shape[0]):
         several |= pairs.parts.piece[v] != pairs.parts.piece[0]
     if several:
-        smooth_out(pairs.parts, room.faces, smooth)
+        smooth_out(pairs.parts, scratch.faces, smooth)
     # near pairs: parts that share a leaf or whose leaves share a vertex; then all others
-    extent = round_positions(room.p, extra, room.near)
-    near_contacts(pairs, near_distances(reach), extent, smooth, room, found)
-    far_contacts(pairs, far_distances(reach), extent, smooth, room, found)
+    extent = round_positions(scratch.p, extra, scratch.near)
+    near_contacts(pairs, near_distances(reach), extent, smooth, scratch, found)
+    far_contacts(pairs, far_distances(reach), extent, smooth, scratch, found)
     # bounds and limits: gamma_p times the smallest distances, less the margin
     least = least_reach
     for v in range(bounds.shape[0]):

@@ -2,12 +2,13 @@
 
 After each substep of any integrator, none of which it knows by name:
 
-1. ``press_again``: each contact applies its impulse of the previous substep.  The solids follow, and so carry what lies on them.
-2. ``repel``: the impulses are corrected.  What is closer than the cloth's thickness no longer approaches, slides only as far as
-   Coulomb friction allows, and is pushed apart (see ``impulses``).
-3. ``confine``: a vertex that has left its bound (see ``narrow_phase``) causes a query at the last certified positions, those
-   known to be free of intersections.  In strict mode vertices beyond their new bounds are clamped to them, and gap constraints
-   are enforced (see ``displacement_bounds``).
+1. ``apply_kept_impulses``: each contact applies its impulse of the previous substep.  The solids follow, and so carry the cloth
+   that lies on them.
+2. ``solve_impulses``: the impulses are corrected.  Parts closer than the cloth's thickness no longer approach, slide only as far as
+   Coulomb friction allows, and are pushed apart (see ``impulses``).
+3. ``clamp_displacements``: a vertex that has left its bound (see ``narrow_phase``) causes a query at the last certified positions,
+   which are known to be free of intersections.  In strict mode vertices beyond their new bounds are clamped to them, and gap
+   constraints are enforced (see ``displacement_bounds``).
 
 The guarantee of strict mode: if a sheet starts without intersections, then in every substep each vertex and triangle, and each two
 edges, that share no vertex stay at a positive distance all along their paths, so none passes through another.  It holds for
@@ -30,24 +31,24 @@ from clothgym._jit import inlined, kernel, merged, placeholder, specialize, unco
 from clothgym.collisions.self.broad_phase import Reach
 from clothgym.collisions.self.displacement_bounds import (
     catch_up,
-    confine,
+    clamp_displacements,
     find_outside_in_lanes,
     find_outside_of_sheet,
     keep,
     note_uncertain,
 )
-from clothgym.collisions.self.impulses import press_again, repel, sweep_lane, sweep_sheet
-from clothgym.collisions.self.query_room import room_for_queries
+from clothgym.collisions.self.impulses import apply_kept_impulses, solve_impulses, sweep_lane, sweep_sheet
+from clothgym.collisions.self.query_scratch import scratch_for_queries
 from clothgym.collisions.self.topology import Pairs
 from clothgym.contact_memory import REPORT_CONTACTS, REPORT_GAP, REPORT_LAG
 
 # of a layout
-correct = placeholder("correct", "``impulses.repel``")
+correct = placeholder("correct", "``impulses.solve_impulses``")
 find_outside = placeholder(
     "find_outside", "of (x, start, bounds, limits, samples, outside, any_outside, query_due): whether a vertex has"
 )
 
-PUSH = 0.5  # largest speed at which what is too close is pushed apart [m/s]
+PUSH = 0.5  # largest speed at which parts that are too close are pushed apart [m/s]
 
 
 class Memory(NamedTuple):
@@ -123,19 +124,19 @@ class Sheet(NamedTuple):
 
 
 @inlined
-def press(x, v, w, sheet, block, step, carried):
+def warm_start(x, v, w, sheet, block, step, lead):
     """Stage 1, before the solids: the contacts of one block apply their impulses of the previous substep.
 
-    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  step: of the control step.  carried:
+    x, v: [m], [m/s], (3, particles, lanes).  w: inverse masses [1/kg], (particles, lanes).  step: of the control step.  lead:
     time for which a new velocity has already moved the positions at the end of a substep [s].
 
-    Like ``keep_apart`` it is part of the main loop: to give a kernel all arrays of ``sheet`` takes as long as a small sheet's
-    forces, so only those are called that have something to do.
+    Like ``solve_self_contact`` it is inlined into the main loop: passing all arrays of ``sheet`` to a kernel takes about 0.1 us, so
+    a kernel is called only when it has work to do.
     """
     if step == 0:
         _begin(x, sheet, block)
     if _any_contact(sheet.memory.contacts, sheet.memory.used, block):
-        press_again(x, v, w, sheet.memory.pressed[block], carried)
+        apply_kept_impulses(x, v, w, sheet.memory.pressed[block], lead)
 
 
 @uncounted
@@ -154,11 +155,11 @@ def _begin(x, sheet, block):
         note_uncertain(x, memory.report[block], memory.used[block])
 
 
-def keep_apart(x, v, w, sheet, room, block, h, carried):
-    """Stages 2 and 3, after the solids: impulses, then bounds.  room: a ``query_room.Room``.  The rest as in ``press``."""
+def solve_self_contact(x, v, w, sheet, scratch, block, h, lead):
+    """Stages 2 and 3, after the solids: impulses, then bounds.  scratch: see ``query_scratch``.  The rest as in ``warm_start``."""
     memory = sheet.memory
     if _any_sweep_due(memory.contacts, memory.waited, memory.span, memory.aged, memory.used, block):
-        correct(x, v, w, sheet, block, h, carried)
+        correct(x, v, w, sheet, block, h, lead)
     # particles that lag behind their attachments catch up
     for l in range(memory.used[block]):
         if memory.behind[block, l] > 0:
@@ -167,7 +168,7 @@ def keep_apart(x, v, w, sheet, room, block, h, carried):
         x, memory.start[block], memory.bounds[block], memory.limits[block], sheet.pairs.samples, memory.outside[block],
         memory.any_outside[block], memory.query_due[block],
     ):  # fmt: skip
-        confine(x, v, w, sheet, room, block, h)
+        clamp_displacements(x, v, w, sheet, scratch, block, h)
     # these positions are certified now
     keep(merged(merged(x)), merged(merged(memory.old[block])))
 
@@ -194,35 +195,39 @@ def _any_sweep_due(contacts, waited, span, aged, used, block):
 
 
 @kernel
-def press_nothing(x, v, w, sheet, block, step, carried):
+def warm_start_nothing(x, v, w, sheet, block, step, lead):
     """Stage 1 of a simulation without self-collision."""
 
 
 @kernel
-def keep_nothing_apart(x, v, w, sheet, room, block, h, carried):
+def solve_nothing(x, v, w, sheet, scratch, block, h, lead):
     """Stages 2 and 3 of a simulation without self-collision."""
 
 
 @kernel
-def room_for_nothing(x, sheet):
+def scratch_for_nothing(x, sheet):
     """Scratch of a simulation without self-collision."""
     return (np.empty(0, x.dtype),)
 
 
 @kernel
-def room_for_sheet(x, sheet):
-    """Scratch of ``keep_apart``, a ``query_room.Room``."""
-    return room_for_queries(sheet.pairs, sheet.memory.impulses[0, 0])
+def scratch_for_sheet(x, sheet):
+    """Scratch of ``solve_self_contact``, a ``query_scratch.QueryScratch``."""
+    return scratch_for_queries(sheet.pairs, sheet.memory.impulses[0, 0])
 
 
 def kernels_of(collides: bool, by_particle: bool) -> dict[str, Any]:
     """What the main loop calls by these names, with self-collision or without, where a block is one sheet or has many lanes."""
     if not collides:
-        return {"press": press_nothing, "keep_apart": keep_nothing_apart, "room_for_self_contact": room_for_nothing}
+        return {
+            "warm_start": warm_start_nothing,
+            "solve_self_contact": solve_nothing,
+            "scratch_for_self_contact": scratch_for_nothing,
+        }
     layout = "particles" if by_particle else "lanes"
     parts = {
-        "correct": specialize(uncounted(repel), f"repel_{layout}", sweep=sweep_sheet if by_particle else sweep_lane),
+        "correct": specialize(uncounted(solve_impulses), f"repel_{layout}", sweep=sweep_sheet if by_particle else sweep_lane),
         "find_outside": find_outside_of_sheet if by_particle else find_outside_in_lanes,
     }
-    kept = specialize(keep_apart, f"keep_apart_{layout}", inline=True, **parts)
-    return {"press": press, "keep_apart": kept, "room_for_self_contact": room_for_sheet}
+    kept = specialize(solve_self_contact, f"solve_self_contact_{layout}", inline=True, **parts)
+    return {"warm_start": warm_start, "solve_self_contact": kept, "scratch_for_self_contact": scratch_for_sheet}

@@ -68,9 +68,9 @@ class Tree(NamedTuple):
     corners: vertices of each leaf, the last repeated if there are three, (leaves, 4).
     leaf_vertices, leaf_edges, leaf_triangles: where those of each leaf begin in ``own_*``, (leaves + 1,).
     nodes: of the tree, each before its two children, the first of which follows it at once: see ``NODE_BEGIN``, (nodes, 3).
-    beside: where the list of adjacent nodes begins for each node without children, itself and later ones, (nodes + 1,).
-    beside_nodes: these lists; beside_leaves: for each entry the pairs of leaves not to be searched, as bits: leaf k of the first
-    node and m of the second, which share a vertex or are found in the other order, are bit ``NODE_LEAVES * k + m``.
+    adjacent: where the list of adjacent nodes begins for each node without children, itself and later ones, (nodes + 1,).
+    adjacent_nodes: these lists; adjacent_leaves: for each entry the pairs of leaves not to be searched, as bits: leaf k of the
+    first node and m of the second, which share a vertex or are found in the other order, are bit ``NODE_LEAVES * k + m``.
     """
 
     corners: Int
@@ -81,9 +81,9 @@ class Tree(NamedTuple):
     leaf_triangles: Int
     own_triangles: Int
     nodes: Int
-    beside: Int
-    beside_nodes: Int
-    beside_leaves: NDArray[np.int64]
+    adjacent: Int
+    adjacent_nodes: Int
+    adjacent_leaves: NDArray[np.int64]
 
 
 class Near(NamedTuple):
@@ -149,13 +149,13 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     for leaf, own in enumerate(corners):
         for vertex in set(own.tolist()):
             leaves_around[vertex].append(leaf)
-    beside = [sorted({other for vertex in set(own.tolist()) for other in leaves_around[vertex]}) for own in corners]
+    adjacent = [sorted({other for vertex in set(own.tolist()) for other in leaves_around[vertex]}) for own in corners]
     # near pairs
-    vertex_triangle, edge_edge = _near_pairs(triangles, edges, leaves, beside, vertex_leaf, edge_leaf)
+    vertex_triangle, edge_edge = _near_pairs(triangles, edges, leaves, adjacent, vertex_leaf, edge_leaf)
     # what belongs to each leaf, and which leaves are not searched
     counted = [_ranges(np.bincount(of, minlength=len(leaves))) for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
     by_leaf = [np.argsort(of, kind="stable") for of in (vertex_leaf, edge_leaf, leaf_of_triangle)]
-    begins, beside_nodes, beside_leaves = _adjacent_nodes(np.array(nodes), beside)
+    begins, adjacent_nodes, adjacent_leaves = _adjacent_nodes(np.array(nodes), adjacent)
     around = _ranges(np.bincount(triangles.ravel(), minlength=len(x)))
     around_triangles = np.argsort(triangles.ravel(), kind="stable") // 3
     both = np.stack([edge_owner, last], axis=1)
@@ -165,7 +165,7 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
     )  # fmt: skip
     tree = Tree(
         _int(corners), counted[0], _int(by_leaf[0]), counted[1], _int(by_leaf[1]), counted[2], _int(by_leaf[2]),
-        _int(np.array(nodes)), begins, beside_nodes, beside_leaves,
+        _int(np.array(nodes)), begins, adjacent_nodes, adjacent_leaves,
     )  # fmt: skip
     near = _near(triangles, edges, triangle_edges, length2, vertex_triangle, edge_edge, around, around_triangles)
     return Pairs(parts, tree, near, _int(np.linspace(0, len(x) - 1, SAMPLES).round()), to_rest(mesh))
@@ -235,8 +235,8 @@ def _compact(centers: NDArray) -> tuple[list[int], list[list[int]]]:
     return order, nodes
 
 
-def _adjacent_nodes(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
-    """Adjacent nodes without children, and the pairs of their leaves not to be searched, as bits: see ``Pairs.beside``."""
+def _adjacent_nodes(nodes: NDArray, adjacent: list[list[int]]) -> tuple[Int, Int, NDArray[np.int64]]:
+    """Adjacent nodes without children, and the pairs of their leaves not to be searched, as bits: see ``Tree.adjacent``."""
     # nodes without children, and the node of each leaf
     childless = np.flatnonzero(nodes[:, NODE_NEXT] == np.arange(len(nodes)) + 1).tolist()
     node_of = {leaf: k for k in childless for leaf in range(nodes[k, NODE_BEGIN], nodes[k, NODE_END])}
@@ -246,7 +246,7 @@ def _adjacent_nodes(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, 
         begin, end = nodes[node, [NODE_BEGIN, NODE_END]].tolist()
         bits_of = {node: 0}
         for leaf in range(begin, end):
-            for other in {*range(begin, leaf + 1), *(other for other in beside[leaf] if other > leaf)}:
+            for other in {*range(begin, leaf + 1), *(other for other in adjacent[leaf] if other > leaf)}:
                 bit = NODE_LEAVES * (leaf - begin) + other - int(nodes[node_of[other], NODE_BEGIN])
                 bits_of[node_of[other]] = bits_of.get(node_of[other], 0) | 1 << bit
         counts[node] = len(bits_of)
@@ -256,7 +256,7 @@ def _adjacent_nodes(nodes: NDArray, beside: list[list[int]]) -> tuple[Int, Int, 
 
 
 def _near_pairs(
-    triangles: NDArray, edges: NDArray, leaves: list[list[int]], beside: list[list[int]], vertex_leaf: NDArray, edge_leaf: NDArray
+    triangles: NDArray, edges: NDArray, leaves: list[list[int]], adjacent: list[list[int]], vertex_leaf: NDArray, edge_leaf: NDArray
 ) -> tuple[NDArray, NDArray]:
     """Pairs of a vertex and a triangle, and of two edges, without a common vertex, of leaves that share one or are the same.
 
@@ -266,7 +266,7 @@ def _near_pairs(
     edges_of = [np.flatnonzero(edge_leaf == leaf).tolist() for leaf in range(len(leaves))]
     corner_sets, end_sets = [set(t) for t in triangles.tolist()], [set(e) for e in edges.tolist()]
     vertex_triangle, edge_edge = [], []
-    for leaf, others in enumerate(beside):
+    for leaf, others in enumerate(adjacent):
         for other in others:
             vertex_triangle += [(v, t) for v in vertices_of[leaf] for t in leaves[other] if v not in corner_sets[t]]
             edge_edge += [

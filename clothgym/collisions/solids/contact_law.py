@@ -27,14 +27,14 @@ RELAXED = 0.05  # share of a point's depth, beyond what the last substep moved i
 
 
 @inlined
-def contact_change(distance, nx, ny, nz, ux, uy, uz, w, friction, carried, zero, one, tiny):
+def contact_change(distance, nx, ny, nz, ux, uy, uz, w, friction, lead, zero, one, tiny):
     """Changes of a particle's position [m] and velocity [m/s] by a contact; zero if it is outside the solid or attached.
 
     distance: signed distance to the solid [m].  n: outward normal.  u: velocity relative to the solid [m/s].  w: inverse mass
     [1/kg].
-    carried: time for which the velocity has already moved the position [s].
+    lead: time for which the velocity has already moved the position [s].
 
-        dx = -distance n - carried s v_T,    dv = dv_N n - s v_T,    s = min(mu dv_N / |v_T|, 1).
+        dx = -distance n - lead s v_T,    dv = dv_N n - s v_T,    s = min(mu dv_N / |v_T|, 1).
     """
     touching = (distance < zero) & (w > zero)
     # normal and tangential velocity
@@ -48,15 +48,19 @@ def contact_change(distance, nx, ny, nz, ux, uy, uz, w, friction, carried, zero,
     slowed = slowed if touching else zero
     dv_n = dv_n if touching else zero
     depth = -distance if touching else zero
-    mx, my, mz = depth * nx - carried * slowed * tx, depth * ny - carried * slowed * ty, depth * nz - carried * slowed * tz
+    mx, my, mz = (
+        depth * nx - lead * slowed * tx,
+        depth * ny - lead * slowed * ty,
+        depth * nz - lead * slowed * tz,
+    )
     return mx, my, mz, dv_n * nx - slowed * tx, dv_n * ny - slowed * ty, dv_n * nz - slowed * tz
 
 
 @inlined
-def edge_change(distance, nx, ny, nz, ex, ey, ez, ux, uy, uz, friction, carried, zero, one, tiny):
+def edge_change(distance, nx, ny, nz, ex, ey, ez, ux, uy, uz, friction, lead, zero, one, tiny):
     """``contact_change`` of a free particle inside the solid that is pushed along e.
 
-        dx = -distance n - carried s v_T,    dv = dv_E e - s v_T,    dv_E = max(-u . n, 0)/(e . n),    s = min(mu dv_E / |v_T|, 1),
+        dx = -distance n - lead s v_T,    dv = dv_E e - s v_T,    dv_E = max(-u . n, 0)/(e . n),    s = min(mu dv_E / |v_T|, 1),
 
     where v_T is the part of u at right angles to e.
     """
@@ -67,19 +71,19 @@ def edge_change(distance, nx, ny, nz, ex, ey, ez, ux, uy, uz, friction, carried,
     tx, ty, tz = ux - ue * ex, uy - ue * ey, uz - ue * ez
     slowed = min(friction * dv / (np.sqrt(tx * tx + ty * ty + tz * tz) + tiny), one)
     mx, my, mz = (
-        -distance * nx - carried * slowed * tx,
-        -distance * ny - carried * slowed * ty,
-        -distance * nz - carried * slowed * tz,
+        -distance * nx - lead * slowed * tx,
+        -distance * ny - lead * slowed * ty,
+        -distance * nz - lead * slowed * tz,
     )
     return mx, my, mz, dv * ex - slowed * tx, dv * ey - slowed * ty, dv * ez - slowed * tz
 
 
 @inlined
 def touch_change(
-    gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, friction, h, carried, zero, one, most_speed, relaxed
+    gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, friction, h, lead, zero, one, most_speed, relaxed
 ):  # fmt: skip
     """The same for a point of a triangle that keeps an impulse j [N s] from substep to substep: its new impulse, its change, and a
-    push [kg m], three components each.  Corner i moves by w_i b_i (carried dj + push) and its velocity changes by w_i b_i dj, with
+    push [kg m], three components each.  Corner i moves by w_i b_i (lead dj + push) and its velocity changes by w_i b_i dj, with
     its barycentric weight b_i.
 
     gap: signed distance of the point along n [m], after j has acted.  u: its velocity relative to the solid [m/s], likewise.
@@ -97,7 +101,7 @@ def touch_change(
     mass = one / inverse_mass if acts else zero
     # impulse along e
     un, cosine = ux * nx + uy * ny + uz * nz, ex * nx + ey * ny + ez * nz
-    target = -max(gap - carried * un, zero) / h
+    target = -max(gap - lead * un, zero) / h
     je = min(max(je_before + (target - un) * mass / cosine, zero), most_speed * mass)
     # friction
     ue = ux * ex + uy * ey + uz * ez
@@ -109,7 +113,7 @@ def touch_change(
     px, py, pz = px if acts else zero, py if acts else zero, pz if acts else zero
     # depth that is left, and how much of it is corrected
     taken = (je - je_before) * inverse_mass * cosine
-    depth = max(-(gap + carried * taken), zero)
-    moved = min(depth, max(taken, zero) * (h - carried))
+    depth = max(-(gap + lead * taken), zero)
+    moved = min(depth, max(taken, zero) * (h - lead))
     push = mass * (moved + relaxed * (depth - moved))
     return px, py, pz, px - jx, py - jy, pz - jz, push * nx, push * ny, push * nz

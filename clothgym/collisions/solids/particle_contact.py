@@ -86,12 +86,12 @@ def to_world(nx, ny, nz, xx, xy, xz, yx, yy, yz, zx, zy, zz):
 
 
 @disjoint
-def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, lead):
     """Apply the contact law to particles at a solid that moves with velocity s [m/s]."""
     zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
     for p in range(gap.shape[0]):
         mx, my, mz, cx, cy, cz = contact_change(
-            gap[p], nx[p], ny[p], nz[p], vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+            gap[p], nx[p], ny[p], nz[p], vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, lead, zero, one, tiny
         )
         x[p] += mx
         y[p] += my
@@ -102,12 +102,12 @@ def _respond(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carr
 
 
 @disjoint
-def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, carried):
+def _respond_to_plane(x, y, z, vx, vy, vz, w, gap, nx, ny, nz, sx, sy, sz, friction, lead):
     """The same with one normal for all particles."""
     zero, one, tiny = x.dtype.type(0), x.dtype.type(1), x.dtype.type(TINY)
     for p in range(gap.shape[0]):
         mx, my, mz, cx, cy, cz = contact_change(
-            gap[p], nx, ny, nz, vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, carried, zero, one, tiny
+            gap[p], nx, ny, nz, vx[p] - sx, vy[p] - sy, vz[p] - sz, w[p], friction, lead, zero, one, tiny
         )
         x[p] += mx
         y[p] += my
@@ -136,7 +136,7 @@ def measure_in_scratch(rows, first, last, collider, shapes, k, within, scratch):
 
 
 @uncounted
-def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz, friction, h, carried):
+def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz, friction, h, lead):
     """Apply the contact law to those of particles ``first`` to ``last`` that are near an edge, and mark them as done.
 
     contacts: signed distances [m] and normals, (4, particles).  edges: particles, (edges,).  pushes: directions, (edges, 3).
@@ -152,7 +152,21 @@ def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz,
         if not ex * nx + ey * ny + ez * nz > least_cosine:
             continue
         mx, my, mz, cx, cy, cz = edge_change(
-            contacts[0, p], nx, ny, nz, ex, ey, ez, s[0, p] - sx, s[1, p] - sy, s[2, p] - sz, friction, carried, zero, one, tiny
+            contacts[0, p],
+            nx,
+            ny,
+            nz,
+            ex,
+            ey,
+            ez,
+            s[0, p] - sx,
+            s[1, p] - sy,
+            s[2, p] - sz,
+            friction,
+            lead,
+            zero,
+            one,
+            tiny,
         )
         r[0, p] += mx
         r[1, p] += my
@@ -165,11 +179,11 @@ def _respond_at_edges(r, s, m, first, last, contacts, edges, pushes, sx, sy, sz,
 
 
 @uncounted
-def resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, counts, rows, scratch):
+def resolve_particles(r, s, m, shapes, colliders, h, lead, edges, pushes, counts, rows, scratch):
     """Resolve one sheet's particles' contacts with solids.
 
     r: positions [m], s: velocities [m/s], (3, particles).  m: inverse masses [1/kg], (particles,).  colliders: rows, (colliders,
-    COLLIDER_ROWS, 1).  h: the substep [s].  carried: time for which the velocity has already moved the positions [s].
+    COLLIDER_ROWS, 1).  h: the substep [s].  lead: time for which the velocity has already moved the positions [s].
     edges: particles near an edge of each solid, (colliders, particles), and ``pushes``, the directions in which it pushes them,
     (colliders, particles, 3), see ``edges``; counts: how many, (colliders,).
     rows: scratch, (PARTICLE_ROWS, particles).  scratch: see ``signed_distance``.
@@ -186,7 +200,7 @@ def resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, cou
                 a, b = _span(rows[P_GAP])
                 _respond_to_plane(
                     r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], rows[P_GAP, a:b], nx, ny, nz, sx, sy,
-                    sz, friction, carried,
+                    sz, friction, lead,
                 )  # fmt: skip
             continue
         # any other solid: particles within its reach, from the first to the last
@@ -213,8 +227,8 @@ def resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, cou
         # the contact law: first of particles near an edge, then of the others
         if counts[k] > 0:
             _respond_at_edges(
-                r, s, m, a, b, rows[P_GAP : P_GAP + 4], edges[k, : counts[k]], pushes[k], sx, sy, sz, friction, h, carried
+                r, s, m, a, b, rows[P_GAP : P_GAP + 4], edges[k, : counts[k]], pushes[k], sx, sy, sz, friction, h, lead
             )
         _respond(
-            r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, carried
+            r[0, a:b], r[1, a:b], r[2, a:b], s[0, a:b], s[1, a:b], s[2, a:b], m[a:b], gap, nx, ny, nz, sx, sy, sz, friction, lead
         )  # fmt: skip

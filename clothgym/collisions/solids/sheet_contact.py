@@ -22,15 +22,15 @@ from clothgym.collisions.solids.signed_distance import SCRATCH_ROWS
 from clothgym.collisions.solids.touch_response import (
     T_IMPULSE,
     TOUCH_COLUMNS,
-    bear_touches,
     follow_touches,
     move_solids,
-    press_touches,
+    solve_touches,
+    warm_start_touches,
 )
 from clothgym.collisions.solids.triangle_contact import COLUMNS, choose_by_cells, choose_one_by_one, find_touches
 
 search = placeholder("search", "``triangle_contact.find_touches``, for a grid or for any triangles")
-resolve_sheet = placeholder("resolve_sheet", "of (r, s, m, triangles, shapes, colliders, h, carried, step, look_every, room, lane)")
+resolve_sheet = placeholder("resolve_sheet", "of (r, s, m, triangles, shapes, colliders, h, lead, step, look_every, room, lane)")
 
 
 class Room(NamedTuple):
@@ -64,7 +64,7 @@ class Room(NamedTuple):
 
 
 @kernel
-def room_for_contact(x, triangles, shapes):
+def scratch_for_contact(x, triangles, shapes):
     """The ``Room`` of a block with positions x [m], (3, particles, lanes)."""
     dtype, particles, lanes, number = x.dtype, x.shape[1], x.shape[2], triangles.shape[0]
     solids, most = shapes.kinds.shape[0], 0
@@ -89,12 +89,12 @@ def room_for_contact(x, triangles, shapes):
     )
 
 
-def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, carried, step, look_every, room, lane):
+def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, lead, step, look_every, room, lane):
     """Contact of one sheet, of its particles and between them.
 
     r: positions [m], s: velocities [m/s], (3, particles).  m: inverse masses [1/kg], (particles,); attached particles are left
     alone.  triangles: (triangles, 3).  colliders: rows, (colliders, COLLIDER_ROWS, 1), of solids that have moved on.
-    h: the substep [s].  carried: time for which the velocity has already moved the positions [s].  step: of the control step,
+    h: the substep [s].  lead: time for which the velocity has already moved the positions [s].  step: of the control step,
     before which no touch has borne anything.  look_every: substeps after which touches are searched for again.
     """
     touches, which, number = room.touches[lane], room.which[lane], room.number[lane]
@@ -118,24 +118,35 @@ def _resolve_sheet(r, s, m, triangles, shapes, colliders, h, carried, step, look
     # touches follow, bear what lies on them, and are corrected
     found = touches[: number[0]]
     follow_touches(r, triangles, colliders, found, which, room.scratch)
-    bear_touches(r, s, m, triangles, found, which, carried)
-    press_touches(r, s, m, triangles, colliders, found, which, h, carried)
+    warm_start_touches(r, s, m, triangles, found, which, lead)
+    solve_touches(r, s, m, triangles, colliders, found, which, h, lead)
     # particles
-    resolve_particles(r, s, m, shapes, colliders, h, carried, edges, pushes, counts, room.rows, room.scratch)
+    resolve_particles(r, s, m, shapes, colliders, h, lead, edges, pushes, counts, room.rows, room.scratch)
 
 
 @uncounted
-def _resolve_particles_alone(r, s, m, triangles, shapes, colliders, h, carried, step, look_every, room, lane):
-    """The same without what is between the particles."""
+def _resolve_particles_alone(r, s, m, triangles, shapes, colliders, h, lead, step, look_every, room, lane):
+    """The same for particles alone."""
     resolve_particles(
-        r, s, m, shapes, colliders, h, carried, room.edges[lane], room.pushes[lane], room.counts[lane], room.rows, room.scratch
+        r,
+        s,
+        m,
+        shapes,
+        colliders,
+        h,
+        lead,
+        room.edges[lane],
+        room.pushes[lane],
+        room.counts[lane],
+        room.rows,
+        room.scratch,
     )
 
 
-def _resolve_where_it_lies(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+def _resolve_where_it_lies(x, v, w, triangles, shapes, colliders, h, lead, step, look_every, room):
     """Move the solids on, and resolve the contacts of a block that is one sheet; x, v: (3, particles, 1)."""
     move_solids(colliders, h)
-    resolve_sheet(merged(x), merged(v), merged(w), triangles, shapes, colliders, h, carried, step, look_every, room, 0)
+    resolve_sheet(merged(x), merged(v), merged(w), triangles, shapes, colliders, h, lead, step, look_every, room, 0)
 
 
 @uncounted
@@ -165,7 +176,7 @@ def _find_near(x, shapes, colliders, bounds, near):
             near[l] |= (height if plane else beyond) < zero
 
 
-def _resolve_lanes(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+def _resolve_lanes(x, v, w, triangles, shapes, colliders, h, lead, step, look_every, room):
     """The same for a block of many sheets, in lanes: those that may touch a solid, on a copy; x, v: (3, particles, lanes)."""
     lanes, particles = x.shape[2], x.shape[1]
     sheets, near, own = room.sheets, room.near, room.own
@@ -194,9 +205,7 @@ def _resolve_lanes(x, v, w, triangles, shapes, colliders, h, carried, step, look
             for k in range(colliders.shape[0]):
                 for e in range(COLLIDER_ROWS):
                     own[k, e, 0] = colliders[k, e, l]
-            resolve_sheet(
-                sheets[l, :3], sheets[l, 3:], room.masses[l], triangles, shapes, own, h, carried, step, look_every, room, l
-            )
+            resolve_sheet(sheets[l, :3], sheets[l, 3:], room.masses[l], triangles, shapes, own, h, lead, step, look_every, room, l)
     # scatter
     for c in range(3):
         for p in range(particles):
@@ -206,13 +215,13 @@ def _resolve_lanes(x, v, w, triangles, shapes, colliders, h, carried, step, look
 
 
 @kernel
-def resolve_nothing(x, v, w, triangles, shapes, colliders, h, carried, step, look_every, room):
+def resolve_nothing(x, v, w, triangles, shapes, colliders, h, lead, step, look_every, room):
     """``resolve`` without solids."""
 
 
 @kernel
-def no_room(x, triangles, shapes):
-    """``room_for_contact`` without solids."""
+def no_scratch(x, triangles, shapes):
+    """``scratch_for_contact`` without solids."""
     return (np.empty(0, x.dtype),)
 
 
@@ -222,7 +231,7 @@ def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
     contact: "sheet", with its "particles" alone, or with "nothing".  by_particle: whether a block is one sheet.
     """
     if contact == "nothing":
-        return {"resolve": resolve_nothing, "room_for_contact": no_room}
+        return {"resolve": resolve_nothing, "scratch_for_contact": no_scratch}
     where = _resolve_where_it_lies if by_particle else _resolve_lanes
     which = f"{contact}_{'particles' if by_particle else 'lanes'}"
     one: Any = _resolve_particles_alone
@@ -231,7 +240,10 @@ def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
         one = specialize(
             uncounted(_resolve_sheet), f"resolve_{which}_one", search=specialize(uncounted(find_touches), f"find_{which}", **choose)
         )
-    return {"resolve": specialize(uncounted(where), f"resolve_{which}", resolve_sheet=one), "room_for_contact": room_for_contact}
+    return {
+        "resolve": specialize(uncounted(where), f"resolve_{which}", resolve_sheet=one),
+        "scratch_for_contact": scratch_for_contact,
+    }
 
 
 def needed(contact: str, kinds: NDArray) -> str:

@@ -52,7 +52,7 @@ def lost_wall(x: NDArray, triangles: NDArray, signed: NDArray, resolution: int) 
     if weight * share[found[lost]].sum() < LEAST_AREA:
         # all of a small solid may be a detail
         return None if signed.min() <= -DEEP else (2 * resolution, 1.0, x.mean(axis=0))
-    # what each of them needs: more cells across, or a taper that is short beside the whole
+    # what each of them needs: more cells across, or a taper that is short compared with the whole
     thickness, slope, middle = thickness[found[lost]], slope[found[lost]], middle[lost]
     enough = np.minimum(resolution * THICK / thickness, LOST / TAPER_SHARE / np.maximum(slope, 1e-9))
     worst = int(np.argmax(enough))

@@ -106,21 +106,21 @@ def _move_corners(r, s, m, triangle, touch, dx, dy, dz, ux, uy, uz):
 
 
 @uncounted
-def bear_touches(r, s, m, triangles, touches, which, carried):
-    """Apply the touches' impulses j again: v_i += w_i b_i j, x_i += w_i b_i carried j.
+def warm_start_touches(r, s, m, triangles, touches, which, lead):
+    """Apply the touches' impulses j again: v_i += w_i b_i j, x_i += w_i b_i lead j.
 
-    r: positions x [m], s: velocities v [m/s], (3, particles).  m: inverse masses w [1/kg], (particles,).  carried: time for which
+    r: positions x [m], s: velocities v [m/s], (3, particles).  m: inverse masses w [1/kg], (particles,).  lead: time for which
     the velocity has already moved the positions [s].
     """
     for n in range(touches.shape[0]):
         jx, jy, jz = touches[n, T_IMPULSE], touches[n, T_IMPULSE + 1], touches[n, T_IMPULSE + 2]
         if jx != 0 or jy != 0 or jz != 0:
-            _move_corners(r, s, m, triangles[which[n, 0]], touches[n], carried * jx, carried * jy, carried * jz, jx, jy, jz)
+            _move_corners(r, s, m, triangles[which[n, 0]], touches[n], lead * jx, lead * jy, lead * jz, jx, jy, jz)
 
 
 @uncounted
-def press_touches(r, s, m, triangles, colliders, touches, which, h, carried):
-    """Correct the touches' impulses, one after the other; h: the substep [s], the rest as in ``bear_touches``."""
+def solve_touches(r, s, m, triangles, colliders, touches, which, h, lead):
+    """Correct the touches' impulses, one after the other; h: the substep [s], the rest as in ``warm_start_touches``."""
     zero, one = r.dtype.type(0), r.dtype.type(1)
     most_speed, relaxed, least_cosine = r.dtype.type(FASTEST), r.dtype.type(RELAXED), r.dtype.type(LEAST_COSINE)
     for n in range(touches.shape[0]):
@@ -145,8 +145,8 @@ def press_touches(r, s, m, triangles, colliders, touches, which, h, carried):
         if not ex * nx + ey * ny + ez * nz > least_cosine:
             ex, ey, ez = nx, ny, nz
         px, py, pz, dx, dy, dz, qx, qy, qz = touch_change(
-            gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, c[R_FRICTION, 0], h, carried, zero, one, most_speed,
+            gap, nx, ny, nz, ex, ey, ez, ux, uy, uz, jx, jy, jz, inverse_mass, c[R_FRICTION, 0], h, lead, zero, one, most_speed,
             relaxed,
         )  # fmt: skip
         touch[T_IMPULSE], touch[T_IMPULSE + 1], touch[T_IMPULSE + 2] = px, py, pz
-        _move_corners(r, s, m, triangle, touch, carried * dx + qx, carried * dy + qy, carried * dz + qz, dx, dy, dz)
+        _move_corners(r, s, m, triangle, touch, lead * dx + qx, lead * dy + qy, lead * dz + qz, dx, dy, dz)

@@ -1,8 +1,7 @@
-"""Arrays that a query of one sheet writes: its scratch, one set a thread, and the contacts and gap constraints that it finds.
+"""Arrays that a query of one sheet writes: scratch, one set for each thread, and the contacts and gap constraints that it finds.
 
-Kernels that make no arrays count no references (see ``_jit.uncounted``), so all that a query needs is made here, once.  Lists whose
-length is not known beforehand are worked through in batches: ``BATCH`` pairs of primitives, and ``LEAF_PAIRS`` pairs of leaves for
-each leaf.
+Kernels that allocate no arrays count no references (see ``_jit.uncounted``), so all scratch is allocated here, once.  Lists of
+unknown length are processed in batches: ``BATCH`` pairs of primitives, and ``LEAF_PAIRS`` pairs of leaves for each leaf.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Found(NamedTuple):
     report: NDArray
 
 
-class Room(NamedTuple):
+class QueryScratch(NamedTuple):
     """Scratch of a query; lengths are in particles, edges, triangles, leaves and nodes of the sheet.
 
     p: positions; ahead: those in the middle of the time until the next query [m], both (particles, 3).  extra: how much farther
@@ -90,13 +89,13 @@ class Room(NamedTuple):
 
 
 @apart
-def room_for_queries(pairs, contacts):
-    """The ``Room`` for a sheet; contacts: an array with a row for each contact that is kept, of the simulation's dtype."""
+def scratch_for_queries(pairs, contacts):
+    """The ``QueryScratch`` for a sheet; contacts: an array with a row for each contact that is kept, of the simulation's dtype."""
     n, edges, triangles = pairs.parts.around.shape[0] - 1, pairs.parts.edges.shape[0], pairs.parts.triangles.shape[0]
     leaves, near = pairs.tree.corners.shape[0], pairs.near.first.shape[0]
     room = LEAF_PAIRS * leaves
     real, single, whole, most = contacts.dtype, np.float32, np.int32, contacts.shape[0]
-    return Room(
+    return QueryScratch(
         np.empty((n, 3)), np.empty((n, 3)), np.zeros(n), np.empty(n), np.empty(n), np.empty(n, real), np.empty(n, np.bool_),
         np.empty(n, np.int64), np.empty((n, 3)), np.zeros(n, np.uint8), np.empty((3, triangles)), np.empty((6, triangles)),
         np.empty(triangles), np.empty((6, n), single), np.empty(edges, single), np.empty((2, triangles), single),
