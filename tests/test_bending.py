@@ -7,7 +7,7 @@ from scipy.optimize import brentq
 
 from clothgym import Material, Simulation, disc, grid, triangle_mesh
 from clothgym.bending import BENDING
-from clothgym.elements import Elastic, element_arrays, room_for_forces
+from clothgym.elements import Elastic, element_arrays, scratch_for_forces
 from clothgym.forces import add_lane_forces
 from clothgym.mesh import BEND_X, NUM_KINDS, STRUCTURAL_X
 
@@ -26,7 +26,7 @@ def no_springs(lanes, damping_time=0.0):
 
 
 def room(x):
-    return room_for_forces(x, np.zeros(0, np.int64))
+    return scratch_for_forces(x, np.zeros(0, np.int64))
 
 
 def bend_forces(model, mesh, x, lanes=1, v=None, damping_time=0.0):

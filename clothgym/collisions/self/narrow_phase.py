@@ -183,7 +183,8 @@ def vertex_contacts(number, distances, parts, extent, smooth, scratch, found):
 
     ``scratch.extra``: how much farther than the reach pairs matter around each vertex, which is also how much more than its share
     it may move [m].  ``scratch.bounds``, ``scratch.limits``: become the smallest distances of each vertex, of all its pairs and of
-    those without a constraint [m].  ``scratch.closest``: becomes the smallest distance in each pair of leaves [m] and its direction.
+    those without a constraint [m].  ``scratch.closest``: becomes the smallest distance in each pair of leaves [m] and its
+    direction.
     """
     p, extra, held, bounds, limits, batch, closest = (
         scratch.p,
