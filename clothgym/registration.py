@@ -96,6 +96,8 @@ def register() -> None:
     ``max_episode_steps`` is one more than the longest episode takes: at exactly that length, Gymnasium's ``TimeLimit`` would also
     truncate an episode that is evaluated, and terminates, in its last step.
     """
+    if ENVIRONMENTS.keys() != LONGEST.keys():
+        raise RuntimeError(f"registration.LONGEST and ENVIRONMENTS differ in {sorted(ENVIRONMENTS.keys() ^ LONGEST.keys())}")
     for env_id, (name, _) in ENVIRONMENTS.items():
         if env_id not in gym.registry:
             gym.register(
