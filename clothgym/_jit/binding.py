@@ -21,7 +21,7 @@ from clothgym._jit.policy import COUNTED, inlined, kernel
 
 
 class _Placeholder:
-    """A name without a kernel: whoever calls it, or compiles a call of it, gets a sentence."""
+    """A kernel that is not bound yet: calling it, or compiling a call of it, raises an error that says how to bind it."""
 
     def __init__(self, name: str, meaning: str) -> None:
         self.sentence = (

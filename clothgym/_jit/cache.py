@@ -69,7 +69,7 @@ def source_digest(folders: Mapping[str, Path], without: Set[str] = WITHOUT_KERNE
 
 
 def name_of(function: Any) -> str:
-    """A kernel's, as that of a file."""
+    """Name of a kernel's files in the cache: a digest of its module and qualified name."""
     return hashlib.sha256(f"{function.__module__}.{function.__qualname__}".encode()).hexdigest()[:16]
 
 

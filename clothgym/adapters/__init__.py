@@ -1,4 +1,4 @@
-"""Floor 8: other libraries' clothes for our environments; each needs its library, and is loaded when first used."""
+"""Floor 8: adapters to other libraries' interfaces. Each needs its library, and is imported on first use."""
 
 from __future__ import annotations
 

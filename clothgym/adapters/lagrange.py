@@ -12,8 +12,9 @@ Reinforcement Learning by PID Lagrangian Methods, Algorithm 2, where J' is the m
 
 With K_P = K_D = 0 this is dual ascent at the rate K_I.
 
-A policy that has not learned its task pays for it all the same, and a price that would keep it within the limit keeps it from
-moving.  So the limit may begin at d_0, and be tightened to d geometrically over a share f of the training: at the share s of it
+Early in training the policy incurs costs without solving the task, and a multiplier that is large enough to enforce the limit
+suppresses all motion.  So the limit may begin at d_0, and be tightened to d geometrically over a share f of the training: at the
+share s of it
 
     d(s) = d_0^(1 - min(s/f, 1)) d^min(s/f, 1)
 """

@@ -107,7 +107,7 @@ class Access:
 
     @contextlib.contextmanager
     def guarding(self) -> Iterator[None]:
-        """While a server is made: it is made with this guard, and tells of messages in sentences.  viser offers no door for it."""
+        """Context in which a server is created with this access check.  Patches ``websockets``, as viser has no hook for it."""
         from websockets.asyncio import server
 
         plain = server.serve

@@ -1,7 +1,7 @@
 """A small network, evaluated so that an environment's action has the same bits alone, in any batch and on any x86-64 processor.
 
-Matrix products of a library add in an order that depends on the processor and on the size of the batch, and its tanh is another
-one on each.  Here every sum goes over the inputs in their order, and tanh is made of additions, products and divisions.
+BLAS sums in an order that depends on the processor and on the size of the batch, and tanh of a library differs between processors.
+Here every sum goes over the inputs in their order, and tanh is made of additions, products and divisions.
 """
 
 from __future__ import annotations

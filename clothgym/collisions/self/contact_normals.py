@@ -15,13 +15,13 @@ sheet has the direction of sum a_i N_i as its normal, and lies above the flat tr
     rise = -1/2 sum a_i N_i . (q - p_i),
 
 which is exact to second order in the size of a triangle, and half of what Phong tessellation takes (Boubekeur and Alexa 2008).
-Without it, layers around a cylinder would move over each other's facets as over cobbles.  Around a vertex at which faces meet at
+Without it, layers around a cylinder would bump over each other's facets.  Around a vertex at which faces meet at
 sharp angles the sheet has no normal, and is as its faces are.  Contact with averaged normals: Puso and Laursen, A mortar
 segment-to-segment contact method for large deformation solid mechanics, 2004.
 
 A contact keeps its direction and its points from one query to the next.  They are those of the middle of this time, where the
-sheets are *ahead*, if they go on as they did since the last query.  Those of its beginning would lag behind the surface's normal by
-half of the way: over a cylinder that is friction that nobody asked for, of the way over twice the radius.
+sheets are *ahead*, if they go on as they did since the last query.  Normals of the start of the interval would lag by half of the
+distance slid: on a cylinder this acts as friction, with a coefficient of that distance over twice the radius.
 
 This is done between different pieces of a mesh, that is for sheets on sheets.  Within one sheet, whose folds are as sharp as its
 triangles allow, which pairs are contacts would change from query to query, and sheets that are draped would not come to rest: there

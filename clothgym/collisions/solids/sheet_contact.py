@@ -3,7 +3,7 @@
 It always works on one sheet, whose particles lie side by side in memory: a lane is gathered before, and scattered after.
 
 1. Prepare: solids move on; every few substeps touches and edges are searched for (``triangle_contact``); then touches follow.
-2. Warm start: touches apply the impulses of before, so that what lies on a solid is borne.
+2. Warm start: touches apply the impulses of before, so that solids support the cloth on them.
 3. Solve: these are corrected, one after the other (``touch_response``), and all particles are pushed out (``particle_contact``).
 4. Store: at the next search, touches that are found again take over the impulses.
 """
