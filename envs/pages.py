@@ -26,7 +26,7 @@ from clothgym.envs.observing import Observation, points_observed
 from clothgym.envs.physics import MEASURED, Physics
 from clothgym.envs.pick_place import STEPS
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.task import Task
+from clothgym.envs.task import OPTIONS, Task
 from clothgym.material import PRESETS, Material
 
 if TYPE_CHECKING:
@@ -50,15 +50,6 @@ FAILED = {
     "torn": f"a structural spring {TWICE:g} times as long as at rest",
     "out_of_bounds": f"the sheet's center {BEYOND:g} m beyond the arena, $room",
     "diverged": "not finite; the last finite observation is returned",
-}
-# the keys of ``reset(options=...)``
-OPTIONS = {
-    "material": "a preset's name or a dict of properties",
-    "target": "a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw``",
-    "rail": "a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad]",
-    "hook": "a dict with any of ``height`` (of the arm's root) [m], ``center`` (of the post) [m], ``yaw`` [rad]",
-    "rumpled": "True or False",
-    "goal": "three coordinates [m]",
 }
 
 # default and meaning of the keywords that all environments take; $name: the task's own

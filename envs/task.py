@@ -7,6 +7,7 @@ terminates.
 
 from __future__ import annotations
 
+import difflib
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
@@ -55,6 +56,17 @@ ENVS_A_THREAD = 16  # fewer are not worth another thread
 def _time_left(task: Task) -> NDArray:
     """Share of the episode that is left, (num_envs,)."""
     return 1 - task.episode["step"] / (task.acting_steps + task.settling_steps)
+
+
+# options of ``reset`` of all tasks, as their manual pages describe them
+OPTIONS = {
+    "material": "a preset's name or a dict of properties",
+    "target": "a dict with any of ``shape``, ``radius``, ``height``, ``center``, ``yaw``",
+    "rail": "a dict with any of ``height`` (of its axis) [m], ``center`` [m], ``yaw`` [rad]",
+    "hook": "a dict with any of ``height`` (of the arm's root) [m], ``center`` (of the post) [m], ``yaw`` [rad]",
+    "rumpled": "True or False",
+    "goal": "three coordinates [m]",
+}
 
 
 class Task:
@@ -479,10 +491,13 @@ class Task:
         """A reset's options, with the properties of a fabric that was named; refuses those that no episode can have."""
         if not isinstance(options, Mapping):
             raise ValueError(f"reset options={shown(options)}: must be a dict with any of {', '.join(self.reset_options)}")
-        unknown = set(options) - set(self.reset_options)
-        if unknown:
-            raise ValueError(f"unknown reset option {sorted(unknown)[0]!r} (there are: {', '.join(self.reset_options)})")
-        checked = dict(options)
+        # evaluators and wrappers pass options of their own; but a misspelled option, or one of another task, would have no effect
+        for name in [name for name in options if isinstance(name, str) and name not in self.reset_options]:
+            near = difflib.get_close_matches(name, OPTIONS.keys() | set(self.reset_options), n=1)
+            if near:
+                guess = f": did you mean {near[0]!r}?" if near[0] != name else " in this task"
+                raise ValueError(f"no reset option {name!r}{guess} (there are: {', '.join(self.reset_options)})")
+        checked = {name: value for name, value in options.items() if name in self.reset_options}
         if "material" in options:
             checked["material"] = checked_material_option(options["material"], self.physics, self.randomize, self.simulation)
         self.check_options(checked)

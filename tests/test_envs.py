@@ -274,7 +274,8 @@ def test_bad_actions_raise_before_anything_moves(env_id, bad):
 @pytest.mark.parametrize(
     ("options", "name"),
     [
-        ({"color": "red"}, "color"),
+        ({"materials": "silk"}, "no reset option 'materials': did you mean 'material'"),
+        ({"gaol": (0, 0, 1)}, "gaol"),
         ({"material": {"mass": 1}}, "mass"),
         ({"material": {"density": -1}}, "density"),
         ({"material": {"bend_rigidity": 0.1}}, "bend_rigidity"),
@@ -294,6 +295,15 @@ def test_bad_reset_options_are_named_and_leave_nothing_behind(env_id, options, n
             env.reset(seed=0, options=options)
     again, _ = env.reset(seed=0)
     assert np.array_equal(flat(again), flat(fresh)) and np.array_equal(env.task.simulation.parameters, properties)
+
+
+def test_reset_options_of_evaluators_are_ignored_and_those_of_other_tasks_refused():
+    env = make("ClothFold-v0")
+    fresh, _ = env.reset(seed=0)
+    again, _ = env.reset(seed=0, options={"lerobot_new_rollout": True, 3: None})
+    assert np.array_equal(flat(again), flat(fresh))
+    with pytest.raises(ValueError, match="no reset option 'target' in this task"):
+        env.reset(seed=0, options={"target": {"shape": "box"}})
 
 
 @two_tasks
