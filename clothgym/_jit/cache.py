@@ -31,7 +31,7 @@ from clothgym.warning import warn_caller
 # modules and folders without kernels, from which none below them takes a constant: who edits them need not compile
 WITHOUT_KERNELS = {"__main__", "adapters", "cli", "playground"}
 # modules and folders above the core, which imports none of them
-ABOVE_CORE = {*WITHOUT_KERNELS, "envs", "lab", "render", "starts"}
+ABOVE_CORE = {*WITHOUT_KERNELS, "envs", "lab", "policies", "render", "starts"}
 CHECKSUM = 32  # bytes of a checksum, and of its key
 NOWHERE = Path(os.devnull) / "none"
 
