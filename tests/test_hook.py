@@ -95,7 +95,9 @@ def test_a_sheet_put_on_the_arm_hangs_by_its_hole():
         env, _ = start(HOOK)
         info = settled(env, on_arm(env), speed)
         assert info["threaded"] and abs(winding(env)) == 1 and info["lying"] == 0
-        assert info["is_success"] == (speed == 0)
+        # it has come to rest; a push at the end undoes that
+        assert info["first_success"] > 0 and info["best"] == 1
+    assert not info["is_success"]
     # and it is observed
     env.reset(seed=3)
     env.task.simulation.reset(positions=on_arm(env))

@@ -319,7 +319,7 @@ def test_a_strain_limit_is_refused_in_a_sentence():
     value = 0
     with pytest.raises(ValueError, match=f"strain_limit={value}: a limiter would keep the strain below the threshold"):
         gym.make(STRAIN, strain_limit=value)
-    with pytest.raises(ValueError, match="take an integrator without one"):
+    with pytest.raises(ValueError, match="use an integrator without one"):
         gym.make_vec(STRAIN, num_envs=2, strain_limit=value)
 
 

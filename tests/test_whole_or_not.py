@@ -15,7 +15,7 @@ from clothgym.envs import episode
 
 ANY = "ClothReach-v0"
 OF_ALL = [
-    {"color": "red"},
+    {"materials": "silk"},
     {"material": {"density": -1}},
     {"material": "corduroy"},
     {"material": None},
