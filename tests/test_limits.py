@@ -118,6 +118,7 @@ def test_a_wall_for_which_no_grid_is_fine_enough_is_told_so():
 # --- anchors --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*too few for:UserWarning")
 def test_more_anchors_than_a_small_integer_counts_all_hold():
     mesh = grid(182, 182, 1.0, 1.0)
