@@ -8,12 +8,15 @@ import textwrap
 import threading
 from pathlib import Path
 
+import numba
+import numpy as np
 import pytest
 from numba.core.errors import TypingError
 
 from clothgym import bending
-from clothgym._jit import WITHOUT_JIT, inlined, kernel, placeholder, specialize
+from clothgym._jit import WITHOUT_JIT, inlined, kernel, merged, placeholder, specialize
 from clothgym._jit.cache import ABOVE_CORE, WITHOUT_KERNELS, cache_folder, source_digest
+from clothgym._jit.merging import _merged_in_python
 from clothgym.bending import add_bend_forces
 from clothgym.integrators import INTEGRATORS
 
@@ -265,3 +268,31 @@ def test_threads_that_make_the_first_call_together_leave_one_entry(monkeypatch):
     assert one(1.0, 2.0) == add(1.0, 2.0)
     assert len(calls) == 4
     assert numba_internals.is_kept(one)
+
+
+# --- views ------------------------------------------------------------------------------------------------------------------
+
+
+@kernel
+def _write_merged(a):
+    row = merged(a)
+    row[..., -1] = 7.0
+    return row
+
+
+@pytest.mark.parametrize("shape", [(3, 5, 1), (2, 3, 4), (6, 1)])
+@pytest.mark.parametrize("view", [_write_merged, numba.njit(_merged_in_python)])
+def test_merged_is_a_view_with_the_last_two_axes_joined(shape, view):
+    a = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
+    before, row = a.copy(), view(a)
+    assert np.shares_memory(row, a) and row.flags.c_contiguous
+    expected = before.reshape(shape[:-2] + (-1,))
+    if view is _write_merged:
+        expected[..., -1] = 7.0
+        assert a[(*[0] * (len(shape) - 2), -1, -1)] == 7.0
+    assert np.array_equal(row, expected)
+
+
+def test_merged_refuses_what_is_not_contiguous():
+    with pytest.raises(TypingError, match="C-contiguous"):
+        _write_merged(np.zeros((4, 6))[:, ::2])

@@ -4,9 +4,9 @@ One policy for the whole project, so that the promises made about bits and about
 
     policy             the sorts of kernels and their compiler's flags; plain numba where the rest does not fit numba
     binding            one kernel from the code of another with other callees: ``specialize``, ``placeholder``
-    merging            views that join the last two axes of an array
+    merging            views that join the last two axes of an array, private to numba with a public fallback
     cache              the folder of compiled kernels: its name, its locks
-    numba_internals    all uses of private interfaces of numba and llvmlite
+    numba_internals    all other uses of private interfaces of numba and llvmlite
     threads            spans of blocks on Python threads
 """
 

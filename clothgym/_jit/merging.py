@@ -1,8 +1,8 @@
 """Views that join the last two axes of an array.
 
 A block of one sheet has a last axis of length one, (3, particles, 1), and loops over its particles are only vectorized over rows
-that the compiler knows to be contiguous.  Numba's ``reshape`` gives such a view by a call of a C function that works out whether it
-can be one: at a few dozen a substep that is a share of it.
+that the compiler knows to be contiguous.  Numba's ``reshape`` returns such a view, too, but calls a C function that checks whether
+a view is possible.  The main loop needs a few dozen views in each substep.
 """
 
 from __future__ import annotations
