@@ -9,6 +9,7 @@ Sections of ``results/self_collision.json``:
   intersection, the most pairs that intersected at once, the smallest gap and the largest lag that the simulation reported.  Modes:
   "none", "fast" and "strict" with a thickness; and "spheres", what peers do: particles are balls that push each other apart in
   every substep, but for those that are nearer at rest; as thick as the cloth, or "covering" it.
+* substeps: the same with one sheet and a control step for each substep, so that the count follows every substep.
 * drape: steps of random actions in ClothDrape-v0 with ``self_collision="strict"``, by target.
 
 ``clothgym.geometry.intersections`` defines the count, and is independent of self-collision.
@@ -32,6 +33,7 @@ from clothgym.starts import MANEUVERS, Maneuver
 
 RESULT = Path(__file__).parent / "results" / "self_collision.json"
 SEEDS, FRAME = 5, 1 / 60
+FOLLOWED = ("13x13", "25x25")  # meshes that are counted after every substep
 DRAGGING = 10.0  # seconds of the maneuvers without end
 MESHES: dict[str, Callable[[], ClothMesh]] = {
     "13x13": lambda: grid(13, 13, 1.0, 1.0),
@@ -100,7 +102,7 @@ def with_spheres(name: str, mesh: ClothMesh, seeds: range, thickness: float, dia
 
 def with_simulation(name: str, mesh: ClothMesh, seeds: range, thickness: float, options: Row) -> Iterator[Maneuver]:
     """A maneuver after each of its frames."""
-    maneuver = MANEUVERS[name](mesh, seeds=seeds, thickness=thickness, time_step=FRAME, **options)
+    maneuver = MANEUVERS[name](mesh, seeds=seeds, thickness=thickness, **{"time_step": FRAME} | options)
     while not over(maneuver):
         maneuver.step()
         yield maneuver
@@ -137,6 +139,21 @@ def measure_maneuver(maneuver: str, mesh: str, mode: str, thickness_mm: float) -
     return row | {"diverged": int(state.simulation.diverged.sum()), "wall_s": round(time.perf_counter() - begun, 1)}
 
 
+def measure_substeps(maneuver: str, mesh: str, thickness_mm: float) -> Row:
+    """Substeps of one strict sheet, and in how many of them something intersected."""
+    sheet, thickness = MESHES[mesh](), thickness_mm / 1000
+    option: Row = {"self_collision": {"mode": "strict", "thickness": thickness}}
+    # the substep is that of control steps of the usual length
+    substeps = MANEUVERS[maneuver](sheet, seeds=[0], thickness=thickness, time_step=FRAME, **option).simulation.substeps
+    option |= {"time_step": FRAME / substeps, "substeps": 1}
+    begun, bad, count = time.perf_counter(), 0, 0
+    frames = with_simulation(maneuver, sheet, range(1), thickness, option)
+    for state in tqdm(frames, desc=f"{maneuver}, {mesh}, substeps", unit="substep", leave=False, disable=None):
+        bad += int(count_intersections(sheet.triangles, state.simulation.positions)[0] > 0)
+        count += 1
+    return {"substeps": count, "intersecting": bad, "wall_s": round(time.perf_counter() - begun, 1)}
+
+
 def measure_drape(target: str) -> Row:
     """Environment steps of random actions, summed over a batch; episodes begin again when they end."""
     env = gym.make_vec("clothgym:ClothDrape-v0", num_envs=LANES, autoreset_mode="Disabled", self_collision="strict")
@@ -168,8 +185,10 @@ def cases() -> dict[str, list[Case]]:
                 if mesh == COMPARED:
                     modes += ["fast"] + (["none", "spheres", "covering spheres"] if thickness == THICKNESSES[0] else [])
                 rows += [{"maneuver": name, "mesh": mesh, "mode": mode, "thickness_mm": thickness} for mode in modes]
+    followed = [{"maneuver": name, "mesh": mesh, "thickness_mm": 4} for mesh in FOLLOWED for name in MANEUVERS]
     return {
         "maneuvers": [(measure_maneuver, row) for row in rows],
+        "substeps": [(measure_substeps, row) for row in followed],
         "drape": [(measure_drape, {"target": target}) for target in TARGETS],
     }
 
