@@ -221,7 +221,7 @@ class Attachments:
         blocks: list[int] | None = None,
     ) -> NDArray:
         """Force of the cloth on each attachment [N], (blocks, attachments, 3, lanes), in these blocks, or in all of them."""
-        out, add = np.empty_like(self.x), pulls_with(bending, self.layout.by_particle)
+        out, add = np.empty_like(self.x), pulls_with(bending, self.layout.kind)
 
         def work(first: int, last: int) -> None:
             add(first, last, x, v, free_w, topology, fabric, self.holder, out)
@@ -481,11 +481,9 @@ def add_pulls(first, last, x, v, free_w, topology, fabric, holder, out):
 
 
 @cache
-def pulls_with(bending: Bending, by_particle: bool) -> Any:
+def pulls_with(bending: Bending, layout: str) -> Any:
     """``add_pulls`` with the forces of a bending model and a memory layout."""
-    return specialize(
-        add_pulls, f"add_pulls_{bending.name}_{by_particle}", **callees_of(add_pulls, kernels_of(bending, by_particle))
-    )
+    return specialize(add_pulls, f"add_pulls_{bending.name}_{layout}", **callees_of(add_pulls, kernels_of(bending, layout)))
 
 
 @kernel

@@ -15,8 +15,8 @@ of the chosen model:
         for a single pass, which needs none.
 
 In all of them x [m] and v [m/s] are (3, particles, lanes), and w [1/kg] is (particles, lanes).  ``elements``, ``elastic``,
-``scratch`` and ``bends`` are those of ``elements``.  For a grid whose particles are adjacent in memory the same forces are in
-``grid_forces``.
+``scratch`` and ``bends`` are those of ``elements``.  Where particles are adjacent in memory the same forces are in ``grid_forces``,
+for a grid, and in ``sheet_forces``.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def add_quadratic_forces(x, v, f, elements, elastic, scratch):
     model is exact for a sheet that bends without stretching.
     """
     members, curves = elements.bends.particles, elements.bends.curves
-    rigidity, damping_time, rows = elastic.rigidity, elastic.damping_time, scratch.rows
-    curve, rate = rows[0], rows[1]
+    rigidity, damping_time, lanes = elastic.rigidity, elastic.damping_time, x.shape[2]
+    curve, rate = scratch.rows[0, :lanes], scratch.rows[1, :lanes]
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         for c in range(3):
@@ -109,7 +109,7 @@ def add_quadratic_forces(x, v, f, elements, elastic, scratch):
 def add_quadratic_products(x, p, y, elements, scale, scratch):
     """``y_i <- y_i + scale q_i sum_j q_j p_j`` for each hinge: the energy's matrix is constant, and never indefinite."""
     members, curves = elements.bends.particles, elements.bends.curves
-    curve = scratch.rows[0]
+    curve = scratch.rows[0, : x.shape[2]]
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]
         for c in range(3):
@@ -129,7 +129,8 @@ def project_quadratic(y, u, w, bends, h, inverse_alpha_tilde, gamma, relaxation,
     """
     members, _, _, curves = bends
     one, zero = y.dtype.type(1), y.dtype.type(0)
-    curve, rate, inverse = scratch.rows[0], scratch.rows[1], scratch.rows[2]
+    lanes = y.shape[2]
+    curve, rate, inverse = scratch.rows[0, :lanes], scratch.rows[1, :lanes], scratch.rows[2, :lanes]
     keeps = lam.shape[0] > 0
     for s in range(members.shape[0]):
         i, j, k, m = members[s, 0], members[s, 1], members[s, 2], members[s, 3]

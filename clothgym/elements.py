@@ -12,6 +12,7 @@ from clothgym._jit import kernel
 from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y, ClothMesh
 
 WORK_ROWS = 38  # of ``Scratch.rows``
+BATCH = 64  # elements that ``sheet_forces`` takes at a time
 ALIKE = 1e-6  # relative difference up to which the springs of a kind count as equally long
 # kinds of springs on a grid, with the rows and columns from the first end to the second
 KINDS = ((STRUCTURAL_X, 0, 1), (STRUCTURAL_Y, 1, 0), (SHEAR, 1, 1), (SHEAR, 1, -1), (BEND_X, 0, 2), (BEND_Y, 2, 0))
@@ -88,8 +89,9 @@ class Elements(NamedTuple):
 class Scratch(NamedTuple):
     """Scratch for the forces of elements.  The content of ``rows`` is lost when a call ends.
 
-    rows: (WORK_ROWS, lanes), or (WORK_ROWS, particles) where particles are adjacent in memory.  kinds: forces of a grid's springs
-    by kind, (3, kinds, ``before`` + particles); the entries before a kind's first spring and after its last are zero, and stay so.
+    rows: (WORK_ROWS, row), with room for the lanes, for ``BATCH`` elements, or for the particles of a grid that are adjacent in
+    memory.  kinds: forces of a grid's springs by kind, (3, kinds, ``before`` + particles); the entries before a kind's first
+    spring and after its last are zero, and stay so.
     """
 
     rows: NDArray
@@ -119,7 +121,7 @@ class Topology(NamedTuple):
     """Everything that exerts forces on a sheet, in the form that the memory layout needs.
 
     springs: one by one.  elements: springs and hinges, one by one or by kinds.  air: triangles, or cells.  triangles: (triangles,
-    3).  offset: of the kinds, where particles are adjacent in memory; otherwise empty.
+    3).  offset: of the kinds, where the particles of a regular grid are adjacent in memory; otherwise empty.
     """
 
     springs: SpringArrays
@@ -149,10 +151,13 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, any_order: bo
     return Elements(springs, bends)
 
 
-def topology_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, by_particle: bool) -> Topology:
-    """The topology of a mesh, from the mesh's ``elements`` and ``surface``; arguments as for ``grid_of`` and ``Topology``."""
+def topology_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, regular: bool) -> Topology:
+    """The topology of a mesh, from the mesh's ``elements`` and ``surface``; arguments as for ``grid_of``.
+
+    regular: whether it is a regular grid whose particles are adjacent in memory.
+    """
     dtype = surface.shares.dtype
-    if not by_particle:
+    if not regular:
         return Topology(elements.springs, elements, surface, surface.triangles, np.zeros(0, np.int64))
     grid = grid_of(mesh, dtype, bending)
     return Topology(elements.springs, grid, grid_surface_of(mesh, dtype), surface.triangles, grid.offset)
@@ -255,7 +260,7 @@ def scratch_for_forces(x, offset):
     before = 0
     for o in offset:
         before = max(before, o)
-    row = particles if len(offset) > 0 else lanes
+    row = particles if len(offset) > 0 else max(lanes, BATCH)
     return Scratch(np.empty((WORK_ROWS, row), x.dtype), np.zeros((3, offset.shape[0], before + particles), x.dtype))
 
 

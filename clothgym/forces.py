@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from clothgym._jit import disjoint, inlined, kernel, merged, placeholder, uncounted
+from clothgym._jit import disjoint, inlined, merged, placeholder, uncounted
 from clothgym.bending import Bending
 from clothgym.elements import Elements
 from clothgym.mesh import SHEAR, ClothMesh
@@ -67,12 +67,8 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
     is the vector from the first end i to the second end j, u its rate of change, r the rest length, and tau the damping time.
     The stiffness k [N/m] is the spring's weight times the row of its kind in ``elastic.stiffness``, (kinds, lanes).
     """
-    # a single environment has its own loop: loops over one lane are slow
-    stiffness, damping_time = elastic.stiffness, elastic.damping_time
-    if x.shape[2] == 1:
-        _add_lane_forces_of_one(merged(x), merged(v), merged(f), elements.springs, stiffness[:, 0], damping_time[0])
-        return
     # spring by spring, each in all lanes
+    stiffness, damping_time = elastic.stiffness, elastic.damping_time
     ends, rest_length, kind, weight = elements.springs
     x0, x1, x2, v0, v1, v2, f0, f1, f2 = x[0], x[1], x[2], v[0], v[1], v[2], f[0], f[1], f[2]
     for s in range(ends.shape[0]):
@@ -87,37 +83,15 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
 @uncounted
 def set_lane_forces(x, v, start, f, elements, elastic, scratch):
     """``f`` is ``start`` plus the forces of ``add_lane_forces`` [N]; start, f: (3, particles, lanes)."""
-    _copy(merged(merged(start)), merged(merged(f)))
+    copy(merged(merged(start)), merged(merged(f)))
     add_lane_forces(x, v, f, elements, elastic, scratch)
 
 
 @disjoint
-def _copy(start, f):
+def copy(start, f):
     """``f <- start``, flat arrays."""
     for e in range(f.shape[0]):
         f[e] = start[e]
-
-
-@kernel
-def _add_lane_forces_of_one(x, v, f, springs, stiffness, damping_time):
-    """``add_spring_forces`` for one environment, in less than half the time: x, v, f (3, particles), stiffness (kinds,)."""
-    ends, rest_length, kind, weight = springs
-    one, tiny = x.dtype.type(1), x.dtype.type(TINY)
-    for s in range(ends.shape[0]):
-        i = ends[s, 0]
-        j = ends[s, 1]
-        r = rest_length[s]
-        dx, dy, dz = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
-        ux, uy, uz = v[0, j] - v[0, i], v[1, j] - v[1, i], v[2, j] - v[2, i]
-        q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-        g = weight[s] * stiffness[kind[s]] * ((one - r * q) + damping_time * (ux * dx + uy * dy + uz * dz) * q * q)
-        fx, fy, fz = g * dx, g * dy, g * dz
-        f[0, i] += fx
-        f[1, i] += fy
-        f[2, i] += fz
-        f[0, j] -= fx
-        f[1, j] -= fy
-        f[2, j] -= fz
 
 
 @disjoint

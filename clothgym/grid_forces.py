@@ -23,6 +23,13 @@ import numpy as np
 from clothgym._jit import disjoint, inlined, merged, uncounted
 from clothgym.bending import Bending, add_no_forces, add_no_products, hinge_angles, hinge_rates, hinge_rows
 from clothgym.forces import TINY, add_lane_air_forces, add_lane_forces, add_lane_products, most_air, set_lane_forces
+from clothgym.sheet_forces import (
+    add_sheet_air_forces,
+    add_sheet_forces,
+    add_sheet_hinge_forces,
+    add_sheet_quadratic_forces,
+    set_sheet_forces,
+)
 
 
 @inlined
@@ -428,15 +435,21 @@ def add_grid_air_forces(x, v, f, surface, resistance, wind, interval, scratch):
 # --- the table ----------------------------------------------------------------------------------------------------------
 
 
-def kernels_of(model: Bending, by_particle: bool) -> dict[str, Any]:
+def kernels_of(model: Bending, layout: str) -> dict[str, Any]:
     """The force kernels for a bending model, by the names under which integrators and the main loop call them.
 
-    by_particle: whether the particles of one sheet are adjacent in memory; otherwise the lanes are.
+    layout: see ``layout.Layout``.
     """
-    if not by_particle:
+    if layout == "lanes":
         return model.kernels | {
             "add_spring_forces": add_lane_forces, "add_spring_products": add_lane_products, "add_air_forces": add_lane_air_forces,
             "set_spring_forces": set_lane_forces,
+        }  # fmt: skip
+    if layout == "sheet":
+        bends = {"springs": add_no_forces, "quadratic": add_sheet_quadratic_forces, "hinge": add_sheet_hinge_forces}
+        return model.kernels | {
+            "add_spring_forces": add_sheet_forces, "add_spring_products": add_lane_products, "add_air_forces": add_sheet_air_forces,
+            "set_spring_forces": set_sheet_forces, "add_bend_forces": bends[model.name],
         }  # fmt: skip
     # the quadratic model is added together with the springs
     hinges = (add_grid_hinge_forces, add_grid_hinge_products) if model.name == "hinge" else (add_no_forces, add_no_products)

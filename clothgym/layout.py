@@ -3,10 +3,11 @@
 Public arrays have the environment first, ``(num_envs, particles, 3)``.  Kernels see ``(block, component, particle, lane)``, and
 vectorize over the elements that are adjacent in memory.
 
-For a grid under a method in which the order of the springs does not matter, that is the sheet's own particles: a block is one
-environment, of one lane, and the springs of one kind are one loop with a constant offset (see ``grid_forces``).  One environment
-then costs no more than each of many.  For triangle meshes and Gauss-Seidel methods it is the environments: a block has many lanes,
-which share a spring's indices and rest length, so that nothing is gathered.
+Under a method in which the order of the springs does not matter, that is the sheet's own particles: a block is one environment, of
+one lane.  The springs of one kind of a regular grid are one loop with a constant offset (see ``grid_forces``); those of any other
+sheet are gathered (see ``sheet_forces``).  One environment then costs no more than each of many.  For Gauss-Seidel methods, and for
+large batches of triangle meshes, it is the environments: a block has many lanes, which share a spring's indices and rest length, so
+that nothing is gathered.
 """
 
 from __future__ import annotations
@@ -26,25 +27,32 @@ VECTOR = 16  # float32 lanes of the widest vector unit in use; blocks are padded
 class Layout(NamedTuple):
     """Which block and lane an environment has.  Lanes beyond ``num_envs`` are padding; they repeat the last environment.
 
-    by_particle: whether one sheet's particles lie side by side; then a block is one environment.
+    kind: "grid" or "sheet" where one sheet's particles lie side by side, and a block is one environment; or "lanes".
     """
 
     num_envs: int
     blocks: int
     lanes: int
-    by_particle: bool
+    kind: str
+
+    @property
+    def by_particle(self) -> bool:
+        """Whether one sheet's particles lie side by side."""
+        return self.kind != "lanes"
 
     @staticmethod
-    def choose(num_envs: int, threads: int, by_particle: bool) -> Layout:
-        """One lane a block where particles lie side by side; else as few and as wide blocks as give every thread the same
-        number."""
-        if by_particle:
-            return Layout(num_envs, num_envs, 1, True)
+    def choose(num_envs: int, threads: int, any_order: bool, regular: bool) -> Layout:
+        """One lane a block where particles lie side by side; else as few and as wide blocks as give every thread the same number.
+
+        any_order: whether the order of the springs does not matter to the method.  regular: whether the sheet is a regular grid.
+        """
+        if any_order and (regular or num_envs < VECTOR):
+            return Layout(num_envs, num_envs, 1, "grid" if regular else "sheet")
         blocks = min(-(-num_envs // VECTOR), threads * -(-num_envs // (threads * WIDEST_BLOCK)))
         lanes = -(-num_envs // blocks)
         if lanes >= VECTOR:
             lanes = -(-lanes // VECTOR) * VECTOR
-        return Layout(num_envs, -(-num_envs // lanes), lanes, False)
+        return Layout(num_envs, -(-num_envs // lanes), lanes, "lanes")
 
     def to_blocks(self, public: NDArray, dtype: NDArray | np.dtype) -> NDArray:
         """(num_envs, ...) to a new contiguous (blocks, ..., lanes)."""
@@ -85,8 +93,9 @@ class Layout(NamedTuple):
         chosen = self.chosen(envs).tolist()
         if not self.by_particle:
             raise ValueError(
-                f"step(envs=...): with {method} on this mesh environments lie side by side in memory and advance together; leave "
-                "envs out, or take a grid with an integrator in which the order of the springs does not matter"
+                f"step(envs=...): with {method} on this mesh {self.num_envs} environments lie side by side in memory and advance "
+                f"together; leave envs out, or take a grid, or less than {VECTOR} environments, with an integrator in which the "
+                "order of the springs does not matter"
             )
         return chosen
 

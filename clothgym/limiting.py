@@ -195,14 +195,14 @@ def no_measure(x, topology, report):
 
 
 @cache
-def kernels_of(limits: bool, by_particle: bool) -> dict[str, Any]:
+def kernels_of(limits: bool, layout: str) -> dict[str, Any]:
     """The limiter's kernels, under the names that the main loop uses.
 
-    limits: whether there is a limit.  by_particle: whether the particles of one grid are adjacent in memory.
+    limits: whether there is a limit.  layout: see ``layout.Layout``.
     """
     if not limits:
         return {"limit_strain": no_limit, "measure_strain": no_measure}
-    largest, which = (_largest_on_grid, "on_grid") if by_particle else (_largest_in_lanes, "in_lanes")
+    largest, which = (_largest_on_grid, "on_grid") if layout == "grid" else (_largest_in_lanes, "in_lanes")
     return {
         "limit_strain": specialize(_limit_strain, f"limit_strain_{which}", apart=True, largest_strain=largest),
         "measure_strain": specialize(_measure_strain, f"measure_strain_{which}", apart=True, largest_strain=largest),

@@ -158,15 +158,12 @@ class MainLoop:
 
 
 @cache
-def compiled(
-    substep: Any, name: str, model: Bending, by_particle: bool, limits: bool, collides: bool, contact: str
-) -> tuple[Any, Any]:
+def compiled(substep: Any, name: str, model: Bending, layout: str, limits: bool, collides: bool, contact: str) -> tuple[Any, Any]:
     """``advance`` around an integrator's substep: with the forces of a bending model and a layout, with a limiter or none, with
     contact of the sheet with itself or none, and with contact with solids (see ``sheet_contact.needed``); and its
     ``scratch_for_block``."""
-    forces, layout = kernels_of(model, by_particle), "particles" if by_particle else "lanes"
-    touching, itself = contact_kernels(contact, by_particle), self_contact_kernels(collides, by_particle)
-    parts = limiting.kernels_of(limits, by_particle) | callees_of(advance, forces | touching | itself)
+    forces, touching, itself = kernels_of(model, layout), contact_kernels(contact, layout), self_contact_kernels(collides, layout)
+    parts = limiting.kernels_of(limits, layout) | callees_of(advance, forces | touching | itself)
     parts["substep"] = specialize(substep, f"{name}_{model.name}_{layout}", apart=True, **callees_of(substep, forces))
     which = f"{name}_{model.name}_{layout}_{limits}_{collides}_{contact}"
     scratch = specialize(scratch_for_block, f"scratch_for_block_{layout}", **callees_of(scratch_for_block, touching | itself))

@@ -123,9 +123,8 @@ class Simulation:
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
-        # how the batch lies in memory: where the springs' order does not matter, the particles of a grid lie side by side
-        by_particle = is_regular(mesh) and self.integrator.any_order
-        self.layout = Layout.choose(self.num_envs, self.threads, by_particle)
+        # how the batch lies in memory
+        self.layout = Layout.choose(self.num_envs, self.threads, self.integrator.any_order, is_regular(mesh))
         # what holds the sheet
         if not isinstance(anchors, Sequence | np.ndarray) or (isinstance(anchors, np.ndarray) and not anchors.ndim):
             raise ValueError(f"anchors={shown(anchors)}: must be a sequence of particles, or of patches of them; () for none")
@@ -145,7 +144,7 @@ class Simulation:
         self._exact_elements = element_arrays(mesh, np.dtype(np.float64), self.bending.hinged, any_order=False)
         own = f"{self._contact.options} {self._contact.thickness}"
         self._surface, self._sheet = surface_arrays(mesh, self.dtype), digest_of(mesh, self.bending.hinged, own)
-        self._topology = topology_of(mesh, self._elements, self._surface, self.bending.name, by_particle)
+        self._topology = topology_of(mesh, self._elements, self._surface, self.bending.name, self.layout.kind == "grid")
         # a state at rest, with masses and stiffness of the material
         self._parameters: NDArray
         self._plan: tuple[NDArray, ...] = ()
@@ -176,7 +175,7 @@ class Simulation:
     def _compile(self, collides: bool) -> None:
         """Compose the main loop from the kernels of the present options; collides: whether the sheet collides with itself."""
         touched, method, dtype = needed(self.contact, self._solids.shapes.kinds), self.integrator, self.dtype.name
-        parts = self.bending, self.layout.by_particle, self.strain_limit is not None, collides, touched
+        parts = self.bending, self.layout.kind, self.strain_limit is not None, collides, touched
         self._advance = MainLoop(*compiled(method.substep, method.name, *parts))
         # on a cold start another process compiles everything except self-contact, which takes about as long
         if collides and method == integrators.INTEGRATORS.get(method.name) and not _jit.is_kept(self._advance.kernel):
@@ -255,7 +254,7 @@ class Simulation:
         method, h = self.integrator, self.time_step / self.substeps
         if method.prepare is not None:
             holdable = np.arange(self.mesh.num_particles) if len(self.grippers) else self._attachments.members
-            plan = method.prepare(Preparation(self._oscillators(0), h, holdable, self.layout.by_particle))
+            plan = method.prepare(Preparation(self._oscillators(0), h, holdable, self.layout.kind == "grid"))
             self._plan = tuple(part.astype(self.dtype) if part.dtype.kind == "f" else part.astype(np.int64) for part in plan)
         # a share of a substep more, or rounding would make three of them two
         look_every, air_every = (

@@ -27,7 +27,8 @@ def check(task: Task) -> None:
     if task.settling == "at_once" and not task.simulation.layout.by_particle:
         raise ValueError(
             f"settling='at_once': with {task.simulation.integrator.name} on this sheet environments advance together; take "
-            "settling='steps', or a grid and an integrator in which the order of the springs does not matter"
+            "settling='steps', or a grid, or less than 16 environments, with an integrator in which the order of the springs does "
+            "not matter"
         )
 
 

@@ -29,6 +29,7 @@ FLOORS = {
     "clothgym.bending": 3,
     "clothgym.forces": 3,
     "clothgym.grid_forces": 3,
+    "clothgym.sheet_forces": 3,
     "clothgym.integrators": 4,
     "clothgym.collisions": 4,
     "clothgym.attachments": 4,

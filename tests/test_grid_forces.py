@@ -172,9 +172,8 @@ def test_only_regular_grids_go_by_kinds():
     mesh = grid(5, 5, 0.4, 0.4)
     longer = mesh.springs._replace(rest_length=mesh.springs.rest_length * np.where(np.arange(len(mesh.springs.kind)) == 3, 1.1, 1))
     assert is_regular(mesh) and not is_regular(disc(0.2, 3)) and not is_regular(replace(mesh, springs=longer))
-    assert Simulation(mesh).layout.by_particle
-    assert not Simulation(replace(mesh, springs=longer)).layout.by_particle
-    assert not Simulation(mesh, integrator="xpbd").layout.by_particle
+    meshes = mesh, replace(mesh, springs=longer)
+    assert [Simulation(m).layout.kind for m in meshes] == ["grid", "sheet"]
 
 
 @pytest.mark.parametrize("bending", BENDING)

@@ -20,9 +20,9 @@ def limited(mesh, x, v, w, limit=LIMIT):
     x, v, w = x.T[:, :, None].copy(), v.T[:, :, None].copy(), np.asarray(w, float)[:, None]
     real = np.dtype(np.float64)
     elements = element_arrays(mesh, real, hinged=False, any_order=False)
-    topology = topology_of(mesh, elements, surface_arrays(mesh, real), "springs", by_particle=False)
+    topology = topology_of(mesh, elements, surface_arrays(mesh, real), "springs", regular=False)
     report = np.zeros((3, 1))
-    kernels_of(True, False)["limit_strain"](x, v, w, topology, limit, report)
+    kernels_of(True, "lanes")["limit_strain"](x, v, w, topology, limit, report)
     return x[:, :, 0].T, v[:, :, 0].T, report[:, 0]
 
 

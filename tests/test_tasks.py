@@ -361,8 +361,8 @@ def test_a_task_without_a_page_gets_a_generated_one():
 
 
 def test_block_and_lane_of_environments():
-    layout = Layout.choose(300, 2, False)
+    layout = Layout.choose(300, 2, any_order=False, regular=True)
     marked = layout.to_blocks(np.arange(300.0)[:, None], np.dtype(np.float64))
     block, lane = layout.at(np.array([0, 7, 150, 299]))
     assert marked[block, 0, lane].tolist() == [0, 7, 150, 299] and layout.blocks > 1
-    assert tuple(map(int, Layout.choose(5, 1, True).at(3))) == (3, 0)
+    assert tuple(map(int, Layout.choose(5, 1, any_order=True, regular=True).at(3))) == (3, 0)

@@ -63,13 +63,13 @@ class Preparation(NamedTuple):
     """What ``Integrator.prepare`` receives.
 
     oscillators: the properties of one environment.  h: the substep [s].  holdable: particles that may be held, (holdable,).
-    by_particle: whether the particles of one sheet, not the lanes, are adjacent in memory.
+    regular: whether the sheet is a regular grid with its particles adjacent in memory.
     """
 
     oscillators: Oscillators
     h: float
     holdable: NDArray
-    by_particle: bool
+    regular: bool
 
 
 @dataclass(frozen=True)

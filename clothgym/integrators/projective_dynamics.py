@@ -78,7 +78,7 @@ def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
     from scipy.sparse.linalg import splu
 
     # A: springs, the quadratic bending model, and masses
-    o, h, holdable, by_particle = preparation
+    o, h, holdable, regular = preparation
     springs, bends = o.elements
     n = len(o.positions)
     scale = h * h + h * o.damping_time
@@ -101,7 +101,7 @@ def prepare(preparation: Preparation) -> tuple[NDArray, ...]:
     slot[holdable] = np.arange(len(holdable))
     held = factors.solve(unit).T.copy()
     # the factors as a band
-    if by_particle:
+    if regular:
         none = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
         below, before, diagonal = _bands(matrix)
         return below, before, none[0], *none, *none, 1 / diagonal, slot, held

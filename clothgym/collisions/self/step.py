@@ -216,18 +216,19 @@ def scratch_for_sheet(x, sheet):
     return scratch_for_queries(sheet.pairs, sheet.memory.impulses[0, 0])
 
 
-def kernels_of(collides: bool, by_particle: bool) -> dict[str, Any]:
-    """What the main loop calls by these names, with self-collision or without, where a block is one sheet or has many lanes."""
+def kernels_of(collides: bool, layout: str) -> dict[str, Any]:
+    """What the main loop calls by these names, with self-collision or without, for a layout (see ``layout.Layout``)."""
     if not collides:
         return {
             "warm_start": warm_start_nothing,
             "solve_self_contact": solve_nothing,
             "scratch_for_self_contact": scratch_for_nothing,
         }
-    layout = "particles" if by_particle else "lanes"
+    by_particle = layout != "lanes"
+    which = "particles" if by_particle else "lanes"
     parts = {
-        "correct": specialize(uncounted(solve_impulses), f"repel_{layout}", sweep=sweep_sheet if by_particle else sweep_lane),
+        "correct": specialize(uncounted(solve_impulses), f"repel_{which}", sweep=sweep_sheet if by_particle else sweep_lane),
         "find_outside": find_outside_of_sheet if by_particle else find_outside_in_lanes,
     }
-    kept = specialize(solve_self_contact, f"solve_self_contact_{layout}", inline=True, **parts)
+    kept = specialize(solve_self_contact, f"solve_self_contact_{which}", inline=True, **parts)
     return {"warm_start": warm_start, "solve_self_contact": kept, "scratch_for_self_contact": scratch_for_sheet}

@@ -225,18 +225,18 @@ def no_scratch(x, triangles, shapes):
     return (np.empty(0, x.dtype),)
 
 
-def kernels_of(contact: str, by_particle: bool) -> dict[str, Any]:
+def kernels_of(contact: str, layout: str) -> dict[str, Any]:
     """Kernels of contact, by the names under which the main loop calls them.
 
-    contact: "sheet", with its "particles" alone, or with "nothing".  by_particle: whether a block is one sheet.
+    contact: "sheet", with its "particles" alone, or with "nothing".  layout: see ``layout.Layout``.
     """
     if contact == "nothing":
         return {"resolve": resolve_nothing, "scratch_for_contact": no_scratch}
-    where = _resolve_where_it_lies if by_particle else _resolve_lanes
-    which = f"{contact}_{'particles' if by_particle else 'lanes'}"
+    where = _resolve_lanes if layout == "lanes" else _resolve_where_it_lies
+    which = f"{contact}_{layout}"
     one: Any = _resolve_particles_alone
     if contact == "sheet":
-        choose = {"choose_near": choose_by_cells if by_particle else choose_one_by_one}
+        choose = {"choose_near": choose_by_cells if layout == "grid" else choose_one_by_one}
         one = specialize(
             uncounted(_resolve_sheet), f"resolve_{which}_one", search=specialize(uncounted(find_touches), f"find_{which}", **choose)
         )
