@@ -23,8 +23,8 @@ def _read(x, members, rows):
 
     x: (3, particles).  members: (elements, M).  rows: (3 M, elements).
     """
-    for e in range(members.shape[0]):
-        for m in range(members.shape[1]):
+    for m in range(members.shape[1]):
+        for e in range(members.shape[0]):
             p = np.uint32(members[e, m])
             rows[3 * m, e], rows[3 * m + 1, e], rows[3 * m + 2, e] = x[0, p], x[1, p], x[2, p]
 
@@ -84,13 +84,15 @@ def set_sheet_forces(x, v, start, f, elements, elastic, scratch):
 
 @disjoint
 def _subtract(rows, members, f):
-    """Subtract the forces on the members of each element, laid out as by ``_read``, from f, (3, particles)."""
+    """Subtract the forces on the four members of each hinge, laid out as by ``_read``, from f, (3, particles)."""
     for e in range(members.shape[0]):
-        for m in range(members.shape[1]):
-            p = np.uint32(members[e, m])
-            f[0, p] -= rows[3 * m, e]
-            f[1, p] -= rows[3 * m + 1, e]
-            f[2, p] -= rows[3 * m + 2, e]
+        i, j = np.uint32(members[e, 0]), np.uint32(members[e, 1])
+        k, l = np.uint32(members[e, 2]), np.uint32(members[e, 3])
+        for c in range(3):
+            f[c, i] -= rows[c, e]
+            f[c, j] -= rows[3 + c, e]
+            f[c, k] -= rows[6 + c, e]
+            f[c, l] -= rows[9 + c, e]
 
 
 @disjoint
