@@ -59,7 +59,7 @@ html_theme_options: dict[str, Any] = {
 # pages of the site that are files of the root; in docs/ a line stands in their place
 OF_THE_ROOT = {"about/changelog": "CHANGELOG.md", "about/contributing": "CONTRIBUTING.md"}
 DEMO = HERE / "demo" / "index.html"
-LINK_TO_DEMO = '<a class="demo" href="demo/index.html">See it move: episodes in your browser</a>'
+LINK_TO_DEMO = '<a class="demo" href="demo/index.html">Take hold of a sheet, in your browser</a>'
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:

@@ -1,14 +1,14 @@
 "use strict";
 // What is drawn: the sheet as a smooth surface through its particles, and solids as boxes swept by a ball.
 
-const REFINED = 4; // drawn cells along the side of a cell of the simulation
+const REFINED = 4, COARSELY = 2, FINE_SHEET = 25; // drawn cells along the side of a cell, and of one of a sheet with more particles a side
 const LIFT = 0.004, DEEPEST = 0.03; // cloth that deep in a solid is drawn above it, at that height [m]
 
 // A grid of particles, drawn as a bicubic surface; its corners go on straight beyond the border.
 class Sheet {
   constructor(episode) {
-    const [rows, cols] = episode.shape;
-    Object.assign(this, { episode, rows, cols, fineRows: (rows - 1) * REFINED + 1, fineCols: (cols - 1) * REFINED + 1 });
+    const [rows, cols] = episode.shape, refined = rows > FINE_SHEET ? COARSELY : refined;
+    Object.assign(this, { episode, rows, cols, refined, fineRows: (rows - 1) * refined + 1, fineCols: (cols - 1) * refined + 1 });
     const count = this.fineRows * this.fineCols;
     this.positions = new Float32Array(3 * count);
     this.normals = new Float32Array(3 * count);
@@ -19,21 +19,21 @@ class Sheet {
     const spacing = [episode.side / (cols - 1), episode.side / (rows - 1)];
     for (let row = 0, v = 0; row < this.fineRows; row++) {
       for (let col = 0; col < this.fineCols; col++, v++) {
-        this.uv[2 * v] = (col / REFINED) * spacing[0];
-        this.uv[2 * v + 1] = (row / REFINED) * spacing[1];
+        this.uv[2 * v] = (col / refined) * spacing[0];
+        this.uv[2 * v + 1] = (row / refined) * spacing[1];
       }
     }
     this.holes = new Set(episode.holes);
     this.triangles = this.#triangles();
     this.springs = this.#springs(spacing);
-    this.weights = Array.from({ length: REFINED }, (_, k) => catmullRom(k / REFINED));
+    this.weights = Array.from({ length: refined }, (_, k) => catmullRom(k / refined));
   }
 
   #triangles() {
     const triangles = [];
     for (let row = 0; row < this.fineRows - 1; row++) {
       for (let col = 0; col < this.fineCols - 1; col++) {
-        if (this.holes.has(Math.floor(row / REFINED) * (this.cols - 1) + Math.floor(col / REFINED))) continue;
+        if (this.holes.has(Math.floor(row / this.refined) * (this.cols - 1) + Math.floor(col / this.refined))) continue;
         const a = row * this.fineCols + col, c = a + this.fineCols;
         triangles.push(a, a + 1, c + 1, a, c + 1, c);
       }
@@ -58,7 +58,7 @@ class Sheet {
 
   // x: positions of all points of the episode [m]; solids: those that the cloth rests on, with their centers.
   place(x, solids) {
-    const { rows, cols, fineRows, fineCols } = this;
+    const { rows, cols, refined, fineRows, fineCols } = this;
     this.#measure(x);
     // along the rows, then along the columns; the fourth number is the strain
     const coarse = (row, col, c) => (c < 3 ? x[3 * (row * cols + col) + c] : this.own[row * cols + col]);
@@ -67,8 +67,8 @@ class Sheet {
       for (let c = 0; c < 4; c++) {
         const at = (col) => coarse(row, col, c);
         for (let col = 0; col < fineCols; col++) {
-          const cell = Math.min(Math.floor(col / REFINED), cols - 2), k = col - REFINED * cell;
-          const [p, q, r, s] = k < REFINED ? this.weights[k] : [0, 0, 1, 0];
+          const cell = Math.min(Math.floor(col / refined), cols - 2), k = col - refined * cell;
+          const [p, q, r, s] = k < refined ? this.weights[k] : [0, 0, 1, 0];
           this.between[4 * (row * fineCols + col) + c] =
             p * beyond(cell - 1, cols, at) + q * at(cell) + r * at(cell + 1) + s * beyond(cell + 2, cols, at);
         }
@@ -78,8 +78,8 @@ class Sheet {
       for (let c = 0; c < 4; c++) {
         const at = (row) => this.between[4 * (row * fineCols + col) + c];
         for (let row = 0; row < fineRows; row++) {
-          const cell = Math.min(Math.floor(row / REFINED), rows - 2), k = row - REFINED * cell;
-          const [p, q, r, s] = k < REFINED ? this.weights[k] : [0, 0, 1, 0];
+          const cell = Math.min(Math.floor(row / refined), rows - 2), k = row - refined * cell;
+          const [p, q, r, s] = k < refined ? this.weights[k] : [0, 0, 1, 0];
           const value = p * beyond(cell - 1, rows, at) + q * at(cell) + r * at(cell + 1) + s * beyond(cell + 2, rows, at);
           const v = row * fineCols + col;
           if (c < 3) this.positions[3 * v + c] = value;

@@ -47,12 +47,13 @@ class Page {
     Object.assign(this, { time: 0, playing: true, waited: 0, stale: true, before: 0, usual: 0, share: 1 });
     const heat = `linear-gradient(90deg, ${HEAT.map((color) => `rgb(${color})`)})`;
     $("#scale").style.background = $("#legend div").style.background = heat;
-    for (const { name, title } of EPISODES) {
+    for (const { name, title } of [{ name: "hand", title: "Hold a sheet" }, ...EPISODES]) {
       const chip = document.createElement("button");
       Object.assign(chip, { textContent: title, onclick: () => this.open(name) });
       chip.dataset.name = name;
       $(".chips").append(chip);
     }
+    this.#tools();
     $("#play").onclick = () => this.toggle();
     $("#color").onclick = () => this.colorByStrain(!this.viewer.strained);
     $("#scrubber input").oninput = (event) => this.seek(Number(event.target.value) * this.episode.duration);
@@ -66,7 +67,7 @@ class Page {
 
   #named() {
     const wanted = decodeURIComponent(location.hash.slice(1));
-    return EPISODES.some(({ name }) => name === wanted) ? wanted : EPISODES[0].name;
+    return EPISODES.some(({ name }) => name === wanted) ? wanted : "hand";
   }
 
   async open(name) {
@@ -77,6 +78,8 @@ class Page {
       if (chip.dataset.name === name) chip.parentNode.scrollLeft = chip.offsetLeft - chip.parentNode.offsetLeft - 40;
     }
     history.replaceState(null, "", `#${name}`);
+    document.body.classList.toggle("live", name === "hand");
+    if (name === "hand") return this.#show((this.hand ??= new Hand()));
     try {
       if (!this.loaded.has(name)) this.loaded.set(name, loadEpisode(name));
       const episode = await this.loaded.get(name);
@@ -92,14 +95,49 @@ class Page {
     this.viewer.show(episode);
     this.orbit.take(episode.camera, this.viewer.stage);
     this.slopes = this.viewer.slopes(this.orbit.camera);
-    $("#title").textContent = EPISODES.find(({ name }) => name === this.name).title;
+    $("#title").textContent = [episode, ...EPISODES].find(({ name }) => name === this.name).title;
     $("#goal").textContent = episode.goal;
     $("#most").textContent = `${100 * episode.strain_shown} %`;
+    if (episode === this.hand) {
+      this.time = 0;
+      this.viewer.place(0);
+      this.play(true);
+      return;
+    }
     const most = Math.max(...episode.strain, 1e-6), last = episode.frames - 1;
     const curve = episode.strain.map((value, k) => `L${k / last} ${1 - 0.06 - (0.8 * Math.max(value, 0)) / most}`).join("");
     document.querySelectorAll("#scrubber path").forEach((path) => path.setAttribute("d", `M0 1${curve}L1 1z`));
     this.seek(0);
     this.play(true);
+  }
+
+  // Buttons of the sheet that is held: its start, its fabric, and switches.
+  #tools() {
+    const change = (name, value) => {
+      this.hand.set(name, value);
+      if (name === "start" || name === "fabric") this.#show(this.hand);
+    };
+    for (const button of $("#tools").querySelectorAll("button")) {
+      const { start, flag } = button.dataset;
+      button.onclick = () => change(start ? "start" : flag, start ?? !this.hand[flag]);
+    }
+    for (const [name, { title }] of Object.entries(SHEETS.fabrics)) $("#fabric").append(new Option(title, name));
+    $("#fabric").onchange = (event) => change("fabric", event.target.value);
+  }
+
+  // A moment of the sheet that is held.
+  #hold(seconds) {
+    const { hand } = this;
+    hand.advance(seconds);
+    if (hand.burst <= 0) this.viewer.place(0);
+    if (hand.burst <= 0) $("#strain b").textContent = percent(hand.strain);
+    for (const button of $("#tools").querySelectorAll("[data-flag]")) button.setAttribute("aria-pressed", hand[button.dataset.flag]);
+    $("#verdict").classList.toggle("told", hand.burst > 0);
+    if (hand.burst > 0) {
+      $("#verdict").classList.add("failed");
+      $("#verdict").innerHTML = "<b>It has burst</b><span>Explicit Euler gains energy in each step. Semi-implicit Euler does not: it begins again.</span>";
+    }
+    this.stale = true;
   }
 
   play(on) {
@@ -155,7 +193,8 @@ class Page {
     this.before = now;
     this.usual += 0.1 * (seconds - this.usual);
     if (this.usual > SLOW && this.share > COARSEST) Object.assign(this, { usual: 0, share: 0.8 * this.share });
-    if (this.episode && this.playing) {
+    if (this.episode && this.episode === this.hand) this.#hold(seconds);
+    else if (this.episode && this.playing) {
       if (this.time < this.episode.duration) this.seek(this.time + seconds);
       else if ((this.waited += seconds) > PAUSE_AT_END) this.seek(0);
     }
@@ -181,7 +220,7 @@ class Page {
 
   #key(event) {
     const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    if (!this.episode || event.target.matches("button, input")) return;
+    if (!this.episode || this.episode === this.hand || event.target.matches("button, input, select")) return;
     if (event.key === " ") this.toggle();
     else if (step) {
       this.play(false);
@@ -192,17 +231,26 @@ class Page {
 
   #pointers(stage) {
     const fingers = new Map(); // by id, where each is
+    const size = () => [stage.clientWidth, stage.clientHeight];
+    const place = (event) => [(2 * event.clientX) / stage.clientWidth - 1, 1 - (2 * event.clientY) / stage.clientHeight];
+    const isLive = () => this.episode && this.episode === this.hand;
+    let holder = null; // the finger that holds the sheet
     const spread = () => {
       const [a, b] = [...fingers.values()];
       return Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
     };
     stage.onpointerdown = (event) => {
       stage.setPointerCapture(event.pointerId);
+      if (isLive() && holder === null && fingers.size === 0 && this.hand.grab(this.viewer, place(event), size())) {
+        holder = event.pointerId;
+        return;
+      }
       fingers.set(event.pointerId, [event.clientX, event.clientY, event.timeStamp]);
       this.orbit.speed = [0, 0];
       this.held = true;
     };
     stage.onpointermove = (event) => {
+      if (event.pointerId === holder && this.hand.held) return this.hand.drag(this.viewer, place(event));
       const before = fingers.get(event.pointerId);
       if (!before) return;
       const apart = fingers.size > 1 ? spread() : 0;
@@ -217,6 +265,11 @@ class Page {
       this.stale = true;
     };
     stage.onpointerup = stage.onpointercancel = (event) => {
+      if (event.pointerId === holder) {
+        holder = null;
+        if (this.hand.held) this.hand.letGo(this.hand.pinning !== this.hand.held.pinned);
+        return;
+      }
       const before = fingers.get(event.pointerId);
       fingers.delete(event.pointerId);
       this.held = fingers.size > 0;

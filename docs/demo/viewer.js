@@ -143,7 +143,7 @@ class Viewer {
   // camera: eye and target [m]; slopes: what has to be in sight, see slopes(); free: where, from the lower to the upper edge of the
   // part of the picture that nothing covers, as shares of its height.
   draw(camera, slopes, free) {
-    const { gl, canvas } = this, { toScreen, toWorld } = this.#seen(camera, slopes, free);
+    const { gl, canvas } = this, { toScreen, toWorld } = Object.assign(this, this.#seen(camera, slopes, free));
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(1.5, 2);
     this.#cast(this.shadow, this.fromLamp);
@@ -195,6 +195,15 @@ class Viewer {
       use(gl, this.shadowing, { offset: center });
       render(gl, parts);
     }
+  }
+
+  // Where a point [m] is in the picture, across and up from -1 to 1, and its depth; and the other way round.
+  toPicture(point) {
+    return through(this.toScreen, point);
+  }
+
+  fromPicture(place) {
+    return through(this.toWorld, place);
   }
 
   #seen({ eye, target }, [wide, high], [bottom, top]) {
@@ -292,6 +301,11 @@ const minus = (a, b) => a.map((value, k) => value - b[k]);
 const dot = (a, b) => a.reduce((sum, value, k) => sum + value * b[k], 0);
 const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 const unit = (a) => a.map((value) => value / Math.hypot(...a));
+
+function through(m, [x, y, z]) {
+  const [a, b, c, d] = [0, 1, 2, 3].map((k) => m[k] * x + m[4 + k] * y + m[8 + k] * z + m[12 + k]);
+  return [a / d, b / d, c / d];
+}
 
 function multiply(a, b) {
   return Array.from({ length: 16 }, (_, k) => [0, 1, 2, 3].reduce((sum, j) => sum + a[4 * j + (k % 4)] * b[4 * (k >> 2) + j], 0));

@@ -1,0 +1,138 @@
+"use strict";
+// A sheet to play with: it moves by itself, see cloth.js, and is drawn as an episode of a single moment that changes.
+
+const PINNED_AT = 0.125, HELD_UP = 1.25, SWUNG_OUT = 0.12; // of pins from the corners, in sides; height of the upper hem [m], and its start
+const BALL = { center: [0, 0, 0.35], radius: 0.22 }, DROPPED_FROM = 0.85; // [m]
+const WIND = [0, 3.5, 0.4], GUSTS = 2.5; // [m/s], and the time of one [s]
+const HEAVY = 9.81; // [m/s^2]
+const CATCH = 44; // how near a particle a finger takes hold of it, in pixels
+const MOST_STEPS = 3; // in a frame: what is slower than that runs in slow motion
+const SLOW_STEPS = 2; // substeps in a frame of explicit Euler, whose end would be over in one otherwise
+const SHOWN = { hang: [[-0.55, -0.4, 0], [0.55, 0.4, 1.3]], drop: [[-0.45, -0.45, 0], [0.45, 0.45, 0.9]] }; // what the picture has to show [m]
+const AGAIN_AFTER = 2.5; // a burst [s]
+
+class Hand {
+  constructor() {
+    Object.assign(this, { start: "hang", fabric: Object.keys(SHEETS.fabrics)[0], windy: false, heavy: true, explicit: false, held: null, left: 0 });
+    Object.assign(this, { name: "hand", title: "Hold a sheet", frames: 1, time_step: 1 / 60, duration: Infinity, holes: [], strain_shown: 0.1 });
+    this.goal = "Take hold of it, pull, throw. Each step has the bits of the core, computed in your browser.";
+    this.camera = { eye: [1.3, -2.2, 1.25], target: [0, 0, 0.6] };
+    this.again();
+  }
+
+  // Begin again, with the fabric, the start and the switches as they are now.
+  again() {
+    const data = { ...SHEETS.common, ...SHEETS.fabrics[this.fabric] }, { rows, cols, solids } = data, ball = this.start === "drop";
+    const cloth = new Cloth({ ...data, solids: ball ? solids : solids.filter(({ plane }) => plane) });
+    Object.assign(this, { cloth, held: null, burst: 0, left: 0, shape: [rows, cols], side: data.side, points: rows * cols + Number(ball) });
+    const x = new Float32Array(3 * cloth.n);
+    for (let p = 0; p < cloth.n; p++) {
+      // upright and swung out by a little, or flat above the ball
+      const across = data.side * ((p % cols) / (cols - 1) - 0.5), along = data.side * (Math.floor(p / cols) / (rows - 1) - 0.5);
+      const below = data.side / 2 - along;
+      x.set(ball ? [across, along, DROPPED_FROM] : [across, SWUNG_OUT * below, HELD_UP - below], 3 * p);
+    }
+    cloth.place(x);
+    if (!ball) {
+      const top = (rows - 1) * cols, inset = Math.round(PINNED_AT * (cols - 1));
+      for (const p of [top + inset, top + cols - 1 - inset]) cloth.pin(p, this.#at(p));
+    }
+    this.solids = ball ? [{ kind: "sphere", holds: true, axes: [1, 0, 0, 0, 1, 0, 0, 0, 1], half: [0, 0, 0], radius: BALL.radius, color: [176, 176, 180], shown: [0, 1] }] : [];
+    // after this moment come the corners of what the picture has to show
+    this.positions = new Float32Array(3 * 3 * this.points);
+    this.#write();
+    for (let p = 0; p < this.points; p++) {
+      SHOWN[this.start].forEach((corner, k) => this.positions.set(corner, 3 * ((k + 1) * this.points + p)));
+    }
+    this.#switch();
+  }
+
+  #switch() {
+    const { time_step, substeps, h } = { ...SHEETS.common, ...SHEETS.fabrics[this.fabric] };
+    const steps = this.explicit ? SLOW_STEPS : substeps, lasting = this.explicit ? SLOW_STEPS * h : time_step;
+    Object.assign(this.cloth, { gravity: [0, 0, this.heavy ? -HEAVY : 0], explicit: this.explicit, substeps: steps, time_step: lasting });
+  }
+
+  set(name, value) {
+    this[name] = value;
+    if (name === "start" || name === "fabric") this.again();
+    else this.#switch();
+  }
+
+  #at(p) {
+    return this.cloth.x.map((row) => row[p]);
+  }
+
+  #write() {
+    const { cloth, positions } = this;
+    for (let c = 0; c < 3; c++) {
+      for (let p = 0; p < cloth.n; p++) positions[3 * p + c] = cloth.x[c][p];
+    }
+    if (this.points > cloth.n) positions.set(BALL.center, 3 * cloth.n);
+  }
+
+  // Take as many steps as have passed.  Returns what there is to tell.
+  advance(seconds) {
+    if (this.burst > 0) {
+      this.burst -= seconds;
+      if (this.burst <= 0) {
+        this.explicit = false;
+        this.again();
+      }
+      return;
+    }
+    this.left = Math.min(this.left + seconds, MOST_STEPS * this.time_step);
+    for (; this.left >= this.time_step; this.left -= this.time_step) {
+      const gust = this.windy ? 0.6 + 0.4 * Math.sin((2 * Math.PI * this.cloth.time) / GUSTS) : 0;
+      this.cloth.wind = WIND.map((value) => value * gust);
+      this.cloth.step();
+    }
+    const most = Math.max(...this.cloth.x.map((row) => row.reduce((a, b) => Math.max(a, Math.abs(b)), 0)));
+    if (most < 5) this.#write();
+    else this.burst = AGAIN_AFTER; // not a number is not less, either
+  }
+
+  // The largest strain of a yarn.
+  get strain() {
+    const { rows, cols, x, rest_length: rest } = this.cloth;
+    let most = 0;
+    for (let row = 0; row < rows; row++) {
+      for (let col = 0; col < cols; col++) {
+        const p = row * cols + col;
+        for (const [q, length, there] of [[p + 1, rest[0], col + 1 < cols], [p + cols, rest[1], row + 1 < rows]]) {
+          if (there) most = Math.max(most, Math.hypot(x[0][q] - x[0][p], x[1][q] - x[1][p], x[2][q] - x[2][p]) / length - 1);
+        }
+      }
+    }
+    return most;
+  }
+
+  // Take hold of the particle that is nearest to a place in the picture; size: of the picture in pixels.  Returns whether there is one.
+  grab(viewer, place, size) {
+    let nearest = CATCH, caught = -1, front = 2;
+    for (let p = 0; p < this.cloth.n; p++) {
+      const [across, up, depth] = viewer.toPicture(this.#at(p));
+      const away = Math.hypot((across - place[0]) * size[0], (up - place[1]) * size[1]) / 2;
+      // of those right below the finger the one in front
+      if (away < Math.min(nearest, CATCH / 4) || (away < nearest && nearest > CATCH / 4) || (away < CATCH / 4 && depth < front)) {
+        [nearest, caught, front] = [away, p, depth];
+      }
+    }
+    if (caught < 0) return false;
+    this.held = { p: caught, depth: viewer.toPicture(this.#at(caught))[2], pinned: this.cloth.pins.has(caught) };
+    this.cloth.pin(caught, this.#at(caught));
+    return true;
+  }
+
+  // Move what is held to a place in the picture, as far away as it was, and not below the floor.
+  drag(viewer, place) {
+    const [x, y, z] = viewer.fromPicture([...place, this.held.depth]);
+    this.cloth.pin(this.held.p, [x, y, Math.max(z, 0.01)]);
+  }
+
+  // Let go; it stays pinned where it was, or where it is put down with ``stay``.
+  letGo(stay) {
+    if (!stay) this.cloth.release(this.held.p);
+    this.held = null;
+  }
+}
