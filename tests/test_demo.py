@@ -115,6 +115,39 @@ def test_a_link_names_an_episode_and_one_that_is_missing_is_said(opened):
     said.clear()
 
 
+@pytest.mark.slow
+def test_a_finger_takes_hold_of_the_sheet_and_throws_it(opened):
+    tab, said = opened
+    tab.evaluate("page.open('hand')")
+    tab.wait_for_function("page.hand.cloth.time > 0.1")
+    said.clear()
+    # a particle between the pins, in pixels
+    place = tab.evaluate("""() => {
+        const { cloth } = page.hand;
+        const [across, up] = page.viewer.toPicture(cloth.x.map((row) => row[28 * 33 + 16]));
+        return [(0.5 + 0.5 * across) * innerWidth, (0.5 - 0.5 * up) * innerHeight];
+    }""")
+    tab.mouse.move(*place)
+    tab.mouse.down()
+    held = tab.evaluate("page.hand.held.p")
+    # within reach of the finger, on the grid of 33 x 33
+    assert max(abs(held // 33 - 28), abs(held % 33 - 16)) < 8 and tab.evaluate("page.hand.cloth.w[page.hand.held.p]") == 0
+    before = np.array(tab.evaluate("page.hand.cloth.x.map((row) => row[page.hand.held.p])"))
+    tab.mouse.move(place[0] + 60, place[1] - 20, steps=4)
+    began = tab.evaluate("page.hand.cloth.time")
+    tab.wait_for_function(f"page.hand.cloth.time > {began + 0.2}")
+    moved = np.array(tab.evaluate("page.hand.cloth.x.map((row) => row[page.hand.held.p])")) - before
+    assert np.linalg.norm(moved) > 0.05
+    tab.mouse.up()
+    assert tab.evaluate(f"[page.hand.held, page.hand.cloth.w[{held}] > 0]") == [None, True]
+    # explicit Euler bursts, which is said, and the sheet begins again
+    tab.click("text=Explicit Euler")
+    tab.wait_for_function("page.hand.burst > 0", timeout=60_000)
+    assert "It has burst" in tab.inner_text("#verdict")
+    tab.wait_for_function("!page.hand.explicit && page.hand.burst <= 0", timeout=60_000)
+    assert np.isfinite(tab.evaluate("page.hand.strain")) and said == []
+
+
 def test_files_are_small_and_complete():
     paths = {path.stem: path.stat().st_size for path in record.FOLDER.glob("*.js")}
     assert set(paths) == {*record.EPISODES, "index"}

@@ -13,7 +13,7 @@ const AGAIN_AFTER = 2.5; // a burst [s]
 
 class Hand {
   constructor() {
-    Object.assign(this, { start: "hang", fabric: Object.keys(SHEETS.fabrics)[0], windy: false, heavy: true, explicit: false, held: null, left: 0 });
+    Object.assign(this, { start: "hang", fabric: Object.keys(SHEETS.fabrics)[0], windy: false, heavy: true, pinning: false, explicit: false, held: null, left: 0 });
     Object.assign(this, { name: "hand", title: "Hold a sheet", frames: 1, time_step: 1 / 60, duration: Infinity, holes: [], strain_shown: 0.1 });
     this.goal = "Take hold of it, pull, throw. Each step has the bits of the core, computed in your browser.";
     this.camera = { eye: [1.3, -2.2, 1.25], target: [0, 0, 0.6] };
@@ -130,7 +130,7 @@ class Hand {
     this.cloth.pin(this.held.p, [x, y, Math.max(z, 0.01)]);
   }
 
-  // Let go; it stays pinned where it was, or where it is put down with ``stay``.
+  // Let go; with ``stay`` it stays where it is.
   letGo(stay) {
     if (!stay) this.cloth.release(this.held.p);
     this.held = null;

@@ -7,7 +7,7 @@ const LIFT = 0.004, DEEPEST = 0.03; // cloth that deep in a solid is drawn above
 // A grid of particles, drawn as a bicubic surface; its corners go on straight beyond the border.
 class Sheet {
   constructor(episode) {
-    const [rows, cols] = episode.shape, refined = rows > FINE_SHEET ? COARSELY : refined;
+    const [rows, cols] = episode.shape, refined = rows > FINE_SHEET ? COARSELY : REFINED;
     Object.assign(this, { episode, rows, cols, refined, fineRows: (rows - 1) * refined + 1, fineCols: (cols - 1) * refined + 1 });
     const count = this.fineRows * this.fineCols;
     this.positions = new Float32Array(3 * count);
