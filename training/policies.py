@@ -159,8 +159,8 @@ def hyperparameters_of(path: Path, env_id: str, advice: str = "") -> dict[str, A
     return dict(table[env_id])
 
 
-def parsed_kwargs(text: str) -> dict[str, Any]:
-    """Keyword arguments of an environment from JSON.
+def parsed_kwargs(text: str, flag: str = "--env-kwargs") -> dict[str, Any]:
+    """Keyword arguments, by default of an environment, from JSON.
 
     Raises:
         ValueError: the text is not JSON, or no object.
@@ -168,7 +168,7 @@ def parsed_kwargs(text: str) -> dict[str, Any]:
     try:
         kwargs = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f'--env-kwargs {text!r} is not JSON ({error}); for instance \'{{"integrator": "xpbd"}}\'') from None
+        raise ValueError(f'{flag} {text!r} is not JSON ({error}); for instance \'{{"integrator": "xpbd"}}\'') from None
     if not isinstance(kwargs, dict):
-        raise ValueError(f'--env-kwargs {text!r}: must be a JSON object, for instance \'{{"integrator": "xpbd"}}\'')
+        raise ValueError(f'{flag} {text!r}: must be a JSON object, for instance \'{{"integrator": "xpbd"}}\'')
     return kwargs
