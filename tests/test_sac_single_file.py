@@ -122,13 +122,13 @@ def test_a_buffer_draws_from_the_last_transitions(single):
 
 def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkeypatch):
     """And not by the next one's first; a termination is marked, a truncation is not."""
-    config = {"env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 10**6}
+    config = {"env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
     more = {"n_envs": 4, "normalize": False}
     for kwargs, goes_on in (({"action_repeat": 40}, False), ({"action_repeat": 40, "max_episode_steps": 1}, False)):
         run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
         made = gym.make_vec("clothgym:ClothReach-v0", num_envs=4, autoreset_mode="Disabled", action_repeat=40)
-        begun = int(np.random.SeedSequence([0, 0]).generate_state(2)[0]) % (single.HELD_OUT - 4)
-        first, _ = made.reset(seed=begun)
+        begun = np.random.default_rng(np.random.SeedSequence([0, 0])).integers(single.HELD_OUT - 4)
+        first, _ = made.reset(seed=int(begun))
         run.collect(at_random=True)
         rows = {name: part[:4] for name, part in run.replay.rows.items()}
         last, reward, terminated, *_ = made.step(rows["action"])
@@ -186,7 +186,7 @@ def test_a_run_leaves_its_story_and_the_same_bits_again(single, tmp_path, monkey
     assert one.about["env_kwargs"] == {"action_repeat": 4, "physics": "fast"} and one.about["learner"] == "sac_scratch"
     scores = json.loads((tmp_path / "one" / "evaluation.json").read_text())
     assert scores["episodes"] == scores["with_noise"]["episodes"] == 4 and scores["timesteps"] == 1600
-    assert one.about["success_rate"] == scores["success_rate"] and scores["core_seconds"] > scores["collecting_seconds"] > 0
+    assert one.about["success_rate"] == scores["success_rate"] and scores["training_seconds"] > scores["collecting_seconds"] > 0
     lines = [json.loads(line) for line in (tmp_path / "one" / "progress.jsonl").read_text().splitlines()]
     assert [line["timesteps"] for line in lines] == [800, 1600] and scores["chosen_by"] == lines[-1]["success_rate"]
     # the file acts as the net did
@@ -218,10 +218,24 @@ def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatc
     assert trained(single, monkeypatch, folder, resume=True) == 0
 
 
+def test_a_curriculum_ends_with_the_arguments_of_the_run(single, monkeypatch):
+    monkeypatch.setattr(single, "LEARNED_FROM", 10**6)
+    config = {
+        "env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 24, "env_kwargs": {"action_repeat": 2},
+        "curriculum": {"n_timesteps": 12, "env_kwargs": {"physics": "fast"}},
+        "hyperparameters": single.asdict(options(single, n_envs=4)),
+    }  # fmt: skip
+    run, seen = single.Run(config, None), []
+    for _ in run.steps():
+        seen.append((run.done, run.env.task.physics_name))
+    assert seen == [(8, "fast"), (16, "fast"), (24, "true")] and run.replay.added == 12
+    assert single.Run(config, None).env.task.physics_name == "fast"
+
+
 def test_goals_are_observed_by_the_policy(single):
     config = {
         "env": "ClothFoldGoal-v0", "seed": 0, "threads": 1, "timesteps": 100, "env_kwargs": {"physics": "fast", "action_repeat": 4},
-        "hyperparameters": single.asdict(options(single, n_envs=2)),
+        "curriculum": {}, "hyperparameters": single.asdict(options(single, n_envs=2)),
     }  # fmt: skip
     run = single.Run(config, None)
     policy = run.policy({})
@@ -249,8 +263,8 @@ def test_wrong_arguments_are_refused_as_wrong_flags_are(command, single, tmp_pat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     config = {
-        "env": "ClothReach-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "hyperparameters": {}, "num_envs": 4,
-        "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
+        "env": "ClothReach-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "hyperparameters": {},
+        "num_envs": 4, "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
     }  # fmt: skip
     files.write_json(tmp_path / "taken" / "config.json", config)
     with pytest.raises(SystemExit) as caught:

@@ -97,7 +97,7 @@ class Record:
         return line
 
 
-class Watch(BaseCallback, Record):
+class Watch(Record, BaseCallback):
     """Between rollouts: a checkpoint each minute, and every so many steps a score on held-out seeds.
 
     every: environment steps between two scores.

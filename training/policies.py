@@ -159,6 +159,20 @@ def hyperparameters_of(path: Path, env_id: str, advice: str = "") -> dict[str, A
     return dict(table[env_id])
 
 
+def check_curriculum(env_id: str, curriculum: Config) -> None:
+    """Refuse a curriculum of folding tasks that begins with sheets that pass through themselves.
+
+    Raises:
+        ValueError: says what would do.
+    """
+    kwargs = curriculum.get("env_kwargs", {})
+    if "Fold" in env_id and kwargs.get("physics") == "fast" and "self_collision" not in kwargs:
+        raise ValueError(
+            f"the curriculum of {env_id!r} begins with physics='fast', in which sheets pass through themselves: what folds there "
+            "does not fold in true physics; drop the curriculum, or add self_collision: strict to its env_kwargs"
+        )
+
+
 def parsed_kwargs(text: str, flag: str = "--env-kwargs") -> dict[str, Any]:
     """Keyword arguments, by default of an environment, from JSON.
 

@@ -29,7 +29,7 @@ KEPT = ("config.json", "evaluation.json", "progress.jsonl")
 ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "behavior cloning",
-    "bc_ppo": "behavior cloning, then PPO", "sac": "SAC, started with expert episodes",
+    "bc_ppo": "behavior cloning, then PPO", "sac_scratch": "SAC", "sac": "SAC, started with expert episodes",
     "her": "SAC with hindsight (HER), started with expert episodes",
 }  # fmt: skip
 Result = dict[str, Any]

@@ -108,6 +108,8 @@ class Args:
         path = Path(__file__).parent / "hyperparams" / f"{ALGO}.yml"
         row = policies.hyperparameters_of(path, self.env)
         kwargs = row.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs)
+        curriculum = row.pop("curriculum", {})
+        policies.check_curriculum(self.env, curriculum)
         options = row | policies.parsed_kwargs(self.options, "--options")
         if unknown := set(options) - set(Options.__dataclass_fields__):
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
@@ -117,9 +119,9 @@ class Args:
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
             raise ValueError(f"{self.folder} holds a run already: go on with --resume {self.folder}, or choose another with --run")
         self.config = {
-            "clothgym": clothgym.__version__, "env": self.env, "algo": ALGO, "clone": {}, "curriculum": {}, "env_kwargs": kwargs,
+            "clothgym": clothgym.__version__, "env": self.env, "algo": ALGO, "clone": {}, "env_kwargs": kwargs,
             "num_envs": chosen["n_envs"], "timesteps": chosen["timesteps"], "seed": self.seed, "threads": 1,
-            "hyperparameters": chosen,
+            "curriculum": curriculum, "hyperparameters": chosen,
         }  # fmt: skip
 
 
@@ -303,6 +305,7 @@ class Run:
 
     Attributes:
         done: control steps so far.  updates: of the critics so far.
+        easy: whether the environments are those of the curriculum.
         collecting: seconds in which environments stepped, and the policy acted.
         episodes: success and performance of the last training episodes, which have noise.
     """
@@ -314,16 +317,11 @@ class Run:
         self.done = 0 if state is None else int(state["num_timesteps"])
         self.updates = 0 if state is None else int(state["num_updates"])
         # all that is random comes from the seed, and one thread adds in one order: the same command again gives the same bits
-        seed, n_envs = np.random.SeedSequence([config["seed"], self.done]), self.options.n_envs
-        first, drawn = seed.generate_state(2).tolist()
+        seed = np.random.SeedSequence([config["seed"], self.done])
         torch.set_num_threads(config["threads"])
-        torch.manual_seed(drawn)
+        torch.manual_seed(int(seed.generate_state(1)[0]))
         self.rng = np.random.default_rng(seed)
-        self.env = gym.make_vec(config["env"], num_envs=n_envs, autoreset_mode="SameStep", **config["env_kwargs"]).unwrapped
-        space = self.env.single_observation_space
-        self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
-        # environment i begins with seed + i, below all held-out seeds
-        self.observation = self.flat(self.env.reset(seed=first % (HELD_OUT - n_envs))[0])
+        self.enter()
         sizes = self.observation.shape[1], *self.env.single_action_space.shape
         self.agent, self.normalizer = Agent(*sizes, self.options), Normalizer(sizes[0], self.options.normalize)
         self.replay = Replay(self.options.buffer_size, *sizes)
@@ -331,6 +329,19 @@ class Run:
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
             self.restore(state)
+
+    def enter(self) -> None:
+        """Begin episodes in new environments: those of the curriculum until its steps are done, then the run's own."""
+        config, curriculum = self.config, self.config["curriculum"]
+        self.easy = self.done < curriculum.get("n_timesteps", 0)
+        kwargs = config["env_kwargs"] | (curriculum["env_kwargs"] if self.easy else {})
+        made = gym.make_vec(config["env"], num_envs=self.options.n_envs, autoreset_mode="SameStep", **kwargs)
+        self.env: Any = made.unwrapped
+        space = self.env.single_observation_space
+        self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
+        # environment i begins with seed + i, below all held-out seeds
+        seed = int(self.rng.integers(HELD_OUT - self.options.n_envs))
+        self.observation = self.flat(self.env.reset(seed=seed)[0])
 
     def flat(self, observation: Any) -> NDArray[np.float32]:
         """An observation as one array, of goals as well."""
@@ -350,6 +361,8 @@ class Run:
                     self.updates += 1
                     self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
             yield options.n_envs * self.env.task.control_steps
+            if self.easy and self.done >= self.config["curriculum"]["n_timesteps"]:
+                self.enter()
 
     def collect(self, at_random: bool) -> None:
         """One decision of each environment, into the replay buffer."""
