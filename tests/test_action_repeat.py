@@ -76,6 +76,14 @@ def test_a_neutral_shaping_adds_the_same_to_the_discounted_returns_of_all_action
         assert t == 13 and total == pytest.approx(0.9**13 * (info["normalized_performance"] + 0.25 * info["is_success"]) - first)
 
 
+def test_lengths_of_scored_episodes_are_control_steps(scripts):
+    from policies import noop
+    from scoring import run_episodes
+
+    found = run_episodes("ClothReach-v0", noop, [1, 2, 3], progress=False, action_repeat=7, physics="fast")
+    assert found["length"].tolist() == [40, 40, 40]
+
+
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match=r"action_repeat=0: must be an integer of at least 1"):
         gym.make("clothgym:ClothReach-v0", action_repeat=0)

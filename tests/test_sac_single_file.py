@@ -2,6 +2,7 @@
 
 import copy
 import json
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -127,7 +128,7 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
     for kwargs, goes_on in (({"action_repeat": 40}, False), ({"action_repeat": 40, "max_episode_steps": 1}, False)):
         run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
         made = gym.make_vec("clothgym:ClothReach-v0", num_envs=4, autoreset_mode="Disabled", action_repeat=40)
-        begun = np.random.default_rng(np.random.SeedSequence([0, 0])).integers(single.HELD_OUT - 4)
+        begun = np.random.SeedSequence([0, 0]).generate_state(2)[0] % (single.HELD_OUT - 4)
         first, _ = made.reset(seed=int(begun))
         run.collect(at_random=True)
         rows = {name: part[:4] for name, part in run.replay.rows.items()}
@@ -140,6 +141,22 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
     run.collect(at_random=True)
     assert run.replay.rows["goes_on"][:4].tolist() == [1] * 4 and len(run.episodes) == 4
     assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
+
+
+def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
+    """The buffer is that of an environment that settles at once."""
+    config, found = {"env": "ClothDrape-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}, {}
+    for settling, steps in (("at_once", 15), ("steps", 37)):
+        kwargs = {"physics": "fast", "action_repeat": 4, "settling": settling}
+        run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, n_envs=1))}, None)
+        # it is never let go: the episode takes all of its 60 control steps, and settles for 85
+        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.full(size, -0.1))
+        for _ in range(steps):
+            run.collect(at_random=True)
+        found[settling] = {name: part[: run.replay.added] for name, part in run.replay.rows.items()}
+        assert len(run.episodes) == 1 and run.replay.added == 15
+    for name, part in found["at_once"].items():
+        assert part == pytest.approx(found["steps"][name], abs=1e-5), name
 
 
 SHORT = {"timesteps": 1600, "n_envs": 8, "updates": 2, "batch_size": 32, "net_arch": [16, 16], "buffer_size": 300}

@@ -240,8 +240,8 @@ class Normalizer:
         self.mean, self.variance, self.count, self.active = np.zeros(size), np.ones(size), 0.0, active
 
     def see(self, observation: NDArray) -> None:
-        """observation: (n_envs, numbers)."""
-        if not self.active:
+        """observation: (any, numbers)."""
+        if not self.active or not len(observation):
             return
         count, away = len(observation), observation.mean(axis=0, dtype=float) - self.mean
         total = self.count + count
@@ -306,6 +306,7 @@ class Run:
     Attributes:
         done: control steps so far.  updates: of the critics so far.
         easy: whether the environments are those of the curriculum.
+        last: each environment's last decision; settling: whether its sheet settles since then.
         collecting: seconds in which environments stepped, and the policy acted.
         episodes: success and performance of the last training episodes, which have noise.
     """
@@ -317,18 +318,22 @@ class Run:
         self.done = 0 if state is None else int(state["num_timesteps"])
         self.updates = 0 if state is None else int(state["num_updates"])
         # all that is random comes from the seed, and one thread adds in one order: the same command again gives the same bits
-        seed = np.random.SeedSequence([config["seed"], self.done])
         torch.set_num_threads(config["threads"])
-        torch.manual_seed(int(seed.generate_state(1)[0]))
-        self.rng = np.random.default_rng(seed)
+        torch.manual_seed(self.seeds()[1])
+        self.rng = np.random.default_rng([config["seed"], self.done])
         self.enter()
         sizes = self.observation.shape[1], *self.env.single_action_space.shape
         self.agent, self.normalizer = Agent(*sizes, self.options), Normalizer(sizes[0], self.options.normalize)
         self.replay = Replay(self.options.buffer_size, *sizes)
+        self.last = Replay(self.options.n_envs, *sizes).rows
         self.episodes: deque[tuple[float, float]] = deque(maxlen=200)
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
             self.restore(state)
+
+    def seeds(self) -> list[int]:
+        """Of the first environment and of torch, others after other numbers of steps."""
+        return np.random.SeedSequence([self.config["seed"], self.done]).generate_state(2).tolist()
 
     def enter(self) -> None:
         """Begin episodes in new environments: those of the curriculum until its steps are done, then the run's own."""
@@ -340,8 +345,8 @@ class Run:
         space = self.env.single_observation_space
         self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
         # environment i begins with seed + i, below all held-out seeds
-        seed = int(self.rng.integers(HELD_OUT - self.options.n_envs))
-        self.observation = self.flat(self.env.reset(seed=seed)[0])
+        self.observation = self.flat(self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))[0])
+        self.settling = np.zeros(self.options.n_envs, bool)
 
     def flat(self, observation: Any) -> NDArray[np.float32]:
         """An observation as one array, of goals as well."""
@@ -365,11 +370,15 @@ class Run:
                 self.enter()
 
     def collect(self, at_random: bool) -> None:
-        """One decision of each environment, into the replay buffer."""
+        """One decision of each environment, into the replay buffer.
+
+        While a sheet settles actions have no effect: what it earns then is of the last decision before, as with
+        ``settling="at_once"``, which not every sheet takes.
+        """
         import torch
 
-        before = self.observation
-        self.normalizer.see(before)
+        before, last, acting = self.observation, self.last, ~self.settling
+        self.normalizer.see(before[acting])
         if at_random:
             action = self.rng.uniform(-1, 1, (len(before), *self.env.single_action_space.shape)).astype(np.float32)
         else:
@@ -384,9 +393,11 @@ class Run:
                 following[i] = self.flat(info["final_obs"][i])
             final = info["final_info"]
             self.episodes.extend(zip(final["is_success"][ended].tolist(), final["normalized_performance"][ended].tolist()))
-        self.replay.add(
-            observation=before, action=action, reward=self.options.reward_scale * reward, following=following, goes_on=~terminated
-        )
+        last["observation"][acting], last["action"][acting], last["reward"][acting] = before[acting], action[acting], 0
+        last["reward"] += self.options.reward_scale * reward
+        last["following"], last["goes_on"] = following, ~terminated
+        self.settling = info["settling"]
+        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it."""
