@@ -16,7 +16,7 @@ import numpy as np
 from scoring import HELD_OUT
 
 from clothgym import files
-from clothgym.adapters.runs import POLICY
+from clothgym.adapters.runs import POLICY, read_config
 from clothgym.lab.bench import machine
 from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
 from clothgym.registration import ENVIRONMENTS
@@ -108,8 +108,6 @@ def note_policies() -> None:
 
 def controls() -> list[Result]:
     """The results of controls, and of the runs that they are compared with, with their hyperparameters."""
-    from clothgym.adapters.runs import read_config
-
     folders = [path.parent for path in sorted(CONTROLS.glob("*/evaluation.json"))]
     envs = {read_config(folder, begun=False)["env"] for folder in folders}
     folders += [folder for env_id in sorted(envs) for folder in sorted(RUNS.glob(f"{env_id}_sac_scratch_*"))]
