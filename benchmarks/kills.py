@@ -1,6 +1,7 @@
 """Training runs that are killed, or whose disk fills up, at any moment: each goes on with ``--resume``.
 
     python benchmarks/kills.py --count 100 --seed 0
+    python benchmarks/kills.py --count 20 --script sac_single_file
 
 Each run is a fork of a process that has loaded torch and the kernels.  It trains for a second or so.  It is killed by the clock, or
 by itself at the n-th step of writing files (half of the bytes written, not yet synced, not yet renamed); or from that step on the
@@ -30,11 +31,17 @@ SHORT = """
 ClothReach-v0:
   {n_envs: 4, n_timesteps: 160, policy: MlpPolicy, n_steps: 10, batch_size: 40, n_epochs: 1, policy_kwargs: {net_arch: [8]}}
 """
+OPTIONS = '{"n_envs": 4, "timesteps": 1600, "updates": 1, "batch_size": 16, "net_arch": [8], "buffer_size": 300}'
+# arguments of a new run, by script
+BEGIN = {
+    "train": ("--env", "ClothReach-v0", "--hyperparams", "short.yml"),
+    "sac_single_file": ("--env", "ClothReach-v0", "--options", OPTIONS),
+}
 STEPS_OF_WRITING = 60  # more than a run has
 SECONDS = 0.5  # in which most of a run lies, from its configuration on
 
 
-def killed_by_the_clock(rng: np.random.Generator) -> None:
+def killed_by_the_clock(rng: np.random.Generator, script: str = "train") -> None:
     """Kill a run after some time, and resume it."""
     seconds = rng.uniform(0, SECONDS)
 
@@ -45,23 +52,23 @@ def killed_by_the_clock(rng: np.random.Generator) -> None:
         time.sleep(seconds)
         os.kill(child, signal.SIGKILL)
 
-    _interrupt_and_resume(watch=watch)
+    _interrupt_and_resume(script, watch=watch)
 
 
-def killed_while_writing(rng: np.random.Generator) -> None:
+def killed_while_writing(rng: np.random.Generator, script: str = "train") -> None:
     """Kill a run at some step of writing a file, and resume it."""
     step = int(rng.integers(STEPS_OF_WRITING))
-    _interrupt_and_resume(prepare=lambda: _from_a_step_of_writing_on(step, lambda: os.kill(os.getpid(), signal.SIGKILL)))
+    _interrupt_and_resume(script, lambda: _from_a_step_of_writing_on(step, lambda: os.kill(os.getpid(), signal.SIGKILL)))
 
 
-def full_disk(rng: np.random.Generator) -> None:
+def full_disk(rng: np.random.Generator, script: str = "train") -> None:
     """Train on a disk that is full from some step of writing on, and resume when there is room."""
     step = int(rng.integers(STEPS_OF_WRITING))
 
     def full() -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    status, said, left = _interrupt_and_resume(prepare=lambda: _from_a_step_of_writing_on(step, full))
+    status, said, left = _interrupt_and_resume(script, lambda: _from_a_step_of_writing_on(step, full))
     assert status == 0 or (status == 1 and "error:" in said), f"status {status}: {said[-500:]}"
     assert "Traceback" not in said and left == [], f"left {left}: {said[-500:]}"
 
@@ -70,7 +77,7 @@ FORMS = (killed_by_the_clock, killed_while_writing, full_disk)
 
 
 def _interrupt_and_resume(
-    prepare: Callable[[], None] = lambda: None, watch: Callable[[int, Path], None] | None = None
+    script: str, prepare: Callable[[], None] = lambda: None, watch: Callable[[int, Path], None] | None = None
 ) -> tuple[int, str, list[str]]:
     """How the first run ends: its status, its output, and half-written files that it leaves.
 
@@ -86,12 +93,12 @@ def _interrupt_and_resume(
         def begin() -> None:
             os.chdir(folder)
             prepare()
-            _train("--run", str(run), "--env", "ClothReach-v0", "--hyperparams", "short.yml")
+            _train(script, "--run", str(run), *BEGIN[script])
 
         status, said = _forked(begin, (lambda child: watch(child, config)) if watch is not None else None)
         left = [path.name for path in run.rglob("*") if ".part" in path.name or path.suffix == ".new"]
         if config.exists():
-            ended, heard = _forked(lambda: _train("--resume", str(run)))
+            ended, heard = _forked(lambda: _train(script, "--resume", str(run)))
             assert ended == 0 and (run / "evaluation.json").exists(), f"resumed with status {ended}: {heard[-500:]}"
             assert "Traceback" not in heard, heard[-500:]
         return status, said, left
@@ -141,17 +148,20 @@ def _preloaded() -> Any:
     return learning
 
 
-def _train(*arguments: str) -> None:
-    """``training/train.py``, with an evaluation after each rollout and without pictures."""
+def _train(script: str, *arguments: str) -> None:
+    """A script of ``training/``, with few episodes in its evaluations and without pictures."""
     learning = _preloaded()
     import endings
+    import sac_single_file
     import train
     import tyro
 
     learning.film = learning.draw_learning_curve = lambda *ignored: None
+    sac_single_file.LEARNED_FROM = 100
+    module, work = (train, train.main) if script == "train" else (sac_single_file, sac_single_file.train)
     common = ("--evaluations", "4", "--eval-episodes", "1", "--final-episodes", "1")
     with endings.stopped():
-        train.main(tyro.cli(train.Args, args=(*arguments, *common)))
+        work(tyro.cli(module.Args, args=(*arguments, *common)))
 
 
 def _from_a_step_of_writing_on(step: int, act: Callable[[], None]) -> None:
@@ -190,11 +200,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--count", type=int, default=100, help="runs (default 100)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--script", choices=BEGIN, default="train", help="the script that is killed (default train)")
     args = parser.parse_args()
     rng = np.random.default_rng(args.seed)
     for one in range(args.count):
         form = FORMS[rng.integers(len(FORMS))]
-        form(rng)
+        form(rng, args.script)
         print(f"{one + 1} of {args.count}: {form.__name__}", flush=True)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import statistics
 import sys
 from pathlib import Path
 from typing import Any
@@ -112,7 +113,21 @@ def _facts(env_id: str) -> str:
         ("make", f'`gym.make("clothgym:{env_id}")`, `gym.make_vec("clothgym:{env_id}", num_envs=256)`'),
     ]
     env.close()
+    rows += _from_scratch(env_id)
     return "\n".join(["| | |", "| --- | --- |", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _from_scratch(env_id: str) -> list[tuple[str, str]]:
+    """How the task is learned without an expert by SAC, and the median success of the committed runs; nothing if there are none."""
+    runs = [row for row in results.learned() if row["env"] == env_id and row["learner"] == "sac_scratch"]
+    if not runs:
+        return []
+    config = results.read_config(results.RUNS / runs[0]["run"], begun=False)
+    said = {**config["env_kwargs"], **config["curriculum"].get("env_kwargs", {})}
+    recipe = ", ".join(f"`{name}={value!r}`" for name, value in said.items())
+    success = statistics.median(row["success_rate"] for row in runs)
+    command, steps = f"`python training/sac_single_file.py --env {env_id}`", f"{config['timesteps'] / 1e6:.2f} M control steps"
+    return [("learned from scratch", f"{command}: trained with {recipe}, {steps}; success {success:.3f} in true physics")]
 
 
 def _scores(env_id: str, scores: Suite) -> str:

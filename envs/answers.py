@@ -56,10 +56,23 @@ def standing(task: Task) -> Iterator[None]:
     task.info[over] = kept_info
     for name, values in kept_ends.items():
         task.outcome[name][over] = values
-    # quantities of a single step
-    task.outcome["reward"][over], task.terms[over] = 0, np.zeros((), task.terms.dtype)
-    if COST in names_of(task.info):
-        task.info[COST][over] = 0
+    for array in _of_a_step(task):
+        array[over] = 0
+
+
+@contextmanager
+def added(task: Task, envs: NDArray) -> Iterator[None]:
+    """Context of a further control step of these environments in the same step: rewards, their terms and costs are summed."""
+    before = [array[envs] for array in _of_a_step(task)]
+    yield
+    for array, value in zip(_of_a_step(task), before):
+        array[envs] += value
+
+
+def _of_a_step(task: Task) -> list[NDArray]:
+    """Quantities of a single step, live, each (num_envs,)."""
+    costs = [task.info[COST]] if COST in names_of(task.info) else []
+    return [task.outcome["reward"], *(task.terms[name] for name in names_of(task.terms)), *costs]
 
 
 def of_batch(task: Task) -> dict[str, Any]:

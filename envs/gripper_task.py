@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -20,7 +20,6 @@ from clothgym.envs.observing import POSITION_BOUND, Observation
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.rumpled import UNEVEN
 from clothgym.envs.scoring import FOLLOWED, FOLLOWED_INFO, FOLLOWED_RANGES, TIME, observe_time
-from clothgym.envs.settling import settle
 from clothgym.envs.stepping import IN_NUMPY
 from clothgym.envs.targets import FRICTION, ON_FLOOR
 from clothgym.envs.task import Task
@@ -110,28 +109,28 @@ class GripperTask(Task):
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
         if action_mode == "pick_place":
-            self.control_steps = pick_place.STEPS
+            if kwargs.get("action_repeat", 1) != 1:
+                given = f"action_repeat={shown(kwargs['action_repeat'])}"
+                raise ValueError(
+                    f"{given}: must be 1 with action_mode='pick_place', an action of which is {pick_place.STEPS} control steps"
+                )
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
         if action_mode == "pick_place":
+            self.control_steps = pick_place.STEPS
             size = pick_place.NUMBERS * self.num_attachments
             self.single_action_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)
             # tips move as fast as the grippers can
             self.rules["reach"] = self.physics.time_step * min(gripper.speed for gripper in self.physics.grippers)
         self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
 
-    def advance(self, actions: Any) -> None:
+    def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
         if self.action_mode == "velocity":
-            super().advance(actions)
-            return
-        self.check_ready()
-        actions = self._checked(actions)
+            return super().commands(actions)
         if not np.isfinite(actions).all():
             env, component = np.argwhere(~np.isfinite(actions))[0].tolist()
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
-        pick_place.perform(self, actions)
-        if self.settling == "at_once":
-            settle(self)
+        return pick_place.commands(self, actions)
 
     def expert(self) -> NDArray:
         return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
@@ -145,16 +144,6 @@ class GripperTask(Task):
         raise NotImplementedError(
             f"{type(self).__name__} has no scripted expert for action_mode='pick_place': take action_mode='velocity'"
         )
-
-    def steps_taken(self) -> NDArray:
-        taken = super().steps_taken()
-        return taken if self.action_mode == "velocity" else -(-taken // pick_place.STEPS)
-
-    def most_steps(self) -> int:
-        if self.action_mode == "velocity":
-            return super().most_steps()
-        rests = -(-self.settling_steps // pick_place.STEPS) if self.settling == "steps" else 0
-        return self.acting_steps // pick_place.STEPS + rests
 
     def _drawn(self) -> list[NDArray]:
         return [*super()._drawn(), self.gripper_starts]

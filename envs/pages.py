@@ -100,6 +100,13 @@ COMMON: dict[str, tuple[str, str]] = {
         'or ``"at_once"``: the step in which the agent is done continues until the sheet has settled and is evaluated, and returns '
         "the sum of the rewards, so that no action is ignored; for sheets without holes, see docs/actions.md",
     ),
+    "action_repeat": (
+        "1", "control steps for which an action is held; rewards and costs are summed, and ``info`` is of the last one",
+    ),
+    "gamma": (
+        "1", "or a learner's discount: a step that does not end the episode gives ``gamma Phi' - Phi`` of the potential, a neutral "
+        "shaping (Ng et al. 1999)",
+    ),
     "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
     "wind": (
         "``None``", 'the arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle',

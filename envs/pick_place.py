@@ -7,6 +7,7 @@ whose actions are ignored.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,8 +80,8 @@ def _eased(share: NDArray) -> NDArray:
     return share * share * (3 - 2 * share)
 
 
-def perform(task: Any, actions: NDArray) -> None:
-    """One action of a batch: ``STEPS`` control steps, whose rewards are added; what ended on the way keeps the info of its end.
+def commands(task: Any, actions: NDArray) -> Callable[[int], NDArray]:
+    """The velocities and fingers of each control step of an action, (num_envs, grippers x 4), as a function of the control step.
 
     task: a ``GripperTask``.  actions: (num_envs, numbers), finite.
     """
@@ -89,28 +90,10 @@ def perform(task: Any, actions: NDArray) -> None:
     tips, cloth = task.simulation.grippers.positions.astype(np.float64), task.simulation.positions.astype(np.float64)
     path = path_of(limited, tips, cloth, task.workspace * side, side)
     reach = float(task.rules["reach"][0])
-    outcome, terms, info = task.outcome.copy(), task.terms.copy(), task.info.copy()
-    begun = ~task.episode["over"]
-    for name in ("reward", "terminated", "failure"):
-        outcome[name][begun] = 0
-    terms[...] = np.zeros((), terms.dtype)
-    velocities = np.zeros((task.num_envs, grippers, 4))
-    for step in range(STEPS):
+
+    def at(step: int) -> NDArray:
         wanted, opened = wanted_at(path, step, side)
-        velocities[..., :3] = (wanted - task.episode["targets"]) / reach
-        velocities[..., 3] = np.where(opened, 1.0, -1.0)
-        running = ~task.episode["over"]
-        task.move(velocities.reshape(task.num_envs, -1))
-        for name in ("reward", "terminated", "failure"):
-            outcome[name][running] += task.outcome[name][running]
-        for name in terms.dtype.names or ():
-            terms[name][running] += task.terms[name][running]
-        info[running] = task.info[running]
-        if task.episode["over"].all():
-            break
-    # environments that were over before it give their last answer
-    outcome["reward"][~begun] = 0
-    info[~begun] = task.info[~begun]
-    for name in ("reward", "terminated", "failure"):
-        task.outcome[name] = outcome[name]
-    task.terms, task.info = terms, info
+        velocities = (wanted - task.episode["targets"]) / reach
+        return np.concatenate([velocities, np.where(opened, 1.0, -1.0)[..., None]], axis=2).reshape(task.num_envs, -1)
+
+    return at

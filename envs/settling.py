@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import one_of
+from clothgym.envs import answers
 
 if TYPE_CHECKING:
     from clothgym.envs.task import Task
@@ -42,11 +43,8 @@ def settle(task: Task) -> None:
         envs = np.flatnonzero((task.episode["settling_since"] >= 0) & ~task.episode["over"])
         if not len(envs):
             return
-        reward, terms = task.outcome["reward"][envs], task.terms[envs]
-        task.move(still, envs)
-        task.outcome["reward"][envs] += reward
-        for name in terms.dtype.names or ():
-            task.terms[name][envs] += terms[name]
+        with answers.added(task, envs):
+            task.move(still, envs)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import _jit, integrators
-from clothgym.checks import not_negative, numbers, one_of, shown
+from clothgym.checks import count, not_negative, number, numbers, one_of, shown
 from clothgym.collisions import Collider, Plane
 from clothgym.envs import answers, hooks
 from clothgym.envs.episode import Fields, TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
@@ -87,6 +87,10 @@ class Task:
         bending, strain_limit, self_collision, contact, air_density: as ``Simulation`` takes them; they override ``physics``.
         obs_mode, image_size, camera, num_points, privileged: kind of the returned observations, see ``Observer``.
         reward_mode: "delta" (change of the performance, see the task's page) or "sparse" (only the evaluation).
+        action_repeat: control steps for which an action is held; their rewards, terms of rewards and costs are summed.  An episode
+            that ends within them ends there.
+        gamma: discount of the agent's steps to which the shaping is adapted: a step that does not end the episode gives
+            ``gamma Phi' - Phi`` as the potential goes from Phi to Phi', so that no policy gains by it (Ng et al. 1999).
         randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
         settling: "steps", or "at_once": the agent's last step continues until its sheet has settled and is evaluated.
         wind: arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
@@ -94,7 +98,7 @@ class Task:
 
     Attributes:
         physics: the sheet, its fabric, its attachments, and the time integration.
-        control_steps: control steps of a step, one by default.
+        control_steps: control steps of a step.
         acting_steps: control steps after which the agent's time is up.
         settling_steps: following control steps, in which actions are ignored.
         actions_per_attachment: numbers of an action for each attachment (anchor or gripper): a velocity, and further numbers.
@@ -130,7 +134,6 @@ class Task:
     physics: ClassVar[Physics]
     acting_steps: ClassVar[int]
     settling_steps: ClassVar[int] = 0
-    control_steps: int = 1
     actions_per_attachment: ClassVar[int] = 3
     kernels: ClassVar[Kernels] = IN_NUMPY
     obs_modes: ClassVar[tuple[str, ...]] = ("keypoints", "particles", "heightmap", "pointcloud", "rgb", "depth", "rgbd")
@@ -170,6 +173,8 @@ class Task:
         privileged: bool = False,
         reward_mode: str = "delta",
         settling: str = "steps",
+        action_repeat: int = 1,
+        gamma: float = 1.0,
         randomize: Mapping[str, Sequence[float]] | None = None,
         wind: Mapping[str, Any] | None = None,
         threads: int | None = None,
@@ -177,6 +182,8 @@ class Task:
         one_of("obs_mode", obs_mode, *self.obs_modes)
         one_of("reward_mode", reward_mode, *REWARD_MODES)
         self.obs_mode, self.reward_mode, self.settling = obs_mode, reward_mode, settling
+        self.control_steps = count("action_repeat", action_repeat)
+        self.gamma = checked_gamma(gamma, reward_mode)
         self._in_numpy = self.kernels.potential is IN_NUMPY.potential
         check_definition(self, self._in_numpy)
         # the fabric, the air and how time is stepped: the task's own, or what the keywords say
@@ -533,7 +540,28 @@ class Task:
     def advance(self, actions: Any) -> None:
         """The same as a part of a longer step: whoever calls it sets ``turn.unfinished`` to nothing at the end."""
         self.check_ready()
-        self.move(self._checked(actions))
+        command = self.commands(self._checked(actions))
+        self._control_step(command(0))
+        for step in range(1, self.control_steps):
+            if self.episode["over"].all():
+                break
+            with answers.added(self, self._everyone):
+                self._control_step(command(step))
+        if self.gamma < 1:
+            # gamma Phi' - Phi, of which Phi' - Phi has been given; an episode's end has no potential but its performance
+            discount = np.where(self.episode["over"], 0, (1 - self.gamma) * self.episode["potential"])
+            self.terms["progress"] -= discount
+            self.outcome["reward"] -= discount
+
+    def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
+        """What each control step of a step is given as its action, a function of the control step: by default the same.
+
+        actions: (num_envs, numbers), float64.
+        """
+        return lambda step: actions
+
+    def _control_step(self, actions: NDArray) -> None:
+        self.move(actions)
         if self.settling == "at_once":
             settle(self)
 
@@ -573,12 +601,16 @@ class Task:
 
     def steps_taken(self) -> NDArray:
         """Calls of ``step`` since each episode's start, (num_envs,)."""
+        return -(-self.control_steps_taken() // self.control_steps)
+
+    def control_steps_taken(self) -> NDArray:
+        """Control steps since each episode's start, without those in which a sheet settles at once, (num_envs,)."""
         step, settling = self.episode["step"], self.episode["settling_since"]
         return np.where(settling >= 0, settling, step) if self.settling == "at_once" else step
 
     def most_steps(self) -> int:
         """Calls of ``step`` that an episode takes at most."""
-        return self.acting_steps + (self.settling_steps if self.settling == "steps" else 0)
+        return -(-(self.acting_steps + (self.settling_steps if self.settling == "steps" else 0)) // self.control_steps)
 
     def _checked(self, actions: Any) -> NDArray:
         """Actions as an array of the right shape, float64."""
@@ -660,6 +692,16 @@ class Task:
         self.outcome["reward"], self.terms[...] = 0, np.zeros((), self.terms.dtype)
         self.observed.begun(self._everyone)
         self.turn.unfinished = ()
+
+
+def checked_gamma(gamma: Any, reward_mode: str) -> float:
+    """A discount of rewards with the potential's change; the other modes have no such rewards."""
+    value = number("gamma", gamma)
+    if not 0 < value <= 1:
+        raise ValueError(f"gamma={shown(gamma)}: must be above 0, and at most 1")
+    if value < 1 and reward_mode != "delta":
+        raise ValueError(f"gamma={shown(gamma)}: must be 1 with reward_mode={reward_mode!r}, whose rewards have no shaping")
+    return value
 
 
 def check_definition(task: Task, in_numpy: bool) -> None:

@@ -61,13 +61,14 @@ def skip(task, env, steps):
 # --- what is shared -------------------------------------------------------------------------------------------------------
 
 PATH = {
-    Task: "reset step advance move check_ready infos info_of get_state set_state steps_taken most_steps _checked _checked_options"
+    Task: "reset step advance move check_ready infos info_of get_state set_state steps_taken most_steps control_steps_taken"
+    " commands _checked _checked_options _control_step"
     " _draw _drawn _draw_material _place_colliders _begin _score_and_observe _memory _prepare_records _compile",
     ClothEnv: "reset step render turn get_state set_state expert_action __getstate__ get_keys_to_action",
     ClothVectorEnv: "reset step render turn get_state set_state expert_actions __getstate__ call get_attr set_attr",
 }
 OVERRIDDEN = {  # macro actions; where grippers begin; rewards of goals
-    "GripperTask": {"advance", "steps_taken", "most_steps", "_drawn"},
+    "GripperTask": {"commands", "_drawn"},
     "FoldGoalTask": {"advance"},
 }
 

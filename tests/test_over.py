@@ -143,8 +143,8 @@ def test_a_success_rate_is_that_of_the_episodes(form):
     assert info["is_success"].tolist() == list(RIGHT) and info["is_success"].mean() == 0.5
     steps = np.array(ENDS) + 2
     assert info["so_far"].tolist() == steps.tolist() and info["normalized_performance"] == pytest.approx(steps / 10)
-    # sums over an episode stop with it: at once a call is one step, and costs once
-    assert cost.tolist() == ([1.0 + end - 1 for end in ENDS] if form == "at once" else steps.tolist())
+    # sums over an episode stop with it: a call that settles at once costs as much as the steps that it stands for
+    assert cost.tolist() == steps.tolist()
     assert total == pytest.approx(steps / 10 + 0.25 * np.array(RIGHT))
 
 

@@ -38,6 +38,23 @@ def test_a_network_gives_what_numpy_gives_in_double_precision(activation, squash
     assert np.abs(policy(x) - want).max() < 3e-6
 
 
+def test_normalized_observations_are_part_of_the_network(tmp_path):
+    rng = np.random.default_rng(4)
+    x, shift, factor = rng.normal(5, 0.1, (60, 6)).astype(np.float32), rng.normal(5, 0.1, 6), rng.uniform(8, 200, 6)
+    plain, policy = policy_of(), policy_of(normalization=(shift, factor))
+    want = np.clip((x.astype(float) - shift) * factor, -8, 8)
+    assert (np.abs(want) == 8).any() and np.abs(policy(x) - plain(want)).max() < 1e-3
+    assert all(np.array_equal(policy(x[i]), policy(x)[i]) for i in range(0, 60, 7))
+    policy.save(tmp_path / "it.npz")
+    assert np.array_equal(policies.read(tmp_path / "it.npz")(x), policy(x))
+    for wrong, said in (
+        ((shift, factor[1:]), r"shapes \(6,\) and \(5,\), its network takes 6"),
+        ((shift, factor * np.inf), "not finite"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            policy_of(normalization=wrong)
+
+
 def test_its_tanh_is_that_of_numpy():
     x = np.linspace(-12, 12, 100_001, dtype=np.float32)[None]
     identity = [(np.eye(1, dtype=np.float32), np.zeros(1, np.float32))]

@@ -90,13 +90,33 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
     assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", results.LABELS["sac"]]
     now = {"ClothReach-v0": "now"}
-    assert report.best_of("ClothReach-v0", other, now) == "PPO: 0.85 in 2 min"
+    assert report.best_of("ClothReach-v0", other, now, from_scratch=True) == "PPO: 0.85 in 2 min"
+    expert = report.best_of("ClothReach-v0", other, now, from_scratch=False)
+    assert expert == "SAC, started with expert episodes: 0.20 in 2 min"
     # who always arrives, and never at no cost, is not the best
-    careless = [result(1.0, learner="sac", cost=70.0, safe_success_rate=0.0)]
+    careless = [result(1.0, learner="sac_scratch", cost=70.0, safe_success_rate=0.0)]
     safe = [result(0.9, seed=seed, cost=0.3, safe_success_rate=rate) for seed, rate in enumerate((0.80, 0.85, 0.87))]
-    assert report.best_of("ClothReach-v0", [*careless, *safe], now) == "PPO: 0.84 at no cost in 2 min"
-    assert report.best_of("ClothDrape-v0", other, now) == "–"
-    assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}).endswith("2 min **(old)**")
+    assert report.best_of("ClothReach-v0", [*careless, *safe], now, True) == "PPO: 0.84 at no cost in 2 min"
+    assert report.best_of("ClothDrape-v0", other, now, True) == "–"
+    assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}, True).endswith("2 min **(old)**")
+
+
+def test_controls_are_rows_by_what_was_changed(report):
+    def control(rate, repeat, normalize=True):
+        made = result(rate, env_kwargs={"action_repeat": repeat}) | {"with_noise": {"success_rate": rate / 2}}
+        return made | {"hyperparameters": {"gamma": 0.9, "normalize": normalize, "updates": 8}}
+
+    rows = [control(0.8, 4), control(0.6, 4), control(0.0, 1), control(0.1, 4, normalize=False)]
+    table = report.controls_table(rows, {'ClothReach-v0 {"action_repeat": 4}': "now"})
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    head, found = lines[0], [dict(zip(lines[0], line)) for line in lines[2:]]
+    assert head[0] == "environment" and [(one["`action_repeat`"], one["normalized"]) for one in found] == [
+        ("1", "yes"), ("4", "no"), ("4", "yes"),
+    ]  # fmt: skip
+    assert [one["success"] for one in found] == ["0.000", "0.100", "0.700"] and found[2]["seeds"] == "2"
+    assert found[2]["with noise"] == "0.350"
+    # only the environment whose present behavior is known to be the same is not old
+    assert ["old" in one["environment"] for one in found] == [True, False, False]
 
 
 def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(results, tmp_path, monkeypatch):

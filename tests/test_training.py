@@ -96,6 +96,7 @@ WRONG = {
     "train --env ClothReach-v0 --algo ppo_lagrange": "has no hyperparameters for 'ClothReach-v0' (there are: ClothStrain-v0",
     "train --hyperparams gone.yml": "--hyperparams gone.yml: there is no such file",
     "train --hyperparams thin.yml": "thin.yml lacks n_envs, policy, n_steps for 'ClothDrape-v0'",
+    "train --env ClothFold-v0 --hyperparams cheat.yml": "the curriculum of 'ClothFold-v0' begins with physics='fast', in which",
     'train --resume learned --env-kwargs {"rows":9}': "--resume goes on with the run's own: drop --env-kwargs",
     "train --resume gone": "'gone' is not the folder of a training run",
     "train --env-kwargs {": "'{' is not JSON",
@@ -111,6 +112,9 @@ WRONG = {
 def wrong(tmp_path, monkeypatch, scripts):
     """A folder with files to name, and no environment and no learner to be had in it."""
     (tmp_path / "thin.yml").write_text("ClothDrape-v0: {n_timesteps: 100}")
+    (tmp_path / "cheat.yml").write_text(
+        SHORT.replace("Reach", "Fold") + "  curriculum: {n_timesteps: 9, env_kwargs: {physics: fast}}"
+    )
     for name, version in (("learned", clothgym.__version__), ("old", "0.0.1")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "checkpoint.pt").touch()

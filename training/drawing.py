@@ -63,15 +63,18 @@ def film(
 ) -> None:
     """Some episodes, by default held-out ones, side by side with white between, each one's end standing still; every so many frames
     of them."""
-    # a film shows how the sheet settles, too
-    env_kwargs = env_kwargs | {"settling": "steps"}
+    # a film shows every control step, and how the sheet settles
+    repeat = env_kwargs.get("action_repeat", 1)
+    env_kwargs = env_kwargs | {"settling": "steps", "action_repeat": 1}
     env = gym.make_vec(env_id, num_envs=episodes, autoreset_mode="Disabled", render_mode="rgb_array", **env_kwargs)
     observations, _ = env.reset(seed=seed)
     frames, running = [], np.ones(episodes, bool)
     still = [np.asarray(frame) for frame in env.render()]
     while running.any():
+        if len(frames) % repeat == 0:
+            action = policy(env, observations)
         frames.append(_row(still))
-        observations, _, terminated, truncated, _ = env.step(policy(env, observations))
+        observations, _, terminated, truncated, _ = env.step(action)
         fresh = env.render()
         still = [new if on else old for new, old, on in zip(fresh, still, running)]
         running &= ~(terminated | truncated)

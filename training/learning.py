@@ -57,23 +57,59 @@ class Clock:
             self.spent, self.begun = self.spent + np.array([time.perf_counter(), time.process_time()]) - self.begun, None
 
 
-class Watch(BaseCallback):
-    """Between rollouts: a checkpoint each minute; and every so many steps a score on held-out seeds, a line in progress.jsonl.
+class Record:
+    """What is noted of a run: its held-out scores, a line each in progress.jsonl, its checkpoints, and the time that it has taken.
 
-    every: environment steps between two scores.  state: of the checkpoint that it goes on from; lines after it are dropped.
+    state: of the checkpoint that it goes on from; lines after it are dropped.
     """
 
-    def __init__(self, folder: Path, config: Config, every: int, episodes: int, state: dict[str, Any] | None) -> None:
-        super().__init__()
-        self.folder, self.config, self.every, self.episodes = folder, config, every, episodes
+    def __init__(self, folder: Path, config: Config, state: dict[str, Any] | None) -> None:
+        self.folder, self.config = folder, config
         before = state or {"num_timesteps": 0, "times": {}}
         self.lines = [line for line in read_progress(folder) if line["timesteps"] <= before["num_timesteps"]]
         self.clock = Clock(before["times"].get("training_seconds", 0.0), before["times"].get("core_seconds", 0.0))
+        self.saved = time.perf_counter()
+        # time in which environments step and the policy chooses actions [s]
+        self.collecting = before["times"].get("collecting_seconds", 0.0)
+
+    def times(self) -> dict[str, float]:
+        """Time spent on training so far [s]."""
+        wall, cores = map(float, self.clock.spent)
+        return {"training_seconds": wall, "core_seconds": cores, "collecting_seconds": self.collecting}
+
+    def is_due(self) -> bool:
+        """Whether it is time for another checkpoint."""
+        return time.perf_counter() - self.saved > CHECKPOINT_SECONDS
+
+    def note(self, acting: policies.Policy, timesteps: int, episodes: int) -> dict[str, Any]:
+        """Score a policy after so many steps; returns the line."""
+        # the tail of the held-out seeds: the final score's are others
+        first = scoring.HELD_OUT + 1_000_000
+        seeds = list(range(first, first + episodes))
+        found = scoring.run_episodes(self.config["env"], acting, seeds, progress=False, **self.config["env_kwargs"])
+        line = {"timesteps": timesteps, **self.times(), "episodes": episodes}
+        line |= {"success_rate": float(found["is_success"].mean())}
+        line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
+        if "episode_cost" in found:
+            line["cost"] = float(found["episode_cost"].mean())
+        self.lines.append(line)
+        files.write(self.folder / PROGRESS, "".join(json.dumps(files.checked_in(one)) + "\n" for one in self.lines))
+        return line
+
+
+class Watch(Record, BaseCallback):
+    """Between rollouts: a checkpoint each minute, and every so many steps a score on held-out seeds.
+
+    every: environment steps between two scores.
+    """
+
+    def __init__(self, folder: Path, config: Config, every: int, episodes: int, state: dict[str, Any] | None) -> None:
+        BaseCallback.__init__(self)
+        Record.__init__(self, folder, config, state)
+        self.every, self.episodes = every, episodes
         # a cloned policy is scored before it is trained further
         self.next = 0 if config["clone"] and not self.lines else int(self.lines[-1]["timesteps"] if self.lines else 0) + every
-        self.saved = time.perf_counter()
-        # time in which environments step and the policy chooses actions, and when that began [s]
-        self.collecting, self.collects_since = before["times"].get("collecting_seconds", 0.0), 0.0
+        self.collects_since = 0.0
 
     def _on_step(self) -> bool:
         return True
@@ -85,7 +121,7 @@ class Watch(BaseCallback):
         if self.num_timesteps >= self.next:
             self.next = self.num_timesteps + self.every
             self.evaluate(self.episodes)
-        elif time.perf_counter() - self.saved > CHECKPOINT_SECONDS:
+        elif self.is_due():
             self.save()
         self.clock.start()
         self.collects_since = time.perf_counter()
@@ -94,11 +130,6 @@ class Watch(BaseCallback):
         self.collecting += time.perf_counter() - self.collects_since
         torch.set_num_threads(self.config["threads"])
 
-    def times(self) -> dict[str, float]:
-        """Time spent on training so far [s]."""
-        wall, cores = map(float, self.clock.spent)
-        return {"training_seconds": wall, "core_seconds": cores, "collecting_seconds": self.collecting}
-
     def save(self) -> None:
         save_checkpoint(self.folder, self.model, self.times())
         self.saved = time.perf_counter()
@@ -106,18 +137,7 @@ class Watch(BaseCallback):
     def evaluate(self, episodes: int) -> None:
         """Score the policy as it is, and save a checkpoint."""
         self.save()
-
-        # the tail of the held-out seeds: the final score's are others
-        first = scoring.HELD_OUT + 1_000_000
-        seeds = list(range(first, first + episodes))
-        found = scoring.run_episodes(self.config["env"], acting_of(self.model), seeds, progress=False, **self.config["env_kwargs"])
-        line = {"timesteps": self.num_timesteps, **self.times(), "episodes": episodes}
-        line |= {"success_rate": float(found["is_success"].mean())}
-        line |= {name: float(found[name].mean()) for name in ("normalized_performance", "return")}
-        if "episode_cost" in found:
-            line["cost"] = float(found["episode_cost"].mean())
-        self.lines.append(line)
-        files.write(self.folder / PROGRESS, "".join(json.dumps(files.checked_in(one)) + "\n" for one in self.lines))
+        line = self.note(acting_of(self.model), self.num_timesteps, episodes)
         for key in line.keys() - set(SCORES[:3]):
             self.logger.record(f"held_out/{key}", line[key])
         self.saved = time.perf_counter()
@@ -301,19 +321,36 @@ def learn_from_expert(model: Any, config: Config) -> None:
 
 
 def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episodes: int) -> None:
-    """Export the policy, score the exported one and the references, draw the learning curve and a film."""
-    wall, cores = watch.clock.spent
-    about = {"digest": digest_of(config["env"], config["env_kwargs"]), "timesteps": config["timesteps"], "training_seconds": wall}
-    about |= {
-        "core_seconds": cores,
-        "collecting_seconds": watch.collecting,
-        "chosen_by": watch.lines[-1]["success_rate"],
+    """Export the policy, and conclude the run with its score."""
+    policy = exported(model, config, account_of(watch))
+    acting = acting_of(model)
+    if policy is not None:
+        policy.save(folder / POLICY)
+        acting = policies.exported(folder / POLICY)
+    own = conclude(watch, acting, final_episodes)
+    if policy is not None:
+        policy.about |= own
+        policy.save(folder / POLICY)
+
+
+def account_of(record: Record) -> dict[str, Any]:
+    """What a run's results say of how they were made."""
+    config, times = record.config, record.times()
+    return {
+        "digest": digest_of(config["env"], config["env_kwargs"]),
+        "timesteps": config["timesteps"],
+        **times,
+        "chosen_by": record.lines[-1]["success_rate"],
         "machine": machine(),
     }
-    policy, path = exported(model, config, about), folder / POLICY
-    if policy is not None:
-        policy.save(path)
-    acting = policies.exported(path) if policy is not None else acting_of(model)
+
+
+def conclude(record: Record, acting: policies.Policy, final_episodes: int, more: dict[str, Any] | None = None) -> dict[str, Any]:
+    """Score a policy and the references, write them with ``more``, draw the learning curve and a film.
+
+    Returns what the policy's file says of its score.
+    """
+    folder, config = record.folder, record.config
     names = ["noop", "random", "expert"] + ["careless"] * (config["env"] == "ClothStrain-v0")
     scores = {}
     for name in [*names, str(folder)]:
@@ -328,14 +365,13 @@ def finish(folder: Path, config: Config, model: Any, watch: Watch, final_episode
     identity = {"env": config["env"], "env_kwargs": config["env_kwargs"]}
     print(f"held-out episodes\n{suite.table([identity | {'policy': name} | row for name, row in scores.items()])}")
     own = scores.pop(str(folder)) | {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": config["algo"]}
-    own |= {"seed": config["seed"], "references": scores} | about
+    own |= {"seed": config["seed"], "references": scores} | account_of(record) | (more or {})
     files.write(folder / EVALUATION, json.dumps(own, indent=1, default=float) + "\n")
-    if policy is not None:
-        # the file contains its scores
-        said = ("success_rate", "safe_success_rate", "normalized_performance", "episodes")
-        policy.about |= {name: own[name] for name in said if name in own}
-        policy.about["first_successes"] = int(episodes["is_success"][:FIRST].sum())
-        policy.save(path)
-    draw_learning_curve(folder, watch.lines, {name: scores[name]["success_rate"] for name in ("noop", "expert") if name in scores})
+    levels = {name: scores[name]["success_rate"] for name in ("noop", "expert") if name in scores}
+    draw_learning_curve(folder, record.lines, levels)
     film(folder / "policy.gif", config["env"], acting, config["env_kwargs"])
-    print(f"trained for {wall / 60:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
+    minutes = record.times()["training_seconds"] / 60
+    print(f"trained for {minutes:.1f} minutes; see {folder}/learning_curve.png and {folder}/policy.gif")
+    # the file contains its scores
+    said = ("success_rate", "safe_success_rate", "normalized_performance", "episodes")
+    return {name: own[name] for name in said if name in own} | {"first_successes": int(episodes["is_success"][:FIRST].sum())}

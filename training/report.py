@@ -4,6 +4,7 @@
     python training/report.py --check                        # only list stale pages, with status 1
     python training/report.py --digests                      # first note the present behavior of each environment: some minutes
     python training/report.py --policies                     # first score committed policies of older code: some minutes
+    python training/report.py --controls runs/repeat_*       # first add these controls' results
     python training/report.py --add runs/ClothDrape-v0_*     # first add these runs' results, and the best policies
 
 A result carries the digest of its environment's behavior (``clothgym.lab.digests``); the present digests are in
@@ -17,20 +18,34 @@ import statistics
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import suite
 import tyro
 from drawing import CURVES, draw_curves
 from endings import refused
-from results import RESULTS, ROOT, Result, add, groups, is_present, learned, note_digests, note_policies, read_digests
+from results import (
+    FROM_SCRATCH,
+    RESULTS,
+    ROOT,
+    Result,
+    add,
+    add_controls,
+    controls,
+    groups,
+    is_present,
+    learned,
+    note_digests,
+    note_policies,
+    read_digests,
+)
 
 from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
 SUITE, MAXIMIZERS, CHEATS = (RESULTS / f"{name}.json" for name in ("suite", "maximizers", "cheats"))
-PAGES = ("README.md", "docs/results.md", "docs/cheats.md")
+PAGES = ("README.md", "docs/results.md", "docs/cheats.md", "docs/learning.md")
 
 
 @dataclass
@@ -39,6 +54,8 @@ class Args:
 
     add: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN ...")] = ()
     """Folders of finished runs, whose results are committed."""
+    controls: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN ...")] = ()
+    """Folders of finished controls, whose results are committed, and whose policies are not."""
     digests: bool = False
     """Note the present behavior of each environment."""
     policies: bool = False
@@ -94,6 +111,7 @@ def scripted_row(row: Result, digests: dict[str, str]) -> dict[str, str]:
         "policy": f"`{row['policy']}`{_old(is_present(row, digests))}",
         "seeds": "",
         "success": f"{row['success_rate']:.3f} [{low:.3f}, {high:.3f}]",
+        "with noise": "",
         "median": "",
         "worst": "",
         "performance": f"{row['normalized_performance']:.3f}",
@@ -114,6 +132,9 @@ def learned_row(label: str, rows: list[Result], digests: dict[str, str]) -> dict
         "policy": f"{label}{_old(all(is_present(row, digests) for row in rows))}",
         "seeds": str(len(rows)),
         "success": f"{interquartile_mean(rates):.3f} [{low:.3f}, {high:.3f}]",
+        "with noise": f"{statistics.median(row['with_noise']['success_rate'] for row in rows):.3f}"
+        if "with_noise" in rows[0]
+        else "",
         "median": f"{statistics.median(rates):.3f}" if len(rows) > 1 else "",
         "worst": f"{min(rates):.3f}" if len(rows) > 1 else "",
         "performance": f"{statistics.median(row['normalized_performance'] for row in rows):.3f}",
@@ -144,9 +165,13 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
     return markdown(rows)
 
 
-def best_of(env_id: str, results: list[Result], digests: dict[str, str]) -> str:
-    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts."""
+def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_scratch: bool) -> str:
+    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts.
+
+    from_scratch: of those that see no expert, or else of those that do.
+    """
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
+    found = [(label, rows) for label, rows in found if (rows[0]["learner"] in FROM_SCRATCH) == from_scratch]
     if not found:
         return "–"
     means = [interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in rows) for _, rows in found]
@@ -185,6 +210,28 @@ def cheats_table(rows: list[Result], digests: dict[str, str]) -> str:
     ])  # fmt: skip
 
 
+def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
+    """Scores of SAC with one thing changed, over seeds."""
+    found: dict[tuple[Any, ...], list[Result]] = {}
+    for row in rows:
+        options, kwargs = row["hyperparameters"], row["env_kwargs"]
+        changed = kwargs.get("action_repeat", 1), options["updates"], options["gamma"], kwargs.get("gamma", 1), options["normalize"]
+        found.setdefault((row["env"], row["timesteps"], *changed), []).append(row)
+    return markdown([
+        {
+            "environment": f"`{env_id}`{_old(all(is_present(row, digests) for row in group))}",
+            "control steps": f"{steps / 1e6:.2f} M", "`action_repeat`": str(repeat), "updates": str(updates),
+            "discount": f"{gamma:.3g}",
+            "shaping's `gamma`": f"{shaping:g}", "normalized": "yes" if normalize else "no", "seeds": str(len(group)),
+            "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
+            "with noise": f"{interquartile_mean(row['with_noise']['success_rate'] for row in group):.3f}",
+            "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",
+            "training": f"{_minutes(group):.1f} min{_collecting(group)}",
+        }
+        for (env_id, steps, repeat, updates, gamma, shaping, normalize), group in sorted(found.items())
+    ])  # fmt: skip
+
+
 # --- pages --------------------------------------------------------------------------------------------------------------------
 
 
@@ -198,14 +245,15 @@ def sections(results: list[Result], scripted: list[Result], digests: dict[str, s
 
 
 def environments(results: list[Result], digests: dict[str, str]) -> str:
-    """The README's table of environments, with the best learner of each."""
-    lines = ["| id | goal | best learner: success, time on one core |", "| --- | --- | --- |"]
+    """The README's table of environments, with the best learners of each: without an expert, and with one."""
+    lines = ["| id | goal | learned from scratch: success, time on one core | with an expert |", "| --- | --- | --- | --- |"]
     for env_id, (_, goal) in ENVIRONMENTS.items():
         if "-Hard-" in env_id:
             continue
         hard = env_id.replace("-v0", "-Hard-v0")
         names = ", ".join(f"[`{name}`](docs/tasks/{name}.md)" for name in (env_id, hard) if name in ENVIRONMENTS)
-        lines.append(f"| {names} | {goal.rstrip('.')} | {best_of(env_id, results, digests)} |")
+        scratch, expert = (best_of(env_id, results, digests, from_scratch) for from_scratch in (True, False))
+        lines.append(f"| {names} | {goal.rstrip('.')} | {scratch} | {expert} |")
     return "\n".join(lines)
 
 
@@ -228,6 +276,7 @@ def pages() -> dict[Path, str]:
     """The up-to-date text of every page."""
     digests, scripted = read_digests(), suite.read(SUITE)
     made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
+    made["controls"] = controls_table(controls(), digests)
     made["cheats"] = cheats_table(suite.read(CHEATS), digests)
     return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
 
@@ -236,6 +285,7 @@ def main(args: Args) -> None:
     with refused():
         for env_id in add(args.add):
             draw_curves(env_id, learned())
+        add_controls(args.controls)
         if args.digests:
             note_digests()
         if args.policies:

@@ -16,22 +16,24 @@ import numpy as np
 from scoring import HELD_OUT
 
 from clothgym import files
-from clothgym.adapters.runs import POLICY
+from clothgym.adapters.runs import POLICY, read_config
 from clothgym.lab.bench import machine
 from clothgym.lab.digests import WITHOUT_EFFECT, digest_of, name_of
 from clothgym.registration import ENVIRONMENTS
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
+CONTROLS = RESULTS / "controls"  # runs with one thing changed, of which no policy is kept
 RUNS, DIGESTS, TODAY = RESULTS / "training", RESULTS / "digests.json", RESULTS / "policies.json"
 COMMITTED = ROOT / "clothgym" / "policies"
 KEPT = ("config.json", "evaluation.json", "progress.jsonl")
 ADVICE = "make it with  python training/report.py --digests"
 LABELS = {
     "ppo": "PPO", "ppo_penalty": "PPO, fixed price", "ppo_lagrange": "PPO, Lagrange multiplier", "bc": "behavior cloning",
-    "bc_ppo": "behavior cloning, then PPO", "sac": "SAC, started with expert episodes",
+    "bc_ppo": "behavior cloning, then PPO", "sac_scratch": "SAC", "sac": "SAC, started with expert episodes",
     "her": "SAC with hindsight (HER), started with expert episodes",
 }  # fmt: skip
+FROM_SCRATCH = ("ppo", "ppo_penalty", "ppo_lagrange", "sac_scratch")  # learners that see no expert
 Result = dict[str, Any]
 
 
@@ -68,7 +70,7 @@ def progress(run: str) -> list[dict[str, float]]:
 def note_digests() -> None:
     """Write the digest of each environment, with its defaults and with the arguments of committed results."""
     wanted = {name_of(env_id, {}): (env_id, {}) for env_id in ENVIRONMENTS}
-    wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in learned()}
+    wanted |= {name_of(row["env"], row["env_kwargs"]): (row["env"], row["env_kwargs"]) for row in [*learned(), *controls()]}
     digests = {}
     for name, (env_id, kwargs) in wanted.items():
         digests[name] = digest_of(env_id, kwargs)
@@ -102,6 +104,27 @@ def note_policies() -> None:
                 noted[f"{env_id} {learner}"] = {"digest": digest, "first_successes": first_successes(env_id, learner)}
                 print(env_id, learner, noted[f"{env_id} {learner}"], "then", about["first_successes"], flush=True)
     files.write_json(TODAY, {"machine": machine(), "policies": noted})
+
+
+def controls() -> list[Result]:
+    """The results of controls, and of the runs that they are compared with, with their hyperparameters."""
+    folders = [path.parent for path in sorted(CONTROLS.glob("*/evaluation.json"))]
+    envs = {read_config(folder, begun=False)["env"] for folder in folders}
+    folders += [folder for env_id in sorted(envs) for folder in sorted(RUNS.glob(f"{env_id}_sac_scratch_*"))]
+    return [
+        json.loads((folder / "evaluation.json").read_text())
+        | {"hyperparameters": read_config(folder, begun=False)["hyperparameters"]}
+        for folder in folders
+    ]
+
+
+def add_controls(folders: Iterable[Path]) -> None:
+    """Copy the committed files of controls."""
+    for folder in folders:
+        target = CONTROLS / folder.resolve().name
+        target.mkdir(parents=True, exist_ok=True)
+        for name in KEPT:
+            shutil.copyfile(folder / name, target / name)
 
 
 def add(folders: Iterable[Path]) -> set[str]:

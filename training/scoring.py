@@ -16,7 +16,7 @@ BATCH = 250
 
 
 def run_episodes(env_id: str, policy: Policy, seeds: list[int], progress: bool = True, **env_kwargs: Any) -> dict[str, NDArray]:
-    """One episode for each seed: return, length and what the last step's info says, arrays over the episodes."""
+    """One episode for each seed: return, length in control steps and what the last step's info says, arrays over the episodes."""
     env = gym.make_vec(env_id, num_envs=min(BATCH, len(seeds)), autoreset_mode="Disabled", **env_kwargs)
     batches = []
     with tqdm(total=len(seeds), unit="episode", disable=None if progress else True, leave=False) as bar:
@@ -38,8 +38,8 @@ def _run_batch(env: Any, policy: Policy, seeds: list[int], bar: Any, count: int)
     while running.any():
         observations, reward, terminated, truncated, info = env.step(policy(env, observations))
         total += reward * running
-        length += running
         done = running & (terminated | truncated)
+        length = np.where(done, env.unwrapped.task.control_steps_taken(), length)
         for key, value in info.items():
             if not key.startswith("_") and isinstance(value, np.ndarray):
                 last[key] = np.where(done, value, last.get(key, value))

@@ -126,6 +126,7 @@ class Args:
             "hyperparameters": {key: value for key, value in hyperparameters.items() if key != "n_timesteps"},
             "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
         }
+        policies.check_curriculum(self.env, config["curriculum"])
         bare = self.env.rpartition(":")[2]
         name = bare if self.algo == "ppo" else f"{bare}_{self.algo}"
         folder = self.run or Path("runs") / f"{name}_{self.seed}"

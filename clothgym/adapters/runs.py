@@ -23,7 +23,7 @@ FIELDS = {
     "env": str, "algo": str, "clone": dict, "curriculum": dict, "env_kwargs": dict, "hyperparameters": dict,
     "num_envs": int, "timesteps": int, "seed": int, "threads": int,
 }  # fmt: skip
-OFF_POLICY = ("sac", "her")
+OFF_POLICY = ("sac", "her", "sac_scratch")
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observations) -> actions
 
 

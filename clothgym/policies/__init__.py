@@ -31,6 +31,7 @@ KIND, VERSION = "policy", 1
 ADVICE = "name another file, or export it again from its run"
 ACTIVATIONS = ("tanh", "relu")
 MOST_LAYERS, WIDEST = 10, 4096
+FAR = np.float32(8)  # standard deviations: what lies beyond is no farther to a network with normalized observations
 
 
 class Policy:
@@ -41,6 +42,7 @@ class Policy:
         keys: parts of an observation that is a dictionary, in the order in which the network takes them; empty for a plain one.
         layers: weights, (inputs, outputs), and biases, (outputs,), float32.
         activation: of all layers but the last, "tanh" or "relu"; squashed: whether a tanh bounds the actions.
+        normalization: what is subtracted from observations, and what they are then multiplied by, (inputs,) each, float32; or None.
     """
 
     def __init__(
@@ -50,11 +52,13 @@ class Policy:
         squashed: bool = False,
         keys: Sequence[str] = (),
         about: Mapping[str, Any] | None = None,
+        normalization: tuple[NDArray, NDArray] | None = None,
     ) -> None:
         one_of("activation", activation, *ACTIVATIONS)
         # rounded as in a file, so that scores are those of the loaded policy
         self.layers = [(as_kept(weight), as_kept(bias)) for weight, bias in layers]
         check_layers(self.layers)
+        self.normalization = None if normalization is None else checked_normalization(normalization, self.layers[0][0].shape[0])
         self.activation, self.squashed, self.keys, self.about = activation, bool(squashed), tuple(keys), dict(about or {})
 
     def make(self, **kwargs: Any) -> gym.Env:
@@ -92,6 +96,8 @@ class Policy:
         size = self.layers[0][0].shape[0]
         if x.ndim not in (1, 2) or x.shape[-1] != size:
             raise ValueError(f"observation of shape {x.shape}: must be ({size},) or (num_envs, {size})")
+        if self.normalization is not None:
+            x = normalized(x, self.normalization)
         action = forward(np.atleast_2d(x), self.layers, self.activation, self.squashed)
         return (action if x.ndim == 2 else action[0]), state
 
@@ -101,6 +107,8 @@ class Policy:
         arrays |= {"squashed": self.squashed, "keys": json.dumps(self.keys)}
         for number, (weight, bias) in enumerate(self.layers):
             arrays[f"weight_{number}"], arrays[f"bias_{number}"] = weight.astype(np.float16), bias.astype(np.float16)
+        if self.normalization is not None:
+            arrays["shift"], arrays["factor"] = self.normalization
         files.write_arrays(path, KIND, VERSION, arrays, compressed=True)
 
 
@@ -108,6 +116,26 @@ def as_kept(array: NDArray) -> NDArray[np.float32]:
     """Numbers as a file holds them, in half precision; those beyond its range are infinite."""
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(np.asarray(array, np.float16), np.float32)
+
+
+def normalized(x: NDArray, normalization: tuple[NDArray, NDArray]) -> NDArray[np.float32]:
+    """``(x - shift) factor``, within ±8, number by number, so that no batch changes a bit; x: float32, (..., inputs)."""
+    shift, factor = normalization
+    return np.clip((x - shift) * factor, -FAR, FAR)
+
+
+def checked_normalization(normalization: tuple[NDArray, NDArray], size: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Both in single precision.
+
+    Raises:
+        ValueError: they do not fit the network, or are not finite.
+    """
+    shift, factor = (np.ascontiguousarray(part, np.float32) for part in normalization)
+    if shift.shape != (size,) or factor.shape != (size,):
+        raise ValueError(f"its normalization has the shapes {shift.shape} and {factor.shape}, its network takes {size} numbers")
+    if not (np.isfinite(shift).all() and np.isfinite(factor).all()):
+        raise ValueError("its normalization has a value that is not finite")
+    return shift, factor
 
 
 def check_layers(layers: Sequence[tuple[NDArray, NDArray]]) -> None:
@@ -171,4 +199,5 @@ def read(path: str | Path) -> Policy:
         if not (isinstance(about, dict) and isinstance(about.get("env_kwargs"), dict)):
             raise ValueError("it does not say for which environment it is")
         checked_id(about.get("env", ""))
-        return Policy(layers, str(arrays["activation"]), bool(arrays["squashed"]), keys, about)
+        normalization = (arrays["shift"], arrays["factor"]) if "shift" in arrays else None
+        return Policy(layers, str(arrays["activation"]), bool(arrays["squashed"]), keys, about, normalization)

@@ -39,7 +39,8 @@ LEARNERS = {
     "bc_ppo": "clone of the expert, then PPO",
     "ppo": "PPO",
     "ppo_lagrange": "PPO, Lagrange multiplier",
-    "sac": "SAC",
+    "sac": "SAC, started with expert episodes",
+    "sac_scratch": "SAC",
 }
 
 
@@ -122,7 +123,7 @@ def record(name: str) -> Recorded:
         "seed": HELD_OUT,
         "options": options,
         "digest": about["digest"],
-        "time_step": stride * task.step_seconds,
+        "time_step": stride * task.physics.time_step,
         "shape": shape,
         "side": task.physics.side,
         "holes": holes,

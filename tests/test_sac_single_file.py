@@ -1,0 +1,291 @@
+"""SAC in a single file: an update beside Stable-Baselines3's, its parts beside numbers from elsewhere, and runs that go on."""
+
+import copy
+import json
+from types import SimpleNamespace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import clothgym
+from clothgym import policies
+
+SIZES = 58, 3
+
+
+@pytest.fixture
+def single(scripts):
+    """The script as a module."""
+    import sac_single_file
+
+    return sac_single_file
+
+
+def options(single, **kwargs):
+    return single.Options(**{"net_arch": (16, 16), "updates": 2, "batch_size": 32, "buffer_size": 1000, **kwargs})
+
+
+def transitions(count, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = {"observation": (58,), "action": (3,), "reward": (), "following": (58,), "goes_on": ()}
+    drawn = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    return drawn | {"action": np.tanh(drawn["action"]), "goes_on": (drawn["goes_on"] < 1).astype(np.float32)}
+
+
+def test_an_update_is_that_of_stable_baselines3(single):
+    """Three of them, from the same weights and with the same noise; there, critics are given layer normalization."""
+    import torch
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.buffers import ReplayBufferSamples
+    from stable_baselines3.common.logger import Logger
+
+    from clothgym.adapters.sb3 import make_sb3_vec_env
+
+    torch.manual_seed(0)
+    agent = single.Agent(*SIZES, options(single, gamma=0.9, tau=0.1, first_alpha=0.3))
+    settings = {"learning_rate": 0.001, "gamma": 0.9, "tau": 0.1, "ent_coef": "auto_0.3", "batch_size": 64}
+    model = SAC("MlpPolicy", make_sb3_vec_env("ClothReach-v0", 2), policy_kwargs={"net_arch": [16, 16]}, device="cpu", **settings)
+    actor, mine = model.actor, agent.policy
+    for k in (0, 2):
+        actor.latent_pi[k].load_state_dict(mine[k].state_dict())
+    for head, part in ((actor.mu, slice(0, 3)), (actor.log_std, slice(3, 6))):
+        head.load_state_dict({"weight": mine[4].weight[part].detach(), "bias": mine[4].bias[part].detach()})
+    for critic, nets in ((model.critic, agent.critics), (model.critic_target, agent.targets)):
+        for k in range(2):
+            critic.q_networks[k] = copy.deepcopy(nets[k])
+            setattr(critic, f"qf{k}", critic.q_networks[k])
+    model.critic.optimizer = torch.optim.Adam(model.critic.parameters(), 0.001)
+    model.set_logger(Logger(None, []))
+
+    batch = {name: torch.as_tensor(part) for name, part in transitions(64).items()}
+    ends = 1 - batch["goes_on"][:, None]
+    samples = ReplayBufferSamples(batch["observation"], batch["action"], batch["following"], ends, batch["reward"][:, None])
+    model.replay_buffer.sample = lambda *args, **kwargs: samples
+    torch.manual_seed(1)
+    model.train(gradient_steps=3, batch_size=64)
+    before = [parameter.detach().clone() for parameter in mine.parameters()]
+    torch.manual_seed(1)
+    for _ in range(3):
+        agent.update(batch, with_policy=True)
+
+    assert agent.log_alpha.item() == pytest.approx(model.log_ent_coef.item(), abs=1e-6)
+    assert agent.log_alpha.item() != pytest.approx(np.log(0.3), abs=1e-3)
+    found = [*agent.critics.parameters(), *agent.targets.parameters(), *mine[:4].parameters()]
+    want = [*model.critic.parameters(), *model.critic_target.parameters(), *actor.latent_pi.parameters()]
+    for one, other in zip(found, want, strict=True):
+        assert one.detach().numpy() == pytest.approx(other.detach().numpy(), abs=2e-5)
+    assert mine[4].weight[3:].detach().numpy() == pytest.approx(actor.log_std.weight.detach().numpy(), abs=2e-5)
+    assert all((one - other).abs().max() > 1e-3 for one, other in zip(mine.parameters(), before))
+
+
+def test_a_rate_and_a_delay_are_kept(single):
+    import torch
+
+    agent = single.Agent(*SIZES, options(single))
+    batch = {name: torch.as_tensor(part) for name, part in transitions(32).items()}
+    before = copy.deepcopy(agent.policy.state_dict()), agent.log_alpha.item(), copy.deepcopy(agent.critics.state_dict())
+    agent.set_rate(0.0)
+    agent.update(batch, with_policy=True)
+    assert all(part.equal(agent.critics.state_dict()[name]) for name, part in before[2].items())
+    agent.set_rate(0.001)
+    agent.update(batch, with_policy=False)
+    assert all(part.equal(agent.policy.state_dict()[name]) for name, part in before[0].items())
+    assert agent.log_alpha.item() == before[1]
+    assert not any(part.equal(agent.critics.state_dict()[name]) for name, part in before[2].items() if name.endswith("weight"))
+
+
+def test_a_normalizer_knows_the_mean_and_deviation_of_all_that_it_saw(single):
+    seen, normalizer = np.random.default_rng(0).normal(3, 2, (5, 40, 58)).astype(np.float32), single.Normalizer(58, active=True)
+    for part in seen:
+        normalizer.see(part)
+    whole = seen.reshape(-1, 58).astype(float)
+    want = np.clip((seen[0] - whole.mean(axis=0)) / np.sqrt(whole.var(axis=0) + 1e-4), -8, 8)
+    assert normalizer(seen[0]).numpy() == pytest.approx(want, abs=1e-5)
+    off = single.Normalizer(58, active=False)
+    off.see(seen[0])
+    assert np.array_equal(off(seen[1]).numpy(), seen[1]) and off.numbers() is None
+
+
+def test_a_buffer_draws_from_the_last_transitions(single):
+    replay, rng = single.Replay(10, *SIZES), np.random.default_rng(0)
+    for first in range(0, 16, 4):
+        rows = transitions(4, seed=first) | {"reward": np.arange(first, first + 4)}
+        replay.add(**rows)
+    assert replay.filled == 10 and sorted(replay.rows["reward"]) == list(range(6, 16))
+    batches = list(replay.minibatches(3, 50, rng, single.Normalizer(58, active=False)))
+    assert [len(batch["action"]) for batch in batches] == [50] * 3
+    assert set(np.concatenate([batch["reward"].numpy() for batch in batches])) == set(range(6, 16))
+    # the rows of a transition stay together
+    last = replay.rows["reward"] >= 12
+    assert replay.rows["observation"][last] == pytest.approx(transitions(4, seed=12)["observation"])
+
+
+def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkeypatch):
+    """And not by the next one's first; a termination is marked, a truncation is not."""
+    config = {"env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
+    more = {"n_envs": 4, "normalize": False}
+    for kwargs, goes_on in (({"action_repeat": 40}, False), ({"action_repeat": 40, "max_episode_steps": 1}, False)):
+        run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
+        made = gym.make_vec("clothgym:ClothReach-v0", num_envs=4, autoreset_mode="Disabled", action_repeat=40)
+        begun = np.random.SeedSequence([0, 0]).generate_state(2)[0] % (single.HELD_OUT - 4)
+        first, _ = made.reset(seed=int(begun))
+        run.collect(at_random=True)
+        rows = {name: part[:4] for name, part in run.replay.rows.items()}
+        last, reward, terminated, *_ = made.step(rows["action"])
+        assert np.array_equal(rows["observation"], first) and np.array_equal(rows["following"], last) and terminated.all()
+        assert rows["reward"] == pytest.approx(10 * reward) and rows["goes_on"].tolist() == [goes_on] * 4
+        assert not np.array_equal(run.observation, last) and len(run.episodes) == 4
+    kwargs = {"action_repeat": 4, "max_episode_steps": 1}
+    run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
+    run.collect(at_random=True)
+    assert run.replay.rows["goes_on"][:4].tolist() == [1] * 4 and len(run.episodes) == 4
+    assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
+
+
+def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
+    """The buffer is that of an environment that settles at once."""
+    config, found = {"env": "ClothDrape-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}, {}
+    for settling, steps in (("at_once", 15), ("steps", 37)):
+        kwargs = {"physics": "fast", "action_repeat": 4, "settling": settling}
+        run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, n_envs=1))}, None)
+        # it is never let go: the episode takes all of its 60 control steps, and settles for 85
+        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.full(size, -0.1))
+        for _ in range(steps):
+            run.collect(at_random=True)
+        found[settling] = {name: part[: run.replay.added] for name, part in run.replay.rows.items()}
+        assert len(run.episodes) == 1 and run.replay.added == 15
+    for name, part in found["at_once"].items():
+        assert part == pytest.approx(found["steps"][name], abs=1e-5), name
+
+
+SHORT = {"timesteps": 1600, "n_envs": 8, "updates": 2, "batch_size": 32, "net_arch": [16, 16], "buffer_size": 300}
+
+
+def trained(single, monkeypatch, folder, *, stop_at=None, resume=False):
+    """A short run; stop_at: updates after which it is interrupted."""
+    import learning
+
+    monkeypatch.setattr(single, "LEARNED_FROM", 64)
+    monkeypatch.setattr(learning, "film", lambda *args, **kwargs: None)
+    kwargs = {"evaluations": 2, "eval_episodes": 2, "final_episodes": 4}
+    if resume:
+        args = single.Args(resume=folder, **kwargs)
+    else:
+        args = single.Args(seed=3, run=folder, options=json.dumps(SHORT), env_kwargs='{"physics": "fast"}', **kwargs)
+    update, count = single.Agent.update, [0]
+
+    def counted(agent, *given, **more):
+        count[0] += 1
+        if count[0] == stop_at:
+            raise KeyboardInterrupt
+        update(agent, *given, **more)
+
+    monkeypatch.setattr(single.Agent, "update", counted)
+    if stop_at is None:
+        single.train(args)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            single.train(args)
+    monkeypatch.setattr(single.Agent, "update", update)
+    return count[0]
+
+
+def test_a_run_leaves_its_story_and_the_same_bits_again(single, tmp_path, monkeypatch):
+    updates = trained(single, monkeypatch, tmp_path / "one")
+    trained(single, monkeypatch, tmp_path / "other")
+    # 50 decisions of each environment, the first 8 of them at random
+    assert updates == 2 * (50 - 8 + 1)
+    one, other = (policies.read(tmp_path / name / "policy.npz") for name in ("one", "other"))
+    for (weight, bias), (again, too) in zip(one.layers, other.layers):
+        assert np.array_equal(weight, again) and np.array_equal(bias, too)
+    assert all(np.array_equal(part, again) for part, again in zip(one.normalization, other.normalization))
+    assert one.about["env_kwargs"] == {"action_repeat": 4, "physics": "fast"} and one.about["learner"] == "sac_scratch"
+    scores = json.loads((tmp_path / "one" / "evaluation.json").read_text())
+    assert scores["episodes"] == scores["with_noise"]["episodes"] == 4 and scores["timesteps"] == 1600
+    assert one.about["success_rate"] == scores["success_rate"] and scores["training_seconds"] > scores["collecting_seconds"] > 0
+    lines = [json.loads(line) for line in (tmp_path / "one" / "progress.jsonl").read_text().splitlines()]
+    assert [line["timesteps"] for line in lines] == [800, 1600] and scores["chosen_by"] == lines[-1]["success_rate"]
+    # the file acts as the net did
+    env = one.make_vec(4)
+    assert one(env.reset(seed=0)[0]).shape == (4, 3)
+
+
+def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatch):
+    from clothgym.adapters.runs import load_last
+
+    folder = tmp_path / "run"
+    trained(single, monkeypatch, folder, stop_at=50)
+    state = load_last(folder)
+    # 25 decisions of each environment were done at the evaluation
+    assert state["num_timesteps"] == 800 and state["num_updates"] == 36 and int(state["variables"]["added"]) == 200
+    run = single.Run(single.policies.read_config(folder), state)
+    assert run.replay.filled == 200 and run.done == 800 and run.updates == 36
+    again = run.state(state["times"])
+    for part in ("policy", "variables"):
+        assert all(value.equal(state[part][name]) for name, value in again[part].items())
+    for part in ("critics", "policy", "alpha"):
+        moments = again["optimizer"][part]["state"]
+        assert all(moments[0][name].equal(value) for name, value in state["optimizer"][part]["state"][0].items()), part
+    # it learns at once, and to the end
+    assert trained(single, monkeypatch, folder, resume=True) == 50
+    lines = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
+    assert [line["timesteps"] for line in lines] == [800, 1600] and (folder / "policy.npz").exists()
+    # a run that has ended is scored again, and takes no step
+    assert trained(single, monkeypatch, folder, resume=True) == 0
+
+
+def test_a_curriculum_ends_with_the_arguments_of_the_run(single, monkeypatch):
+    monkeypatch.setattr(single, "LEARNED_FROM", 10**6)
+    config = {
+        "env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 24, "env_kwargs": {"action_repeat": 2},
+        "curriculum": {"n_timesteps": 12, "env_kwargs": {"physics": "fast"}},
+        "hyperparameters": single.asdict(options(single, n_envs=4)),
+    }  # fmt: skip
+    run, seen = single.Run(config, None), []
+    for _ in run.steps():
+        seen.append((run.done, run.env.task.physics_name))
+    assert seen == [(8, "fast"), (16, "fast"), (24, "true")] and run.replay.added == 12
+    assert single.Run(config, None).env.task.physics_name == "fast"
+
+
+def test_goals_are_observed_by_the_policy(single):
+    config = {
+        "env": "ClothFoldGoal-v0", "seed": 0, "threads": 1, "timesteps": 100, "env_kwargs": {"physics": "fast", "action_repeat": 4},
+        "curriculum": {}, "hyperparameters": single.asdict(options(single, n_envs=2)),
+    }  # fmt: skip
+    run = single.Run(config, None)
+    policy = run.policy({})
+    assert run.keys == policy.keys == ("achieved_goal", "desired_goal", "observation")
+    batch, _ = policy.make_vec(2).reset(seed=1)
+    assert np.array_equal(policy(batch), policy.predict({key: part[:2] for key, part in batch.items()})[0])
+    assert run.noisy(None, batch).shape == (2, 8)
+
+
+WRONG = {
+    "--env ClothHang-Hard-v0": "has no hyperparameters for 'ClothHang-Hard-v0' (there are: ClothReach-v0",
+    '--options {"gamma":2}': "--options: gamma 2: must be from 0 to 1",
+    '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
+    "--run taken": "taken holds a run already: go on with --resume taken",
+    "--resume taken": "is a run of ppo, which train.py goes on with",
+}
+
+
+@pytest.mark.parametrize("command", WRONG)
+def test_wrong_arguments_are_refused_as_wrong_flags_are(command, single, tmp_path, monkeypatch, capsys):
+    import tyro
+
+    from clothgym import files
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken").mkdir()
+    config = {
+        "env": "ClothReach-v0", "algo": "ppo", "clone": {}, "curriculum": {}, "env_kwargs": {}, "hyperparameters": {},
+        "num_envs": 4, "timesteps": 100, "seed": 0, "threads": 1, "clothgym": clothgym.__version__,
+    }  # fmt: skip
+    files.write_json(tmp_path / "taken" / "config.json", config)
+    with pytest.raises(SystemExit) as caught:
+        tyro.cli(single.Args, args=command.split(" "))
+    # without the frame around it and its line breaks
+    said = " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert caught.value.code == 2 and WRONG[command] in said

@@ -1,0 +1,500 @@
+"""SAC in one file, to be read from top to bottom: from scratch, on a batch of native environments, on a CPU.
+
+    python training/sac_single_file.py --env ClothReach-v0          # runs/ClothReach-v0_sac_scratch_0
+    python training/sac_single_file.py --resume runs/ClothReach-v0_sac_scratch_0
+
+Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), with the temperature of its section 5.  Three changes make
+it learn on 32 and more environments at once: several updates follow each step of the batch, critics have layer normalization (Ba et
+al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
+Rates depend on counts of steps, not on time, so the same command again gives the same policy.
+
+The folder holds what ``train.py`` leaves: config.json, checkpoint.pt, one a minute, with the replay buffer, progress.jsonl,
+policy.npz, evaluation.json, learning_curve.png and policy.gif.  A run that goes on begins new episodes.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import policies
+import tyro
+from endings import going_on, refused, stopped
+from numpy.typing import NDArray
+from scoring import HELD_OUT
+from tqdm import tqdm
+
+import clothgym
+from clothgym import files
+from clothgym.registration import checked_id
+
+ALGO = "sac_scratch"
+LEARNED_FROM = 3_000  # decisions at random, before the first update
+LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviation, before the tanh
+FIRST_LOG_STD = -1.5
+NOISY_EPISODES = 200  # of the final evaluation with noise, at most
+LEAST_RATE = 0.05  # share of the learning rate that is left at the end
+# the least and the largest value of each number, and of each entry of net_arch
+LIMITS = {
+    "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
+    "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1), "tau": (0, 1), "first_alpha": (1e-6, 10),
+    "reward_scale": (1e-6, 1e6), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1), "evaluations": (1, 10**4),
+    "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
+}  # fmt: skip
+
+
+@dataclass
+class Options:
+    """Hyperparameters.  A flag overrides the environment's value in hyperparams/sac_scratch.yml, and that one the value here."""
+
+    timesteps: int = 200_000  # control steps of all environments, without those in which sheets settle at once
+    n_envs: int = 32  # environments in the batch
+    updates: int = 8  # updates of the critics after each step of the batch
+    policy_delay: int = 2  # of these, the policy and the temperature are updated in every such one
+    batch_size: int = 256  # transitions in an update
+    buffer_size: int = 400_000  # transitions in the replay buffer
+    learning_rate: float = 0.001  # of Adam, at the beginning; it decays linearly over the run
+    gamma: float = 0.95  # discount of a decision, that is, of action_repeat control steps
+    tau: float = 0.01  # share of the critics that their targets take over in an update
+    first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
+    reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
+    normalize: bool = True  # whether observations are normalized
+    net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
+
+
+@dataclass
+class Args:
+    """What to train, for how long, and where to keep it."""
+
+    env: str = "ClothReach-v0"
+    """Id of the environment."""
+    seed: int = 0
+    """Seed of the nets, the noise, the minibatches and the environments."""
+    run: Path | None = None
+    """Folder of the run; runs/ENV_sac_scratch_SEED by default."""
+    resume: Path | None = None
+    """Folder of a run to go on with; its configuration is used."""
+    env_kwargs: str = "{}"
+    """Keyword arguments of the environment, as JSON: '{"action_repeat": 2}'; over those of the hyperparameter file."""
+    options: str = "{}"
+    """Hyperparameters, as JSON: '{"timesteps": 100000, "gamma": 0.9}'; over those of the hyperparameter file."""
+    evaluations: int = 5
+    """Evaluations on the way."""
+    eval_episodes: int = 100
+    """Held-out episodes of each of them."""
+    final_episodes: int = 500
+    """Held-out episodes of the final evaluation, by the mean action; the first 200 of them also with noise."""
+    folder: Path = field(init=False)
+    config: dict[str, Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Everything is checked here, before torch is imported; errors look like those of a wrong flag."""
+        self.env = checked_id(self.env)
+        _within_limits("--", {name: getattr(self, name) for name in ("seed", "evaluations", "eval_episodes", "final_episodes")})
+        if self.resume is not None:
+            self.folder, self.config = self.resume, policies.read_config(self.resume, begun=False)
+            policies.same_as(self.config, self, "env", "seed")
+            policies.own_only(self, "run", "env_kwargs", "options")
+            if self.config["algo"] != ALGO:
+                raise ValueError(f"--resume {self.resume}: is a run of {self.config['algo']}, which train.py goes on with")
+            return
+        path = Path(__file__).parent / "hyperparams" / f"{ALGO}.yml"
+        row = policies.hyperparameters_of(path, self.env)
+        kwargs = row.pop("env_kwargs", {}) | policies.parsed_kwargs(self.env_kwargs)
+        curriculum = row.pop("curriculum", {})
+        policies.check_curriculum(self.env, curriculum)
+        options = row | policies.parsed_kwargs(self.options, "--options")
+        if unknown := set(options) - set(Options.__dataclass_fields__):
+            raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
+        chosen = asdict(Options(**options))
+        _within_limits("--options: ", {name: value for name, value in chosen.items() if name != "normalize"})
+        self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
+        if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
+            raise ValueError(f"{self.folder} holds a run already: go on with --resume {self.folder}, or choose another with --run")
+        self.config = {
+            "clothgym": clothgym.__version__, "env": self.env, "algo": ALGO, "clone": {}, "env_kwargs": kwargs,
+            "num_envs": chosen["n_envs"], "timesteps": chosen["timesteps"], "seed": self.seed, "threads": 1,
+            "curriculum": curriculum, "hyperparameters": chosen,
+        }  # fmt: skip
+
+
+def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
+    for name, value in numbers.items():
+        least, most = LIMITS[name]
+        for one in np.atleast_1d(value):
+            if not least <= one <= most:  # NaN is not, either
+                raise ValueError(f"{prefix}{name.replace('_', '-')} {value}: must be from {least} to {most}")
+
+
+# --- the nets -----------------------------------------------------------------------------------------------------------------
+
+
+class Agent:
+    """A policy, two critics and their slow copies, the targets; and the temperature, which a policy of less entropy lowers."""
+
+    def __init__(self, observations: int, actions: int, options: Options) -> None:
+        import torch  # imported in functions: it takes seconds, after all checks of arguments
+        from torch import nn
+
+        def net(inputs: int, outputs: int, normalized: bool) -> Any:
+            layers, sizes = [], (inputs, *options.net_arch)
+            for size, following in pairwise(sizes):
+                layers += [nn.Linear(size, following), *([nn.LayerNorm(following)] if normalized else []), nn.ReLU()]
+            return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
+
+        self.options, self.target_entropy = options, -float(actions)
+        # the policy's outputs: means, then logarithms of standard deviations
+        self.policy = net(observations, 2 * actions, normalized=False)
+        nn.init.constant_(self.policy[-1].bias[actions:], FIRST_LOG_STD)
+        self.critics, self.targets = (
+            nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(2)) for _ in range(2)
+        )
+        self.targets.load_state_dict(self.critics.state_dict())
+        self.log_alpha = torch.tensor(math.log(options.first_alpha), requires_grad=True)
+        parts = {"policy": self.policy.parameters(), "critics": self.critics.parameters(), "alpha": [self.log_alpha]}
+        self.optimizers = {name: torch.optim.Adam(part, options.learning_rate) for name, part in parts.items()}
+
+    def act(self, observation: Any) -> tuple[Any, Any]:
+        """Actions drawn from the policy, (batch, numbers), and the logarithms of their probability densities, (batch,).
+
+        ``a = tanh(u)`` with u from a normal distribution; ``log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u))``.
+        """
+        import torch
+        from torch.nn.functional import softplus
+
+        mean, log_std = self.policy(observation).chunk(2, dim=-1)
+        log_std = log_std.clamp(*LOG_STD)
+        noise = torch.randn_like(mean)
+        u = mean + log_std.exp() * noise
+        density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi) - 2 * (math.log(2) - u - softplus(-2 * u))
+        return torch.tanh(u), density.sum(-1)
+
+    def values(self, critics: Any, observation: Any, action: Any) -> Any:
+        """What each critic says, (2, batch)."""
+        import torch
+
+        pair = torch.cat([observation, action], dim=-1)
+        return torch.stack([critic(pair).squeeze(-1) for critic in critics])
+
+    def update(self, batch: dict[str, Any], with_policy: bool) -> None:
+        """Learn from a minibatch: observation, action, reward, following observation, and 0 where an episode has terminated."""
+        import torch
+
+        alpha = self.log_alpha.detach().exp()
+        if with_policy:
+            action, log_density = self.act(batch["observation"])
+            # the temperature falls while the entropy is above its target, and rises below it
+            loss = -(self.log_alpha * (log_density.detach() + self.target_entropy)).mean()
+            self._step("alpha", loss, [self.log_alpha])
+        # both critics: towards the reward and the lower of the targets' values, with the entropy's worth, of what follows
+        with torch.no_grad():
+            following, density = self.act(batch["following"])
+            value = self.values(self.targets, batch["following"], following).amin(0) - alpha * density
+            wanted = batch["reward"] + self.options.gamma * batch["goes_on"] * value
+        error = self.values(self.critics, batch["observation"], batch["action"]) - wanted
+        self._step("critics", 0.5 * error.square().mean(1).sum(), list(self.critics.parameters()))
+        # the policy: towards actions that both critics value, and towards entropy
+        if with_policy:
+            value = self.values(self.critics, batch["observation"], action).amin(0)
+            self._step("policy", (alpha * log_density - value).mean(), list(self.policy.parameters()))
+        with torch.no_grad():
+            for target, one in zip(self.targets.parameters(), self.critics.parameters()):
+                target.lerp_(one, self.options.tau)
+
+    def _step(self, name: str, loss: Any, parameters: list[Any]) -> None:
+        """Descend; only the gradients of these parameters are computed."""
+        import torch
+
+        for parameter, gradient in zip(parameters, torch.autograd.grad(loss, parameters)):
+            parameter.grad = gradient
+        self.optimizers[name].step()
+
+    def set_rate(self, rate: float) -> None:
+        for optimizer in self.optimizers.values():
+            optimizer.param_groups[0]["lr"] = rate
+
+    def exported(self, about: dict[str, Any], keys: tuple[str, ...], normalizer: Normalizer) -> Any:
+        """The mean action as a policy that needs no torch."""
+        from clothgym.policies import Policy
+
+        linear = [(one.weight.detach().numpy().T, one.bias.detach().numpy()) for one in self.policy[::2]]
+        weight, bias = linear[-1]
+        linear[-1] = weight[:, : weight.shape[1] // 2], bias[: len(bias) // 2]
+        return Policy(linear, "relu", squashed=True, keys=keys, about=about, normalization=normalizer.numbers())
+
+
+# --- experience ---------------------------------------------------------------------------------------------------------------
+
+
+class Normalizer:
+    """Running mean and variance of all observations so far (Chan et al. 1979)."""
+
+    def __init__(self, size: int, active: bool) -> None:
+        self.mean, self.variance, self.count, self.active = np.zeros(size), np.ones(size), 0.0, active
+
+    def see(self, observation: NDArray) -> None:
+        """observation: (any, numbers)."""
+        if not self.active or not len(observation):
+            return
+        count, away = len(observation), observation.mean(axis=0, dtype=float) - self.mean
+        total = self.count + count
+        squares = self.variance * self.count + observation.var(axis=0, dtype=float) * count
+        self.variance = (squares + away**2 * self.count * count / total) / total
+        self.mean, self.count = self.mean + away * count / total, total
+
+    def numbers(self) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+        """What is subtracted from observations, and what they are then multiplied by; None where they are left as they are."""
+        if not self.active:
+            return None
+        return self.mean.astype(np.float32), (1 / np.sqrt(self.variance + 1e-4)).astype(np.float32)
+
+    def __call__(self, observation: NDArray) -> Any:
+        import torch
+
+        from clothgym.policies import normalized
+
+        numbers = self.numbers()
+        return torch.as_tensor(observation if numbers is None else normalized(observation, numbers))
+
+
+class Replay:
+    """The last transitions, row after row: arrays (buffer_size, ...)."""
+
+    def __init__(self, size: int, observations: int, actions: int) -> None:
+        shapes = {"observation": (observations,), "action": (actions,), "reward": (), "following": (observations,), "goes_on": ()}
+        self.rows = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
+        self.size, self.added = size, 0
+
+    @property
+    def filled(self) -> int:
+        return min(self.added, self.size)
+
+    def add(self, **transitions: NDArray) -> None:
+        """One transition of each environment, the oldest ones make room."""
+        places = (self.added + np.arange(len(transitions["reward"]))) % self.size
+        for name, rows in self.rows.items():
+            rows[places] = transitions[name]
+        self.added += len(places)
+
+    def minibatches(self, count: int, size: int, rng: np.random.Generator, normalizer: Normalizer) -> Iterator[dict[str, Any]]:
+        """So many, of transitions drawn with replacement, their observations normalized."""
+        import torch
+
+        drawn = rng.integers(0, self.filled, count * size)
+        parts = {name: rows[drawn] for name, rows in self.rows.items()}
+        tensors = {
+            name: normalizer(part) if name in ("observation", "following") else torch.as_tensor(part)
+            for name, part in parts.items()
+        }
+        for first in range(0, count * size, size):
+            yield {name: tensor[first : first + size] for name, tensor in tensors.items()}
+
+
+# --- the run ------------------------------------------------------------------------------------------------------------------
+
+
+class Run:
+    """A learner on its batch of environments.
+
+    Attributes:
+        done: control steps so far.  updates: of the critics so far.
+        easy: whether the environments are those of the curriculum.
+        last: each environment's last decision; settling: whether its sheet settles since then.
+        collecting: seconds in which environments stepped, and the policy acted.
+        episodes: success and performance of the last training episodes, which have noise.
+    """
+
+    def __init__(self, config: dict[str, Any], state: dict[str, Any] | None) -> None:
+        import torch
+
+        self.config, self.options = config, Options(**config["hyperparameters"])
+        self.done = 0 if state is None else int(state["num_timesteps"])
+        self.updates = 0 if state is None else int(state["num_updates"])
+        # all that is random comes from the seed, and one thread adds in one order: the same command again gives the same bits
+        torch.set_num_threads(config["threads"])
+        torch.manual_seed(self.seeds()[1])
+        self.rng = np.random.default_rng([config["seed"], self.done])
+        self.enter()
+        sizes = self.observation.shape[1], *self.env.single_action_space.shape
+        self.agent, self.normalizer = Agent(*sizes, self.options), Normalizer(sizes[0], self.options.normalize)
+        self.replay = Replay(self.options.buffer_size, *sizes)
+        self.last = Replay(self.options.n_envs, *sizes).rows
+        self.episodes: deque[tuple[float, float]] = deque(maxlen=200)
+        self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
+        if state is not None:
+            self.restore(state)
+
+    def seeds(self) -> list[int]:
+        """Of the first environment and of torch, others after other numbers of steps."""
+        return np.random.SeedSequence([self.config["seed"], self.done]).generate_state(2).tolist()
+
+    def enter(self) -> None:
+        """Begin episodes in new environments: those of the curriculum until its steps are done, then the run's own."""
+        config, curriculum = self.config, self.config["curriculum"]
+        self.easy = self.done < curriculum.get("n_timesteps", 0)
+        kwargs = config["env_kwargs"] | (curriculum["env_kwargs"] if self.easy else {})
+        made = gym.make_vec(config["env"], num_envs=self.options.n_envs, autoreset_mode="SameStep", **kwargs)
+        self.env: Any = made.unwrapped
+        space = self.env.single_observation_space
+        self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
+        # environment i begins with seed + i, below all held-out seeds
+        self.observation = self.flat(self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))[0])
+        self.settling = np.zeros(self.options.n_envs, bool)
+
+    def flat(self, observation: Any) -> NDArray[np.float32]:
+        """An observation as one array, of goals as well."""
+        return np.concatenate([observation[key] for key in self.keys], axis=-1) if self.keys else observation
+
+    def steps(self) -> Iterator[int]:
+        """A step of the batch and its updates, again and again, until the control steps are done; yields how many were done."""
+        options, least = self.options, LEARNED_FROM
+        while self.done < self.config["timesteps"]:
+            begun = time.perf_counter()
+            self.collect(at_random=self.replay.added < least)
+            self.collecting += time.perf_counter() - begun
+            self.done += options.n_envs * self.env.task.control_steps
+            if self.replay.added >= least:
+                self.agent.set_rate(options.learning_rate * max(1 - self.done / self.config["timesteps"], LEAST_RATE))
+                for batch in self.replay.minibatches(options.updates, options.batch_size, self.rng, self.normalizer):
+                    self.updates += 1
+                    self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
+            yield options.n_envs * self.env.task.control_steps
+            if self.easy and self.done >= self.config["curriculum"]["n_timesteps"]:
+                self.enter()
+
+    def collect(self, at_random: bool) -> None:
+        """One decision of each environment, into the replay buffer.
+
+        While a sheet settles actions have no effect: what it earns then is of the last decision before, as with
+        ``settling="at_once"``, which not every sheet takes.
+        """
+        import torch
+
+        before, last, acting = self.observation, self.last, ~self.settling
+        self.normalizer.see(before[acting])
+        if at_random:
+            action = self.rng.uniform(-1, 1, (len(before), *self.env.single_action_space.shape)).astype(np.float32)
+        else:
+            with torch.no_grad():
+                action = self.agent.act(self.normalizer(before))[0].numpy()
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        following = self.observation = self.flat(observation)
+        # in same-step mode an environment that has ended shows the next episode's first observation already
+        if (ended := np.flatnonzero(terminated | truncated)).size:
+            following = following.copy()
+            for i in ended:
+                following[i] = self.flat(info["final_obs"][i])
+            final = info["final_info"]
+            self.episodes.extend(zip(final["is_success"][ended].tolist(), final["normalized_performance"][ended].tolist()))
+        last["observation"][acting], last["action"][acting], last["reward"][acting] = before[acting], action[acting], 0
+        last["reward"] += self.options.reward_scale * reward
+        last["following"], last["goes_on"] = following, ~terminated
+        self.settling = info["settling"]
+        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
+
+    def policy(self, about: dict[str, Any]) -> Any:
+        """The mean action as it is now, as a file holds it."""
+        config = self.config
+        own = {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": ALGO, "seed": config["seed"]}
+        return self.agent.exported(own | about, self.keys, self.normalizer)
+
+    def noisy(self, env: Any, observations: Any) -> NDArray:
+        """Actions with the noise of the policy."""
+        import torch
+
+        with torch.no_grad():
+            return self.agent.act(self.normalizer(self.flat(observations)))[0].numpy()
+
+    def state(self, times: dict[str, float]) -> dict[str, Any]:
+        """All that a run needs to go on, but for the episodes."""
+        import torch
+
+        agent, normalizer, filled = self.agent, self.normalizer, self.replay.filled
+        parts = {name: torch.as_tensor(rows[:filled]) for name, rows in self.replay.rows.items()}
+        parts |= {"added": torch.tensor(self.replay.added), "log_alpha": agent.log_alpha.detach()}
+        parts |= {name: torch.as_tensor(getattr(normalizer, name)) for name in ("mean", "variance", "count")}
+        return {
+            "policy": agent.policy.state_dict(),
+            "optimizer": {name: one.state_dict() for name, one in agent.optimizers.items()}
+            | {"of critics": agent.critics.state_dict(), "of targets": agent.targets.state_dict()},
+            "variables": parts, "constraint": {}, "num_timesteps": self.done, "num_updates": self.updates, "times": times,
+        }  # fmt: skip
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a state.
+
+        Raises:
+            ValueError: it is of other nets than the configuration describes.
+        """
+        agent, parts, optimizers = self.agent, dict(state["variables"]), dict(state["optimizer"])
+        with files.naming(Path(policies.CHECKPOINT), "checkpoint of the networks in its configuration", "train again"):
+            agent.policy.load_state_dict(state["policy"])
+            agent.critics.load_state_dict(optimizers.pop("of critics"))
+            agent.targets.load_state_dict(optimizers.pop("of targets"))
+            for name, one in agent.optimizers.items():
+                one.load_state_dict(optimizers[name])
+            agent.log_alpha.data = parts["log_alpha"]
+            for name in ("mean", "variance"):
+                setattr(self.normalizer, name, parts[name].numpy())
+            self.normalizer.count, self.replay.added = float(parts["count"]), int(parts["added"])
+            for name, rows in self.replay.rows.items():
+                rows[: self.replay.filled] = parts[name].numpy()
+
+
+def acting(policy: Any) -> policies.Policy:
+    """An exported policy as evaluations take it."""
+    return lambda env, observations: policy(observations)
+
+
+def train(args: Args) -> None:
+    """Learn, with held-out evaluations on the way, and score what was learned."""
+    import learning  # imported here: torch takes seconds, after all checks of arguments
+    from scoring import run_episodes, score
+
+    from clothgym.adapters.runs import load_last, save_tensors
+
+    folder, config = args.folder, args.config
+    with refused():
+        state = load_last(folder) if args.resume is not None and policies.has_checkpoint(folder) else None
+        run, record = Run(config, state), learning.Record(folder, config, state)
+    folder.mkdir(parents=True, exist_ok=True)
+    files.write_json(folder / policies.CONFIG, config)
+    every = max(1, config["timesteps"] // args.evaluations)
+    with tqdm(total=config["timesteps"], initial=run.done, unit="step", unit_scale=True, disable=None) as bar:
+        record.clock.start()
+        for count in run.steps():
+            bar.update(count)
+            if run.episodes:
+                bar.set_postfix_str("success {:.2f}, performance {:.2f}".format(*np.mean(run.episodes, axis=0)), refresh=False)
+            is_last = run.done >= config["timesteps"]
+            evaluated = is_last or run.done // every > (run.done - count) // every
+            if evaluated or record.is_due():
+                record.clock.stop()
+                record.collecting = run.collecting
+                if evaluated:
+                    line = record.note(acting(run.policy({})), run.done, args.eval_episodes)
+                    tqdm.write(f"{run.done:,} steps: success {line['success_rate']:.3f}, {line['normalized_performance']:.3f}")
+                save_tensors(folder / policies.CHECKPOINT, run.state(record.times()))
+                record.saved = time.perf_counter()
+                record.clock.start()
+    policy = run.policy(learning.account_of(record))
+    seeds = list(range(HELD_OUT, HELD_OUT + min(args.final_episodes, NOISY_EPISODES)))
+    noisy = score(run_episodes(config["env"], run.noisy, seeds, **config["env_kwargs"]))
+    said = {name: noisy[name] for name in ("episodes", "success_rate", "success_rate_ci95", "normalized_performance")}
+    print(f"with noise: success {said['success_rate']:.3f}, performance {said['normalized_performance']:.3f}")
+    policy.about |= learning.conclude(record, acting(policy), args.final_episodes, {"with_noise": said})
+    policy.save(folder / learning.POLICY)
+
+
+if __name__ == "__main__":
+    given = tyro.cli(Args)
+    with stopped(lambda: going_on("sac_single_file.py", given.folder)):
+        train(given)
