@@ -103,6 +103,7 @@ def describe(about: dict[str, Any], env: Any) -> dict[str, Any]:
         "task": env.unwrapped.task_description,
         "fps": env.unwrapped.metadata["render_fps"],
         "agent_pos": agent_names(task),
+        "observation_keys": list(getattr(env.single_observation_space, "spaces", ())),
         "observation_slices": {name: [at.start, at.stop] for name, at in task.observation_slices.items()},
         "versions": {name: metadata.version(name) for name in ("numpy", "numba", "gymnasium")}
         | {"clothgym": clothgym.__version__, "python": platform.python_version()},
