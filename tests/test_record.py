@@ -115,6 +115,44 @@ def test_a_killed_recording_goes_on_to_the_same_set(recorded, tmp_path, form, wh
         assert data.read_bytes() == (whole / data.relative_to(folder)).read_bytes()
 
 
+def test_minari_opens_a_set_by_its_name(recorded, tmp_path, monkeypatch):
+    """In its root, by the names of the folders; and makes the environment again."""
+    minari = pytest.importorskip("minari")
+    flags = ("--env", "ClothFoldGoal-v0", "--policy", "random", "--episodes", 2, "--seed", 3)
+    root = tmp_path / "cloth" / "fold"
+    root.mkdir(parents=True)
+    folder, _, _ = recorded(*flags, form="minari", out=str(root / "random-v0"))
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = minari.load_dataset("cloth/fold/random-v0")
+    assert dataset.spec.dataset_name == "random" and dataset.spec.version == 0
+    env = dataset.recover_environment()
+    assert env.spec.id == "ClothFoldGoal-v0" and env.observation_space == dataset.observation_space
+    observation, info = env.reset(seed=4)
+    for key, part in dataset[1].observations.items():
+        assert np.array_equal(part[0], observation[key])
+    assert dataset[1].infos["strain_max"][0] == info["strain_max"] and dataset[1].terminations[-1]
+
+
+def test_robomimic_opens_a_set(recorded):
+    pytest.importorskip("robomimic")
+    from robomimic.utils import obs_utils
+    from robomimic.utils.dataset import SequenceDataset
+
+    keys = ("agent_pos", "environment_state")
+    folder, _, episodes = recorded("--env", "ClothReach-v0", "--episodes", 2, form="robomimic")
+    obs_utils.initialize_obs_utils_with_obs_specs({"obs": {"low_dim": list(keys), "rgb": []}})
+    found = SequenceDataset(str(folder / "demo.hdf5"), obs_keys=keys, dataset_keys=("actions", "rewards", "dones"))
+    frames = [(episode, step) for episode in episodes for step in range(len(episode["actions"]))]
+    assert len(found) == len(frames) == 80
+    for k, (episode, step) in enumerate(frames):
+        frame = found[k]
+        assert np.array_equal(frame["actions"][0], episode["actions"][step]) and frame["dones"][0] == (step == 39)
+        assert frame["rewards"][0] == episode["rewards"][step]
+        for key in keys:
+            assert np.array_equal(frame["obs"][key][0], episode[key][step])
+            assert step == 39 or np.array_equal(frame["next_obs"][key][0], episode[key][step + 1])
+
+
 def test_failed_episodes_are_marked_or_left_out(recorded):
     flags = ("--env", "ClothReach-v0", "--policy", "expert", "--noise", 0.2, "--num-envs", 3)
     _, kept, _ = recorded(*flags, "--episodes", 12, "--failed", "keep", out="kept")

@@ -9,6 +9,7 @@ Episode ``i`` is the one that seed ``seed + i`` gives.  After a crash, the same 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -101,7 +102,7 @@ def record(args: Args) -> None:
     chosen = formats.named(args.format)
     about = arguments(args)
     env = recordings.make_batch(about, min(args.num_envs, args.episodes), args.threads)
-    about = recordings.describe(about | {"name": f"cloth/{args.out.name}"}, env)
+    about = recordings.describe(about | {"name": "cloth/" + re.sub(r"[^\w.-]", "_", args.out.name)}, env)
     journal = recordings.Journal(args.out, about, args.max_gb * 1e9)
     policy = None if args.policy == "random" else policies.named(args.policy, args.env, args.seed)
     with tqdm(total=args.episodes, initial=sum(journal.ended.values()), unit="episode", disable=None) as bar:

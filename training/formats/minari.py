@@ -5,6 +5,7 @@ In a folder of Minari's root, ``~/.minari/datasets/cloth/fold/expert-v0``, the s
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from recordings import Episode
 from clothgym.adapters.lerobot import named
 
 DATA = "data"
+VERSIONED = re.compile(r"-v\d+$")  # as names of sets must be
 
 
 def write(folder: Path, about: dict[str, Any], episodes: Iterator[Episode]) -> None:
@@ -37,7 +39,7 @@ def write(folder: Path, about: dict[str, Any], episodes: Iterator[Episode]) -> N
         storage.update_episodes([EpisodeBuffer(seed=episode.seed, observations=observations, actions=episode.actions, **own)])
     storage.update_metadata(
         {
-            "dataset_id": about["name"],
+            "dataset_id": about["name"] if VERSIONED.search(about["name"]) else f"{about['name']}-v0",
             "algorithm_name": about["policy"],
             "description": f"{about['task']} Recorded with clothgym {about['versions']['clothgym']}.",
             "minari_version": minari.__version__,
