@@ -94,10 +94,10 @@ def test_observations_lie_in_their_space(env_id, sizes):
     env = make_env(2, env_id=env_id, obs_mode="keypoints")
     observation, _ = env.reset(seed=[3, 4])
     assert tuple(box.shape[0] for box in env.single_observation_space.values()) == sizes
-    push = np.sign(np.random.default_rng(0).uniform(-1, 1, (2, env.single_action_space.shape[0]))).astype(np.float32)
-    for _ in range(40):
+    rng = np.random.default_rng(0)
+    for _ in range(60):
         assert env.observation_space.contains(observation)
-        observation, *_ = env.step(push)
+        observation, *_ = env.step(np.sign(rng.uniform(-1, 1, env.action_space.shape)).astype(np.float32))
     goal = env.env.task.observed.batch()["desired_goal"] if env_id == "ClothFoldGoal-v0" else None
     assert goal is None or np.array_equal(observation["environment_state"][:, -12:], goal)
 
