@@ -238,6 +238,7 @@ def test_wrong_flags_are_refused(recorded):
         (("--pictures", "video"), "--pictures video: is for --format lerobot with --obs-mode rgb"),
         (("--seed", 999_990), "seeds are for evaluation"),
         (("--noise", 2), "--noise 2.0: must be from 0 to 1"),
+        (("--noise", 0.1, "--policy", "random"), "--noise 0.1: the actions of --policy random are noise already"),
         (("--policy", "exprt"), "exprt"),
     ):
         done = call("record.py", *flags)

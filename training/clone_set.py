@@ -28,6 +28,7 @@ from scoring import HELD_OUT, run_episodes, score
 from clothgym import files
 from clothgym.adapters.runs import POLICY, exported
 from clothgym.folders import expand_paths
+from clothgym.lab.bench import machine
 from clothgym.policies import Policy
 
 
@@ -111,7 +112,8 @@ def main(args: Args) -> None:
     print(f"cloned {policy.about['samples']:,} samples of {args.data}: mean squared error {left:.4f}", flush=True)
     seeds = [HELD_OUT + k for k in range(args.episodes)]
     row = score(run_episodes(about["env"], exported(args.run / POLICY), seeds, **policy.about["env_kwargs"]))
-    files.write(args.run / "evaluation.json", json.dumps(row | policy.about, indent=1, default=float) + "\n")
+    row |= policy.about | {"machine": machine()}
+    files.write(args.run / "evaluation.json", json.dumps(row, indent=1, default=float) + "\n")
     low, high = row["success_rate_ci95"]
     print(f"{about['env']}: success {row['success_rate']:.3f} ({low:.3f} to {high:.3f}) in {args.episodes} held-out episodes")
 

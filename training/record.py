@@ -74,6 +74,8 @@ class Args:
             raise ValueError(f"--seed {self.seed}: its episodes reach {HELD_OUT}, from where on seeds are for evaluation")
         if not 0 <= self.noise <= 1:
             raise ValueError(f"--noise {self.noise}: must be from 0 to 1")
+        if self.noise and self.policy == "random":
+            raise ValueError(f"--noise {self.noise}: the actions of --policy random are noise already")
         if not self.max_gb > 0:
             raise ValueError(f"--max-gb {self.max_gb}: must be positive")
         if self.pictures == "video" and (self.format, self.obs_mode) != ("lerobot", "rgb"):
