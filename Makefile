@@ -3,11 +3,13 @@
 # make check: lint, type check, and tests of each floor that are quick once their kernels are compiled
 # make bits: digests of every id, method and contact, compiled for this processor and for two other instruction sets of x86-64
 # make clients: tests with other libraries      make rllib: with Ray, and the older Gymnasium that it pins
+# make lerobot: with LeRobot, in Python 3.12 or later, LEROBOT_PYTHON
 # make oldest: tests with the oldest dependencies; each of these in an environment of its own
 # make release: wheel and sdist of what is committed, checked and tried out      make notebook: runs docs/notebooks/
 # make site: the documentation as a site in build/site, from the pages, the docstrings and the command line's help
 PYTHON ?= python3
 PYTHONS ?= $(PYTHON)
+LEROBOT_PYTHON ?= python3.12
 VENV ?= .venv
 BIN = $(VENV)/bin
 ENV ?= ClothDrape-v0
@@ -15,7 +17,7 @@ SEED ?= 0
 QUICK = floors closest intersections mesh grid_forces integrators collisions self_contact guards simulation shading reach bits_command
 OLDEST = closest intersections mesh integrators simulation envs reach
 
-.PHONY: train check lint test test-all bits clients rllib oldest notebook release site bench clean
+.PHONY: train check lint test test-all bits clients rllib lerobot oldest notebook release site bench clean
 
 train: $(VENV)/ready
 	$(BIN)/python training/train.py --env $(ENV) --seed $(SEED) $(ARGS)
@@ -50,6 +52,12 @@ rllib:
 	$(VENV)-rllib/bin/pip install --quiet --constraint .ci/rllib.txt "torch==2.13.0" "pytest>=8" ".[rllib]"
 	cd tests && ../$(VENV)-rllib/bin/python -m pytest -q rllib test_reach.py test_vector_env.py
 
+lerobot:
+	$(LEROBOT_PYTHON) -m venv $(VENV)-lerobot
+	$(VENV)-lerobot/bin/pip install --quiet --no-deps "lerobot==0.6.1"
+	$(VENV)-lerobot/bin/pip install --quiet --constraint .ci/lerobot.txt "torch==2.13.0" $$(sed '/^#/d; s/=.*//' .ci/lerobot.txt) "pytest>=8" ".[record]"
+	cd tests && ../$(VENV)-lerobot/bin/python -m pytest -q lerobot
+
 oldest:
 	$(PYTHON) -m venv $(VENV)-oldest
 	$(VENV)-oldest/bin/pip install --quiet --constraint .ci/oldest.txt "pytest>=8" .
@@ -83,4 +91,4 @@ $(VENV)/ready: pyproject.toml .ci/constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-oldest $(VENV)-notebook $(VENV)-site build dist *.egg-info clothgym/envs
+	rm -rf $(VENV) $(VENV)-clients $(VENV)-rllib $(VENV)-lerobot $(VENV)-oldest $(VENV)-notebook $(VENV)-site build dist *.egg-info clothgym/envs

@@ -1,6 +1,6 @@
 """Cost of self-collision: relative to none, by number of particles, and compared with MuJoCo.
 
-    pip install "mujoco>=4" matplotlib tqdm
+    pip install "mujoco-core>=4.0.1" matplotlib tqdm
     python benchmarks/self_collision_cost.py                      # measures what the results lack, prints tables, draws the plot
     python benchmarks/self_collision_cost.py --select cost alone  # cases whose names hold all these words
 
@@ -20,7 +20,6 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import lru_cache, partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -228,16 +227,16 @@ def start_of(model: Any) -> Any:
 
 
 def measure_mujoco(engine: str, contact: str, steps: int) -> Row:
-    """One sheet on one core."""
+    """One sheet on one core; processor time, which other programs on the machine disturb least."""
     model = mujoco_model(contact, steps)
     triangles = model.flex_elem.reshape(-1, 3)
     best, counts, warned = np.full(round(SECONDS / FRAME), np.inf), [], 0
     for _ in range(ROUNDS):
         data = start_of(model)
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {steps}", leave=False, disable=None):
-            begun = time.perf_counter()
+            begun = time.process_time()
             mujoco.mj_step(model, data, nstep=steps)
-            best[frame] = min(best[frame], time.perf_counter() - begun)
+            best[frame] = min(best[frame], time.process_time() - begun)
             counts.append(int(count_intersections(triangles, data.flexvert_xpos)[0]))
         warned = sum(warning.number for warning in data.warning)
     return _speeds(best, 1) | _counted(np.array(counts[-len(best) :])) | {"warnings": int(warned)}
@@ -253,9 +252,9 @@ def measure_ours(engine: str, contact: str, lanes: int) -> Row:
     for _ in range(ROUNDS):
         simulation.reset(positions=maneuver.start - (0, 0, 0.1 * SIDE - DROP))
         for frame in tqdm(range(len(best)), desc=f"{engine} {contact} {lanes}", leave=False, disable=None):
-            begun = time.perf_counter()
+            begun = time.process_time()
             simulation.step()
-            best[frame] = min(best[frame], time.perf_counter() - begun)
+            best[frame] = min(best[frame], time.process_time() - begun)
             counts.append(count_intersections(mesh.triangles, simulation.positions))
     return {"steps": simulation.substeps} | _speeds(best, lanes) | _counted(np.array(counts[-len(best) :]))
 
@@ -318,7 +317,7 @@ def draw(rows: list[Row], path: Path) -> None:
 
 def main() -> None:
     args = parsed(__doc__)
-    results = fill(RESULT, cases(), args.select, args.fresh, ABOUT | {"mujoco version": version("mujoco")})
+    results = fill(RESULT, cases(), args.select, args.fresh, ABOUT | {"mujoco version": mujoco.__version__})
     for name in cases():
         if results.get(name):
             print(f"\n{name}\n{table(results[name])}")

@@ -18,6 +18,7 @@ from clothgym.envs.pages import check_keywords, completed
 from clothgym.envs.pictures import RENDER_MODES, check_render_mode, checked_frame_size, draw, frames_a_second, renderer_of
 from clothgym.envs.task import Task
 from clothgym.exclusive import CallGuard, exclusive
+from clothgym.registration import ENVIRONMENTS
 from clothgym.warning import warn_caller
 
 IMAGE_SIZE = 480
@@ -59,6 +60,12 @@ class TaskHolder:
     def observation_slices(self) -> dict[str, slice]:
         """Where each observation lies in an environment's state vector, by its name on the page."""
         return dict(self.task.observation_slices)
+
+    @property
+    def task_description(self) -> str:
+        """The task as a sentence, for policies conditioned on language: as its id is registered, or its docstring's first line."""
+        registered = dict(ENVIRONMENTS.values()).get(type(self).__name__.removesuffix("Env").removesuffix("Vector"))
+        return registered or (self.task_class.__doc__ or "").strip().partition("\n")[0]
 
     @property
     def mesh_edges(self) -> NDArray[np.int64]:

@@ -44,7 +44,7 @@ SHORTER = (
     (r"n_eval_episodes=\d+", "n_eval_episodes=2"),
     (r"len\(successes\) < \d+", "len(successes) < 2"),
     (r"\b64\b", "4"),
-    (r"range\(12\)", "range(2)"),
+    (r"default_rng\(0\), 12,", "default_rng(0), 2,"),
     (r"num_envs=16\b", "num_envs=4"),
     (r"for frame in range\(60\)", "for frame in range(4)"),
     (r"\[ball\]\] \* 60", "[ball]] * 4"),

@@ -6,7 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
-from stable_baselines3.common.vec_env import VecMonitor
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor
 from test_envs import flat
 
 from clothgym.adapters.sb3 import make_sb3_vec_env
@@ -70,3 +72,27 @@ def test_attributes_methods_and_errors(env_id):
         env.set_attr("render_mode", None, indices=[0])
     with pytest.raises(ValueError, match=env_id):
         make_sb3_vec_env("CartPole-v1", 2)
+
+
+@pytest.mark.parametrize("kind", [None, SubprocVecEnv])
+def test_the_library_s_own_functions_work_with_default_arguments(kind):
+    """``make_vec_env`` and ``evaluate_policy``: the mean of the returns of the same episodes, played one by one."""
+    # worker processes import nothing but what the id names
+    envs = make_vec_env("clothgym:ClothReach-v0", n_envs=2, seed=5, vec_env_cls=kind)
+    model = PPO("MlpPolicy", envs, n_steps=20, batch_size=20, device="cpu", seed=0).learn(40)
+    envs.seed(100)
+    mean, deviation = evaluate_policy(model, envs)
+    envs.close()
+    returns = []
+    for lane in range(2):
+        env = gym.make("ClothReach-v0")
+        # five episodes of each, the later ones drawn by the environment's generator
+        for episode in range(5):
+            observation, _ = env.reset(seed=100 + lane if episode == 0 else None)
+            total, done = 0.0, False
+            while not done:
+                action, _ = model.predict(observation, deterministic=True)
+                observation, reward, terminated, truncated, _ = env.step(action)
+                total, done = total + reward, terminated or truncated
+            returns.append(total)
+    assert mean == pytest.approx(np.mean(returns), abs=1e-5) and deviation == pytest.approx(np.std(returns), abs=1e-5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_MODULES = ("lagrange", "pixels", "runs", "sb3")
+_MODULES = ("lagrange", "lerobot", "pixels", "runs", "sb3")
 
 
 def __getattr__(name: str) -> Any:

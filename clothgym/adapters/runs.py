@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from numpy.typing import NDArray
 
 import clothgym
@@ -141,7 +142,24 @@ def exported(path: Path) -> Policy:
         FileNotFoundError, ValueError: there is none, or it is damaged.
     """
     policy = policies.read(path)
-    return lambda env, observations: policy(observations)
+    return Chunks(policy) if "chunk" in policy.about else lambda env, observations: policy(observations)
+
+
+class Chunks:
+    """A policy whose network gives the actions of several steps at once, for a batch whose episodes begin together.
+
+    Of each chunk the first ``about["execute"]`` actions are executed, then the network is asked again.
+    """
+
+    def __init__(self, policy: policies.Policy) -> None:
+        self.policy, self.execute = policy, policy.about["execute"]
+        self.actions: NDArray = np.zeros(0)  # of the last chunk, (num_envs, chunk, numbers)
+
+    def __call__(self, env: Any, observations: Any) -> NDArray:
+        step = int(env.unwrapped.task.steps_taken().max()) % self.execute
+        if step == 0:
+            self.actions = self.policy(observations).reshape(env.num_envs, self.policy.about["chunk"], -1)
+        return self.actions[:, step]
 
 
 def learned(folder: Path, env_id: str) -> Policy:
