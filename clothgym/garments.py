@@ -1,9 +1,9 @@
 """Floor 1: garments as two panels of one outline, sewn along their seams; and garments from files.
 
-The outlines, the names of their key points and the ranges of their sizes are those of Lips et al. 2024, Learning keypoints for
-robotic cloth manipulation using synthetic data (arXiv 2401.01734), from the MIT-licensed tlpss/synthetic-cloth-data,
-``geometric_templates.py`` and ``cloth_meshes.py``.  The neckline is ours: there both panels have one, and here the back's is higher.
-So are trousers, long sleeves and skirts, which the source does not have.
+Outlines, key points and ranges of sizes of T-shirts, shorts and towels are those of Lips et al. 2024, Learning keypoints for
+robotic cloth manipulation using synthetic data (arXiv 2401.01734), in the MIT-licensed tlpss/synthetic-cloth-data
+(``geometric_templates.py``, ``cloth_meshes.py``).  Long sleeves, trousers and skirts are additions, and so is the neckline, which
+is higher on the back.
 
 A garment lies flat, centered on the origin, with its front up and its neck or waist toward +y.  "left" and "right" are -x and +x.
 The right half of a panel is triangulated, mirrored, and copied for the other panel.
@@ -25,17 +25,18 @@ from clothgym.geometry.regions import fill_regions
 from clothgym.mesh import ClothMesh, frozen, grid
 from clothgym.triangles import load_mesh, triangle_mesh
 
-SPACING, THICKNESS = 0.02, 0.002  # of the particles, and that the cloth keeps to itself [m]
-LAYERS = 1 / 0.28  # distance of the layers at rest, in thicknesses: the default of self-collision, ``USUAL``, then is this thickness
-STEEPEST = 0.25  # largest distance of a layer from the plane of the seams, in spacings
+SPACING = 0.02  # of the particles [m]
+USUAL_THICKNESS = 0.1  # that the cloth keeps to itself, in spacings
+LAYERS = 1 / 0.28  # distance of the layers at rest, in thicknesses: the usual thickness of self-collision is then the same
+STEEPEST = 0.25  # largest distance of a layer from the seams' plane, in spacings
 MOST_DRAWS = 1000  # of sizes until an outline is possible
 NECKLINE_POINTS = 64  # of the polygon that stands for a neckline
 BACK_SHARE = 0.25  # depth of the back's neckline over that of the front's
 LEAST_INSEAM = 0.05  # of legs [m]
 LEAST_GAP = 0.01  # between the legs [m]
 
-# ranges of the sizes, from which random garments are drawn, and whose middles are the defaults; widths and lengths in meters, angles
-# in radians, and those in RELATIVE as a share of another size
+# ranges of the sizes, from which random garments are drawn, and whose middles are the defaults; their meanings and units are in the
+# docstrings of the garments
 TSHIRT = {
     "chest_width": (0.38, 0.65), "shoulder_width": (0.9, 1.05), "neck_width": (0.45, 0.55), "neck_depth": (0.05, 0.1),
     "sleeve_width": (0.25, 0.3), "sleeve_length": (0.19, 0.2), "length": (0.62, 0.75), "chest_length": (0.65, 0.7),
@@ -50,7 +51,7 @@ RANGES: dict[str, dict[str, tuple[float, float]]] = {
     "long_sleeve": {**TSHIRT, "sleeve_width": (0.2, 0.25), "sleeve_length": (0.45, 0.55)},
     "shorts": SHORTS,
     "trousers": {**SHORTS, "crotch_height": (0.2, 0.28), "pipe_width": (0.35, 0.5), "length": (0.8, 1.05),
-                 "waist_pipe_angle": (0.05, 0.15), "pipe_outer_angle": (0.0, 0.1)},
+                 "waist_pipe_angle": (0.02, 0.08), "pipe_outer_angle": (0.0, 0.1)},
     "skirt": {"waist_width": (0.3, 0.45), "length": (0.35, 0.7), "side_angle": (0.05, 0.3)},
     "towel": {"length": (0.5, 1.0), "width": (2 / 3, 1.0)},
 }  # fmt: skip
@@ -94,19 +95,21 @@ class _Half(NamedTuple):
     """The right half of a panel, counter-clockwise from where the border leaves the axis x = 0 to where it comes back.
 
     front: sides of the front.  back: of the last side, the neckline, the back's; None if both panels are the same.
+    first: the key point where the first side begins, if it is one.
     """
 
     front: list[_Side]
     back: _Side | None = None
+    first: str = ""
 
 
-def tshirt(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: float) -> Garment:
+def tshirt(spacing: float = SPACING, thickness: float | None = None, **sizes: float) -> Garment:
     """A T-shirt: open at neck, hem and cuffs; the neckline of the back is higher.
 
     Args:
         spacing: of the particles [m].
-        thickness: that the cloth keeps to itself by default with ``self_collision="strict"`` [m]; at rest the layers are 3.6 times as
-            far apart.
+        thickness: that the cloth keeps to itself by default with ``self_collision="strict"`` [m], usually a tenth of the spacing.
+            At rest the layers are 3.6 times as far apart.
         sizes: chest_width, sleeve_length, length and neck_depth [m]; shoulder_width, neck_width, sleeve_width and waist_width over
             chest_width; chest_length (from the hem to the armpits) over length less 2 cm; sleeve_angle and shoulder_angle below
             the horizontal, and sleeve_inner_angle of the cuff [rad].  The middle of each range in ``RANGES`` by default.
@@ -118,12 +121,12 @@ def tshirt(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: floa
     return make("tshirt", spacing, thickness, sizes)
 
 
-def long_sleeve(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: float) -> Garment:
+def long_sleeve(spacing: float = SPACING, thickness: float | None = None, **sizes: float) -> Garment:
     """A T-shirt with long sleeves; see ``tshirt``."""
     return make("long_sleeve", spacing, thickness, sizes)
 
 
-def shorts(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: float) -> Garment:
+def shorts(spacing: float = SPACING, thickness: float | None = None, **sizes: float) -> Garment:
     """Shorts: open at waist and legs.
 
     sizes: waist_width, crotch_height (from the crotch up to the waist) and length [m]; pipe_width (of a leg at its end) over
@@ -133,12 +136,12 @@ def shorts(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: floa
     return make("shorts", spacing, thickness, sizes)
 
 
-def trousers(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: float) -> Garment:
+def trousers(spacing: float = SPACING, thickness: float | None = None, **sizes: float) -> Garment:
     """Long trousers; see ``shorts``."""
     return make("trousers", spacing, thickness, sizes)
 
 
-def skirt(spacing: float = SPACING, thickness: float = THICKNESS, **sizes: float) -> Garment:
+def skirt(spacing: float = SPACING, thickness: float | None = None, **sizes: float) -> Garment:
     """A skirt: open at waist and hem.
 
     sizes: waist_width and length [m], and side_angle of the sides from the vertical [rad].  Others, and errors: see ``tshirt``.
@@ -151,12 +154,10 @@ def towel(spacing: float = SPACING, **sizes: float) -> Garment:
 
     sizes: length [m], and width over length.  Others, and errors: see ``tshirt``.
     """
-    return make("towel", spacing, THICKNESS, sizes)
+    return make("towel", spacing, None, sizes)
 
 
-def random_garment(
-    kind: str, seed: int | np.random.Generator, spacing: float = SPACING, thickness: float = THICKNESS
-) -> Garment:
+def random_garment(kind: str, seed: int | np.random.Generator, spacing: float = SPACING, thickness: float | None = None) -> Garment:
     """A garment whose sizes are drawn uniformly from ``RANGES``, again until its outline is possible.
 
     kind: a name of ``RANGES``.  seed: of a generator, or a generator, from which the sizes are drawn.  Others, and errors: see
@@ -171,11 +172,14 @@ def random_garment(
     raise RuntimeError(f"no possible {kind} within {MOST_DRAWS} draws")
 
 
-def make(kind: str, spacing: float = SPACING, thickness: float = THICKNESS, sizes: Mapping[str, float] | None = None) -> Garment:
-    """A garment of a kind of ``RANGES``, for instance from a task's options; arguments and errors as for ``tshirt``."""
+def make(
+    kind: str, spacing: float = SPACING, thickness: float | None = None, sizes: Mapping[str, float] | None = None
+) -> Garment:  # fmt: skip
+    """A garment of a kind of ``RANGES``; arguments and errors as for ``tshirt``."""
     # sizes
     known("garment", kind, RANGES)
-    spacing, thickness = positive("spacing", spacing), positive("thickness", thickness)
+    spacing = positive("spacing", spacing)
+    thickness = USUAL_THICKNESS * spacing if thickness is None else positive("thickness", thickness)
     chosen = {name: (low + high) / 2 for name, (low, high) in RANGES[kind].items()}
     for name, value in (sizes or {}).items():
         known(f"size of a {kind}", name, chosen)
@@ -186,11 +190,11 @@ def make(kind: str, spacing: float = SPACING, thickness: float = THICKNESS, size
     half = OUTLINES[kind](chosen)
     if flaw := _flaw(half):
         given = ", ".join(f"{name}={value:.4g}" for name, value in chosen.items())
-        raise ValueError(f"{kind}: {flaw} with {given}: choose sizes nearer to the ranges in clothgym.garments.RANGES")
+        raise ValueError(f"{kind}: {flaw} with {given}: choose sizes nearer to their ranges in clothgym.garments.RANGES")
     if LAYERS * thickness / 2 > STEEPEST * spacing:
         raise ValueError(
-            f"thickness={thickness:g}: at spacing={spacing:g} must be at most {2 * STEEPEST / LAYERS * spacing:.2g} m, so that the "
-            "layers meet at the seams"
+            f"thickness={thickness:g}: must be at most {2 * STEEPEST / LAYERS * spacing:.2g} m at spacing={spacing:g}, so that the "
+            "layers meet at the seams without a sharp bend"
         )
     return _sewn(kind, half, spacing, LAYERS * thickness, chosen)
 
@@ -263,7 +267,7 @@ def _legs_half(sizes: Mapping[str, float]) -> _Half:
         _line("side", "waist", outer, waist, True),
         _line("waist", "", waist, [0.0, waist[1]], False),
     ]
-    return _Half(front)
+    return _Half(front, first="crotch")
 
 
 def _skirt_half(sizes: Mapping[str, float]) -> _Half:
@@ -294,8 +298,8 @@ def _line(name: str, key_point: str, start: ArrayLike, end: ArrayLike, sewn: boo
 
 
 def _neckline(neck: NDArray, depth: float, round_: bool) -> NDArray[np.float64]:
-    """From the neck to the middle, ``depth`` below it [m], (points, 2): half an ellipse or a parabola, so that both leave the neck at
-    directions that lie well apart."""
+    """From the neck to the middle, ``depth`` below it [m], (points, 2): half an ellipse, or a parabola, which leaves a wide angle
+    between both at the neck."""
     share = np.linspace(0, 1, NECKLINE_POINTS)
     if round_:
         along, down = (1 - share**2) / (1 + share**2), 2 * share / (1 + share**2)
@@ -331,7 +335,7 @@ def _spaced(points: NDArray, spacing: float) -> NDArray[np.float64]:
 
 
 def _panel(half: _Half, spacing: float) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """The whole panel of the back: points [m], (points, 2), triangles, those of them that the front has, and which points are sewn."""
+    """The whole panel of the back: points [m], (points, 2), triangles, which of them the front has, and which points are sewn."""
     # half of it, with the part between the necklines as a region of its own
     sides = [_spaced(side.points, spacing) for side in half.front]
     axis = _spaced(np.array([sides[-1][-1], sides[0][0]]), spacing)
@@ -362,7 +366,7 @@ def _sewn(kind: str, half: _Half, spacing: float, apart: float, sizes: Mapping[s
         raise ValueError(
             f"spacing={spacing:g}: the {kind} is a single triangle wide at ({narrow[0]:.3g}, {narrow[1]:.3g}) m: give a smaller one"
         )
-    # particles row by row, so that neighbors have near numbers: the front's, then the back's, of which those at seams are the front's
+    # particles row by row, so that neighbors have near numbers: the front's with the seams, then the others of the back
     order = np.lexsort((points[:, 0], np.round(points[:, 1] / spacing)))
     place = np.empty(len(points), np.int64)
     place[order] = np.arange(len(points))
@@ -385,11 +389,12 @@ def _sewn(kind: str, half: _Half, spacing: float, apart: float, sizes: Mapping[s
     mirror = np.empty(len(x), np.int32)
     mirror[back_of] = back_of[image]
     mirror[front_of[has_front]] = front_of[image][has_front]
-    key_points = {}
-    for side in half.front:
-        if side.key_point:
-            at = int(np.argmin(np.sum((points - side.points[-1]) ** 2, axis=1)))
-            key_points[f"{side.key_point}_left"], key_points[f"{side.key_point}_right"] = int(mirror[front_of[at]]), int(front_of[at])
+    key_points: dict[str, int] = {}
+    for name, point in [(half.first, half.front[0].points[0]), *((side.key_point, side.points[-1]) for side in half.front)]:
+        right = int(front_of[np.argmin(np.sum((points - point) ** 2, axis=1))])
+        left = int(mirror[right])
+        if name:
+            key_points |= {name: right} if left == right else {f"{name}_left": left, f"{name}_right": right}
     front = np.arange(len(corners)) < fronts.sum()
     return Garment(kind, triangle_mesh(x, corners), key_points, frozen(front), frozen(mirror), sizes)
 

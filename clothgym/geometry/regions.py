@@ -3,8 +3,8 @@
 Points of a hexagonal lattice fill the regions.  They move to the mean of their neighbors in the Delaunay triangulation, which is
 renewed each time (Field 1988, Laplacian smoothing and Delaunay triangulations).  Points of borders stay where they are.
 
-Mesh generators that keep an angle do exist: Triangle has no free license, gmsh is a program of 60 MB under the GPL, and both choose
-their own points on borders.  Panels that are sewn together share these, so that the borders are given here.
+Generators that guarantee an angle insert points on borders, which panels that are sewn together share; Triangle is not free for
+commercial use, and Gmsh is under the GPL.  Here a triangulation with a smaller angle than ``SMALLEST_ANGLE`` is refused.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def fill_regions(regions: Sequence[NDArray], spacing: float) -> tuple[NDArray, N
             if best is not None and best[0] >= GOOD_ANGLE:
                 return best[1]
     if best is None or best[0] < SMALLEST_ANGLE:
-        angle = "a border would be lost" if best is None else f"the smallest angle would be {best[0]:.0f} degrees"
-        raise ValueError(f"spacing={spacing:g} does not suit this outline ({angle}): give a smaller one, or blunter corners")
+        problem = "a border would be lost" if best is None else f"the smallest angle would be {best[0]:.0f} degrees"
+        raise ValueError(f"spacing={spacing:g} does not suit this outline ({problem}): give a smaller one, or blunter corners")
     return best[1]
 
 
