@@ -53,7 +53,7 @@ def lying(sheet: str, spacing: float, num_envs: int, self_collision: str | bool)
         side = round(np.sqrt(mesh.num_particles))
         mesh = grid(side, side, spacing * (side - 1), spacing * (side - 1))
     cloth = Simulation(
-        mesh, num_envs=num_envs, bending="hinge", colliders=[Plane(point=(0, 0, -0.01), friction=0.5)],
+        mesh, num_envs=num_envs, bending="quadratic", colliders=[Plane(point=(0, 0, -0.01), friction=0.5)],
         self_collision=self_collision, threads=1,
     )  # fmt: skip
     cloth.step(LYING)
@@ -78,7 +78,9 @@ def main() -> None:
         (lying, {"sheet": sheet, "spacing": spacing, "num_envs": batch, "self_collision": mode})
         for spacing in SPACINGS for batch in BATCHES for mode in (False, "strict") for sheet in ("tshirt", "grid")
     ]  # fmt: skip
-    results = fill(RESULT, {"meshes": made, "frames": frames}, args.select, args.fresh, {"time_step": 1 / 60, "bending": "hinge"})
+    results = fill(
+        RESULT, {"meshes": made, "frames": frames}, args.select, args.fresh, {"time_step": 1 / 60, "bending": "quadratic"}
+    )
     for section in ("meshes", "frames"):
         print(table(results.get(section, [])), end="\n\n")
 

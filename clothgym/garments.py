@@ -6,13 +6,13 @@ robotic cloth manipulation using synthetic data (arXiv 2401.01734), in the MIT-l
 is higher on the back.
 
 A garment lies flat, centered on the origin, with its front up and its neck or waist toward +y.  "left" and "right" are -x and +x.
-The right half of a panel is triangulated, mirrored, and copied for the other panel.
+The right half of a panel is triangulated, mirrored, and copied for the other panel.  Panels resist bending, seams do not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym.checks import indices, known, number, positive, shown, vector
 from clothgym.geometry.polygons import crosses_itself
 from clothgym.geometry.regions import fill_regions
-from clothgym.mesh import ClothMesh, frozen, grid
+from clothgym.mesh import OPPOSITE, ClothMesh, Hinges, Springs, frozen, grid
 from clothgym.triangles import load_mesh, triangle_mesh
 
 SPACING = 0.02  # of the particles [m]
@@ -396,7 +396,25 @@ def _sewn(kind: str, half: _Half, spacing: float, apart: float, sizes: Mapping[s
         if name:
             key_points |= {name: right} if left == right else {f"{name}_left": left, f"{name}_right": right}
     front = np.arange(len(corners)) < fronts.sum()
-    return Garment(kind, triangle_mesh(x, corners), key_points, frozen(front), frozen(mirror), sizes)
+    mesh = _with_free_seams(triangle_mesh(x, corners), x[:, 2] == 0)
+    return Garment(kind, mesh, key_points, frozen(front), frozen(mirror), sizes)
+
+
+def _with_free_seams(mesh: ClothMesh, sewn: NDArray[np.bool_]) -> ClothMesh:
+    """The mesh with panels that are flat at rest, and seams that bend freely: no hinges or skip springs across them.
+
+    The garment then rests flat, as if pressed, and all bending models take it.  sewn: which particles lie at seams, (particles,).
+    """
+    mesh = mesh.with_rest_angles(0.0)
+    hinges, springs = mesh.hinges, mesh.springs
+    seam = sewn[hinges.particles[:, :2]].all(axis=1)
+    across, ends = (np.sort(pairs, axis=1) @ [mesh.num_particles, 1] for pairs in (hinges.particles[seam, 2:], springs.particles))
+    kept = (springs.kind != OPPOSITE) | ~np.isin(ends, across)
+    return replace(
+        mesh,
+        springs=Springs(*(frozen(field[kept]) for field in springs)),
+        hinges=Hinges(*(frozen(field[~seam]) for field in hinges)),
+    )
 
 
 def _towel(spacing: float, sizes: Mapping[str, float]) -> Garment:

@@ -31,7 +31,7 @@ def simulation(garment: Garment, solids: Sequence[Any] = (), anchors: Sequence[A
     """A garment above the floor, in strict contact."""
     floor = Plane(friction=0.5)
     cloth = Simulation(
-        garment.mesh, bending="hinge", colliders=[floor, *solids], anchors=anchors, self_collision="strict"
+        garment.mesh, bending="quadratic", colliders=[floor, *solids], anchors=anchors, self_collision="strict"
     )  # fmt: skip
     cloth.set_parameters(air_drag=AIR_DRAG)
     return cloth

@@ -9,7 +9,7 @@ from exact_intersections import intersecting_pairs
 from clothgym import Material, Plane, Simulation, garments, load_garment
 from clothgym.geometry.intersections import count_intersections
 from clothgym.geometry.regions import SMALLEST_ANGLE, fill_regions, inside
-from clothgym.mesh import EDGE
+from clothgym.mesh import EDGE, OPPOSITE
 
 SPACING = 0.03
 OPENINGS = {"tshirt": 4, "long_sleeve": 4, "shorts": 3, "trousers": 3, "skirt": 2, "towel": 1}
@@ -121,6 +121,21 @@ def test_garments_are_symmetric_and_have_two_sides(made, kind):
     assert left and all(garment.mirror[garment.key_points[name]] == garment.key_points[name[:-4] + "right"] for name in left)
 
 
+def test_panels_are_flat_at_rest_and_seams_bend_freely(made):
+    """Every inner edge but those of seams has a hinge and a skip spring, which joins particles of one panel."""
+    for kind in ("tshirt", "shorts"):
+        mesh = made[kind].mesh
+        assert mesh.flat
+        x = mesh.rest_positions
+        edges, times = np.unique(np.sort(mesh.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+        seams = (times == 2) & (x[edges, 2] == 0).all(axis=1)
+        hinged = np.unique(np.sort(mesh.hinges.particles[:, :2], axis=1), axis=0)
+        assert seams.any() and np.array_equal(hinged, edges[(times == 2) & ~seams])
+        skip = mesh.springs.particles[mesh.springs.kind == OPPOSITE]
+        assert len(skip) == len(hinged)
+        assert np.linalg.norm(x[skip[:, 0]] - x[skip[:, 1]], axis=1).min() > SPACING
+
+
 def test_the_back_of_the_neck_is_higher(made):
     """Where the middle of each panel ends: the depth of the neckline below the neck, a quarter of it on the back."""
     shirt = made["tshirt"]
@@ -150,7 +165,7 @@ def test_a_shirt_falls_quietly_and_without_intersections(made):
     """Dropped 5 cm in strict contact, whose usual thickness is a tenth of the spacing: one layer comes to lie on the other."""
     shirt = made["tshirt"]
     floor = Plane(point=(0, 0, -0.05), friction=0.5)
-    cloth = Simulation(shirt.mesh, Material.preset("cotton"), bending="hinge", colliders=[floor], self_collision="strict")
+    cloth = Simulation(shirt.mesh, Material.preset("cotton"), bending="quadratic", colliders=[floor], self_collision="strict")
     for _ in range(6):
         cloth.step(5)
         assert cloth.intersections()[0] == 0
