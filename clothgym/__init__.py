@@ -12,6 +12,7 @@ from clothgym import folders
 from clothgym.registration import register
 
 if TYPE_CHECKING:
+    from clothgym import garments as garments
     from clothgym import policies as policies
     from clothgym.attachments import Gripper as Gripper
     from clothgym.collisions import Box as Box
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from clothgym.collisions import MeshCollider as MeshCollider
     from clothgym.collisions import Plane as Plane
     from clothgym.collisions import Sphere as Sphere
+    from clothgym.garments import load_garment as load_garment
     from clothgym.integrators import INTEGRATORS as INTEGRATORS
     from clothgym.material import Material as Material
     from clothgym.mesh import ClothMesh as ClothMesh
@@ -47,11 +49,12 @@ _HOMES = {
     "Wind": "clothgym.wind",
     "disc": "clothgym.triangles",
     "grid": "clothgym.mesh",
+    "load_garment": "clothgym.garments",
     "load_mesh": "clothgym.triangles",
     "triangle_mesh": "clothgym.triangles",
 }
 # packages that are loaded when first used, too
-_PACKAGES = ("adapters", "collisions", "envs", "integrators", "policies", "render", "starts")
+_PACKAGES = ("adapters", "collisions", "envs", "garments", "integrators", "policies", "render", "starts")
 
 __all__ = [*_HOMES, "policies"]
 

@@ -19,6 +19,7 @@ FLOORS = {
     "clothgym.mesh_files": 1,
     "clothgym.mesh_repair": 1,
     "clothgym.triangles": 1,
+    "clothgym.garments": 1,
     "clothgym.material": 1,
     "clothgym.geometry": 1,
     "clothgym.wind": 1,

@@ -34,7 +34,7 @@ def quads_as_triangles(x: NDArray, quads: NDArray) -> tuple[NDArray, NDArray]:
 def as_triangles(x: NDArray) -> list[tuple[int, int, int]] | None:
     """Triangles between the corners of one polygon, or None if it crosses itself or has no area; x: [m], (corners, 3)."""
     p = _in_its_plane(x)
-    if p is None or _crosses_itself(p):
+    if p is None or crosses_itself(p):
         return None
     left, triangles = list(range(len(p))), []
     while len(left) > 3:
@@ -70,7 +70,7 @@ def _cross(a: NDArray, b: NDArray) -> NDArray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _crosses_itself(p: NDArray) -> bool:
+def crosses_itself(p: NDArray) -> bool:
     """Whether two sides of a polygon cross between their ends; p: (corners, 2)."""
     ends = np.roll(p, -1, axis=0)
     for k in range(len(p) - 2):

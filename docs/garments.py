@@ -1,0 +1,106 @@
+"""The pictures of docs/garments.md.
+
+python docs/garments.py                                  # garments.png, and garment_shirts.png
+python docs/garments.py --kinds tshirt towel --seed 1    # garments.png with some kinds and other sizes
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pictures import labeled, picture, side_by_side, write
+
+from clothgym import Plane, Simulation, Sphere
+from clothgym.garments import RANGES, Garment, random_garment, tshirt
+from clothgym.render import Camera
+
+HERE = Path(__file__).parent
+HELD = {"tshirt": "shoulder_left", "long_sleeve": "shoulder_left", "towel": "top_left"}  # key points; others hang from waist_left
+GRASP = 0.025  # particles within this distance of a held one are held with it [m]
+RESTING, HANGING, FALLING = 60, 240, 150  # control steps
+AIR_DRAG = 1.5  # with which what hangs comes to rest
+EYES = {"flat": (0.0, -0.25, 1.6), "hanging": (0.5, -2.0, 0.9), "crumpled": (0.7, -0.8, 0.6)}
+
+
+def simulation(garment: Garment, solids: Sequence[Any] = (), anchors: Sequence[Any] = ()) -> Simulation:
+    """A garment above the floor, in strict contact."""
+    floor = Plane(friction=0.5)
+    cloth = Simulation(
+        garment.mesh, bending="quadratic", colliders=[floor, *solids], anchors=anchors, self_collision="strict"
+    )  # fmt: skip
+    cloth.set_parameters(air_drag=AIR_DRAG)
+    return cloth
+
+
+def after(cloth: Simulation, steps: int) -> NDArray[np.float32]:
+    """Positions after so many steps [m], (particles, 3), without intersections by the exact count."""
+    cloth.step(steps)
+    if cloth.intersections().any():
+        raise RuntimeError("the garment passes through itself")
+    return cloth.positions[0]
+
+
+def states(garment: Garment) -> dict[str, NDArray[np.float32]]:
+    """Positions of a garment that lies flat, hangs from a key point, and has fallen from there [m], (particles, 3) each."""
+    x = garment.mesh.rest_positions
+    flat = simulation(garment)
+    flat.reset(positions=x + [0, 0, 0.01])
+    # upright, with the key point above
+    held = garment.key_points[HELD.get(garment.kind, "waist_left")]
+    near = np.linalg.norm(x - x[held], axis=1) < GRASP
+    near[held] = False
+    up = x[held, :2] / np.linalg.norm(x[held, :2])
+    upright = np.stack([x[:, :2] @ [up[1], -up[0]], -x[:, 2], x[:, :2] @ up], axis=1)
+    cloth = simulation(garment, anchors=[[held, *np.flatnonzero(near).tolist()]])
+    cloth.reset(positions=upright + [0, 0, 0.1 - upright[:, 2].min()])
+    hanging = after(cloth, HANGING)
+    cloth.release()
+    return {"flat": after(flat, RESTING), "hanging": hanging, "crumpled": after(cloth, FALLING)}
+
+
+def draw_kinds(kinds: Sequence[str], seed: int) -> None:
+    """A row for each two kinds, with a random garment in each state."""
+    strips = []
+    for kind in kinds:
+        garment = random_garment(kind, seed)
+        images = []
+        for state, x in states(garment).items():
+            about = x - x.mean(axis=0) * [1, 1, 0]
+            images.append(labeled(picture(garment.mesh, about, Camera(EYES[state], (0, 0, 0.02)), []), f"{kind}, {state}"))
+        strips.append(side_by_side(images))
+    rows = [side_by_side(strips[k : k + 2]) for k in range(0, len(strips), 2)]
+    write(HERE / "garments.png", side_by_side(rows, axis=0))
+
+
+def draw_shirts() -> None:
+    """A T-shirt dropped over a ball, and one that hangs from its shoulders, a little closer together than they are at rest."""
+    garment = tshirt()
+    x = garment.mesh.rest_positions
+    ball = Sphere(center=(0, 0, 0.2), radius=0.18, friction=0.4)
+    cloth = simulation(garment, [ball])
+    cloth.reset(positions=x + [0, 0, 0.45])
+    over = labeled(picture(garment.mesh, after(cloth, FALLING), Camera((1.0, -1.4, 1.0), (0, 0, 0.1)), [ball]), "over a ball")
+    shoulders = [garment.key_points["shoulder_left"], garment.key_points["shoulder_right"]]
+    cloth = simulation(garment, anchors=shoulders)
+    cloth.reset(positions=x[:, [0, 2, 1]] * [1, -1, 1] + [0, 0, 0.5])
+    cloth.move_anchors(cloth.positions[0][shoulders] * [0.8, 1, 1])
+    hung = labeled(picture(garment.mesh, after(cloth, HANGING), Camera((0.5, -2.0, 0.9), (0, 0, 0.5)), []), "from its shoulders")
+    write(HERE / "garment_shirts.png", side_by_side([over, hung]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="*", default=list(RANGES), choices=list(RANGES), help="of the rows")
+    parser.add_argument("--seed", type=int, default=0, help="of their sizes")
+    args = parser.parse_args()
+    draw_kinds(args.kinds, args.seed)
+    draw_shirts()
+
+
+if __name__ == "__main__":
+    main()
