@@ -38,6 +38,9 @@ def test_a_chunk_is_executed_in_order():
         acted.append(float(actions[1, 2]))
         observations, *_ = env.step(actions)
     assert acted == [0, 0.25, 0, 0.25, 0] and actions.shape == (2, 3)
+    # after five steps the second action is due, and the first in an environment whose episode begins
+    observations, _ = env.reset(seed=1, options={"reset_mask": np.array([True, False])})
+    assert policy(env, observations)[:, 0].tolist() == [0, 0.25]
 
 
 def test_a_set_is_cloned_and_its_policy_is_scored(scripts, tmp_path, monkeypatch):

@@ -191,6 +191,17 @@ def test_pictures_are_kept_as_they_are(recorded):
         assert np.ravel(stats[name]) == pytest.approx(value, abs=1e-6), name
 
 
+def test_a_policy_on_state_vectors_acts_while_pictures_are_recorded(recorded):
+    kwargs = json.dumps({"privileged": True, "image_size": 16})
+    flags = ("--env", "ClothReach-v0", "--policy", "learned", "--episodes", 2)
+    _, _, pictured = recorded(*flags, "--obs-mode", "rgb", "--env-kwargs", kwargs, out="pictures")
+    _, _, plain = recorded(*flags, out="states")
+    for one, other in zip(pictured, plain, strict=True):
+        assert np.array_equal(one["actions"], other["actions"]) and np.array_equal(one["rewards"], other["rewards"])
+    refused = call("record.py", *flags, "--obs-mode", "particles", "--out", "no")
+    assert refused.returncode == 2 and "learned observes keypoints" in refused.stderr
+
+
 def test_films_follow_the_pictures(recorded):
     av = pytest.importorskip("av")
     flags = ("--env", "ClothReach-v0", "--episodes", 2, "--obs-mode", "rgb")

@@ -90,11 +90,29 @@ class Args:
 def arguments(args: Args) -> dict[str, Any]:
     """What decides the content of the set, as JSON."""
     names = ("env", "policy", "episodes", "seed", "format", "obs_mode", "failed", "noise", "pictures")
-    kwargs = policies.env_kwargs(args.policy, args.env) | policies.parsed_kwargs(args.env_kwargs)
-    if "obs_mode" in kwargs:
+    own, given = policies.env_kwargs(args.policy, args.env), policies.parsed_kwargs(args.env_kwargs)
+    if "obs_mode" in given:
         raise ValueError("--env-kwargs: obs_mode is the flag --obs-mode")
+    kwargs = {name: value for name, value in (own | given).items() if name != "obs_mode"}
     lossy = ["observation.image"] if args.pictures == "video" else []
     return {name: getattr(args, name) for name in names} | {"env_kwargs": kwargs, "lossy_features": lossy}
+
+
+def acting(args: Args) -> policies.Policy | None:
+    """The policy, None for random actions.  One that was trained on state vectors gets these also while pictures are recorded.
+
+    Raises:
+        ValueError: it needs other observations than those that are recorded.
+    """
+    if args.policy == "random":
+        return None
+    policy = policies.named(args.policy, args.env, args.seed)
+    needs = policies.env_kwargs(args.policy, args.env).get("obs_mode", "keypoints")
+    if args.policy in policies.SCRIPTED or needs == args.obs_mode:
+        return policy
+    if needs != "keypoints" or args.obs_mode == "particles":
+        raise ValueError(f"--obs-mode {args.obs_mode}: {args.policy} observes {needs}; record with --obs-mode {needs}")
+    return lambda env, observations: policy(env, env.unwrapped.task.observation.copy())
 
 
 def record(args: Args) -> None:
@@ -106,7 +124,7 @@ def record(args: Args) -> None:
     env = recordings.make_batch(about, min(args.num_envs, args.episodes), args.threads)
     about = recordings.describe(about | {"name": "cloth/" + re.sub(r"[^\w.-]", "_", args.out.name)}, env)
     journal = recordings.Journal(args.out, about, args.max_gb * 1e9)
-    policy = None if args.policy == "random" else policies.named(args.policy, args.env, args.seed)
+    policy = acting(args)
     with tqdm(total=args.episodes, initial=sum(journal.ended.values()), unit="episode", disable=None) as bar:
         seeds = recordings.record(env, policy, journal, about, bar)
     env.close()

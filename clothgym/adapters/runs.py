@@ -146,7 +146,7 @@ def exported(path: Path) -> Policy:
 
 
 class Chunks:
-    """A policy whose network gives the actions of several steps at once, for a batch whose episodes begin together.
+    """A policy whose network gives the actions of several steps at once.
 
     Of each chunk the first ``about["execute"]`` actions are executed, then the network is asked again.
     """
@@ -156,10 +156,11 @@ class Chunks:
         self.actions: NDArray = np.zeros(0)  # of the last chunk, (num_envs, chunk, numbers)
 
     def __call__(self, env: Any, observations: Any) -> NDArray:
-        step = int(env.unwrapped.task.steps_taken().max()) % self.execute
-        if step == 0:
-            self.actions = self.policy(observations).reshape(env.num_envs, self.policy.about["chunk"], -1)
-        return self.actions[:, step]
+        steps = env.unwrapped.task.steps_taken() % self.execute
+        if (steps == 0).any():
+            fresh = self.policy(observations).reshape(env.num_envs, self.policy.about["chunk"], -1)
+            self.actions = np.where(steps[:, None, None] == 0, fresh, self.actions if self.actions.size else fresh)
+        return self.actions[np.arange(len(steps)), steps]
 
 
 def learned(folder: Path, env_id: str) -> Policy:
