@@ -49,6 +49,7 @@ def test_committed_digests_match_the_environments(name):
 def test_every_environment_has_a_digest_without_irrelevant_arguments():
     assert set(ENVIRONMENTS) <= set(DIGESTS) and len(set(DIGESTS.values())) == len(DIGESTS)
     assert name_of("clothgym:ClothReach-v0", {"threads": 2, "settling": "at_once"}) == "ClothReach-v0"
+    assert name_of("ClothReach-v0", {"action_repeat": 1}) == "ClothReach-v0" != name_of("ClothReach-v0", {"action_repeat": 2})
     assert name_of("ClothReach-v0", {"rows": 7, "physics": "fast"}) == 'ClothReach-v0 {"physics": "fast", "rows": 7}'
 
 

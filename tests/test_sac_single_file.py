@@ -159,7 +159,15 @@ def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
         assert part == pytest.approx(found["steps"][name], abs=1e-5), name
 
 
-SHORT = {"timesteps": 1600, "n_envs": 8, "updates": 2, "batch_size": 32, "net_arch": [16, 16], "buffer_size": 300}
+SHORT = {
+    "timesteps": 1600,
+    "normalize": True,
+    "n_envs": 8,
+    "updates": 2,
+    "batch_size": 32,
+    "net_arch": [16, 16],
+    "buffer_size": 300,
+}
 
 
 def trained(single, monkeypatch, folder, *, stop_at=None, resume=False):

@@ -59,6 +59,8 @@ def _feed(made: Any, value: Any) -> None:
 def name_of(env_id: str, env_kwargs: Mapping[str, Any]) -> str:
     """Of what a digest is: the id, and the keywords that move bits, as JSON."""
     moving = {name: value for name, value in sorted(env_kwargs.items()) if name not in WITHOUT_EFFECT}
+    if moving.get("action_repeat") == 1:  # as if it was not given
+        del moving["action_repeat"]
     return " ".join([checked_id(env_id), *([json.dumps(moving)] if moving else [])])
 
 
