@@ -289,8 +289,8 @@ OUTLINES: dict[str, Callable[[Mapping[str, float]], _Half]] = {
 
 
 def _direction(angle: float) -> NDArray[np.float64]:
-    """The unit vector at an angle from +x [rad], (2,)."""
-    return np.array([np.cos(angle), np.sin(angle)])
+    """The unit vector at an angle from +x [rad], (2,), rounded: the last bits of sines depend on the processor."""
+    return np.round(np.array([np.cos(angle), np.sin(angle)]), 12)
 
 
 def _line(name: str, key_point: str, start: ArrayLike, end: ArrayLike, sewn: bool) -> _Side:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pictures import labeled, picture, side_by_side, write
+from PIL import Image
 
 from clothgym import Plane, Simulation, Sphere
 from clothgym.garments import RANGES, Garment, random_garment, tshirt
@@ -24,15 +25,15 @@ HELD = {"tshirt": "shoulder_left", "long_sleeve": "shoulder_left", "towel": "top
 GRASP = 0.025  # particles within this distance of a held one are held with it [m]
 RESTING, HANGING, FALLING = 60, 240, 150  # control steps
 AIR_DRAG = 1.5  # with which what hangs comes to rest
+UNEVEN = 5e-4  # of what hangs [m]
+SMALLER = 0.7  # of the pictures of all kinds
 EYES = {"flat": (0.0, -0.25, 1.6), "hanging": (0.5, -2.0, 0.9), "crumpled": (0.7, -0.8, 0.6)}
 
 
 def simulation(garment: Garment, solids: Sequence[Any] = (), anchors: Sequence[Any] = ()) -> Simulation:
     """A garment above the floor, in strict contact."""
-    floor = Plane(friction=0.5)
-    cloth = Simulation(
-        garment.mesh, bending="quadratic", colliders=[floor, *solids], anchors=anchors, self_collision="strict"
-    )  # fmt: skip
+    solids = [Plane(friction=0.5), *solids]
+    cloth = Simulation(garment.mesh, bending="quadratic", colliders=solids, anchors=anchors, self_collision="strict")
     cloth.set_parameters(air_drag=AIR_DRAG)
     return cloth
 
@@ -56,6 +57,8 @@ def states(garment: Garment) -> dict[str, NDArray[np.float32]]:
     near[held] = False
     up = x[held, :2] / np.linalg.norm(x[held, :2])
     upright = np.stack([x[:, :2] @ [up[1], -up[0]], -x[:, 2], x[:, :2] @ up], axis=1)
+    # a single layer in a vertical plane would stay in it
+    upright[:, 1] += np.random.default_rng(0).normal(scale=UNEVEN, size=len(x))
     cloth = simulation(garment, anchors=[[held, *np.flatnonzero(near).tolist()]])
     cloth.reset(positions=upright + [0, 0, 0.1 - upright[:, 2].min()])
     hanging = after(cloth, HANGING)
@@ -74,7 +77,8 @@ def draw_kinds(kinds: Sequence[str], seed: int) -> None:
             images.append(labeled(picture(garment.mesh, about, Camera(EYES[state], (0, 0, 0.02)), []), f"{kind}, {state}"))
         strips.append(side_by_side(images))
     rows = [side_by_side(strips[k : k + 2]) for k in range(0, len(strips), 2)]
-    write(HERE / "garments.png", side_by_side(rows, axis=0))
+    whole = Image.fromarray(side_by_side(rows, axis=0))
+    write(HERE / "garments.png", np.asarray(whole.resize([round(SMALLER * side) for side in whole.size], Image.Resampling.LANCZOS)))
 
 
 def draw_shirts() -> None:
