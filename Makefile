@@ -56,7 +56,7 @@ lerobot:
 	$(LEROBOT_PYTHON) -m venv $(VENV)-lerobot
 	$(VENV)-lerobot/bin/pip install --quiet --no-deps "lerobot==0.6.1"
 	$(VENV)-lerobot/bin/pip install --quiet --constraint .ci/lerobot.txt "torch==2.13.0" $$(sed '/^#/d; s/=.*//' .ci/lerobot.txt) "pytest>=8" ".[record]"
-	cd tests && ../$(VENV)-lerobot/bin/python -m pytest -q lerobot
+	cd tests && ../$(VENV)-lerobot/bin/python -m pytest -q with_lerobot
 
 oldest:
 	$(PYTHON) -m venv $(VENV)-oldest

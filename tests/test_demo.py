@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import importlib.util
 import json
 import shutil
 import struct
@@ -15,8 +16,11 @@ import pytest
 import clothgym
 
 DEMO = Path(__file__).parent.parent / "docs" / "demo"
-sys.path.insert(0, str(DEMO))
-import record  # noqa: E402 - a script of docs/
+# a script of docs/, whose name training/ has, too
+_spec = importlib.util.spec_from_file_location("demo_record", DEMO / "record.py")
+record = importlib.util.module_from_spec(_spec)
+sys.modules["demo_record"] = record
+_spec.loader.exec_module(record)
 
 CHROMIUM = next((path for path in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if path), None)
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox", "--disable-dev-shm-usage"]

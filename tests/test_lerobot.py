@@ -1,6 +1,6 @@
 """LeRobot's interface, without LeRobot: the calls that its evaluator makes (0.6.1, scripts/lerobot_eval.py), in their order.
 
-``make lerobot`` runs tests/lerobot/ with the library itself.
+``make lerobot`` runs tests/with_lerobot/ with the library itself.
 """
 
 import importlib.util
