@@ -2,7 +2,6 @@
 
     python benchmarks/speed.py                              # all groups, about half an hour; writes results/speed.json
     python benchmarks/speed.py --select springs drape       # some groups: prints only
-    python benchmarks/speed.py --draw                       # docs/speed.png from the results
 
 Times are this thread's processor time.  The cases of a group take turns, so other load on the machine affects all of them alike.
 Ratios are therefore more reliable than times.
@@ -34,8 +33,6 @@ ROUNDS = 15
 VISITS = 1_500_000  # approximate product of springs, substeps and environments in a call
 DRAPE, DRAPE_SUBSTEPS = grid(17, 17, 0.6, 0.6), 50  # the sheet of ClothDrape-v0, and the substeps of its control step
 MANY, STEPS = 128, 100  # environments and steps of an episode
-BATCHES, SIDES, THREADS = (1, 4, 16, 64, 128, 512), (17, 25, 33, 49), (1, 2)  # of ``scaling``
-PICTURE = Path(__file__).parent.parent / "docs" / "speed.png"
 RARE = 0.81  # upper bound of random actions, so that they release in one step of a hundred
 
 
@@ -170,55 +167,6 @@ def contact() -> list[Row]:
     ]
 
 
-def scaling() -> list[Row]:
-    """Steps per second of ClothDrape-v0 over environments, threads and particles a side, with expert and random actions, by wall
-    time for more than one thread; and of springs alone, which no contact can exceed."""
-    rows = []
-    for actor in ("expert", "random"):
-        cases = [(n, 1, 17) for n in BATCHES] + [(MANY, threads, 17) for threads in THREADS[1:]] + [(16, 1, s) for s in SIDES[1:]]
-        for num_envs, threads, side in cases:
-            clock = time.thread_time if threads == 1 else time.perf_counter
-            steps = STEPS if num_envs * side < MANY * SIDES[1] else STEPS // 2
-            us = play({"": {"threads": threads, "rows": side}}, actor == "expert", num_envs, steps, rounds=1, clock=clock)[""]
-            rows.append(row("scaling", f"{actor}, {num_envs} environments, {threads} threads, {side} a side", 1e6 / us, "steps/s"))
-    for side in SIDES:
-        control = batch("ClothDrape-v0", 1, rows=side).task.simulation
-        sheet = hanging(grid(side, side, 0.6, 0.6), 1, time_step=control.time_step, substeps=control.substeps)
-        rows.append(row("scaling", f"springs alone, {side} a side", 1 / in_turns({"": sheet.step})[""], "steps/s"))
-    return rows
-
-
-def draw(rows: list[Row]) -> None:
-    """Steps/s over environments and over particles a side, of the group ``scaling``."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    now = {r["what"]: r["now"] for r in rows if r["group"] == "scaling"}
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
-    for actor, color in (("expert", "#d1495b"), ("random", "#00798c")):
-        at_17 = [now[f"{actor}, {n} environments, 1 threads, 17 a side"] for n in BATCHES]
-        left.plot(BATCHES, at_17, "o-", color=color, label=f"{actor}, one core")
-        for threads in THREADS[1:]:
-            left.plot(
-                MANY, now[f"{actor}, {MANY} environments, {threads} threads, 17 a side"], "^", color=color, label=f"{threads} cores"
-            )
-        by_side = [now[f"{actor}, 16 environments, 1 threads, {side} a side"] for side in SIDES]
-        right.plot(SIDES, by_side, "o-", color=color, label=f"{actor}, 16 environments")
-    alone = [now[f"springs alone, {side} a side"] for side in SIDES]
-    left.axhline(alone[0], color="#8a8f98", linestyle="--", label="springs alone")
-    right.plot(SIDES, alone, "--", color="#8a8f98", label="springs alone")
-    left.set(xscale="log", yscale="log", xlabel="environments", ylabel="steps/s", title="17 x 17 particles")
-    right.set(xscale="log", xlabel="particles a side", title="one core")
-    right.set_xticks(SIDES, [str(side) for side in SIDES], minor=False)
-    right.minorticks_off()
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    figure.savefig(PICTURE, dpi=110)
-
-
 def env() -> list[Row]:
     """Steps per second of ``gym.make``, with resets."""
     cases = [(env_id, physics, actor) for env_id in ENVIRONMENTS for physics in ("true", "fast") for actor in ("random", "expert")]
@@ -282,7 +230,6 @@ GROUPS: dict[str, Callable[[], list[Row]]] = {
     "springs": springs,
     "drape": drape,
     "contact": contact,
-    "scaling": scaling,
     "env": env,
     "overhead": overhead,
 }
@@ -291,18 +238,13 @@ GROUPS: dict[str, Callable[[], list[Row]]] = {
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--select", nargs="+", choices=tuple(GROUPS), metavar="GROUP", help=", ".join(GROUPS))
-    parser.add_argument("--draw", action="store_true", help="draw docs/speed.png from the results, and measure nothing")
-    args = parser.parse_args()
-    if args.draw:
-        draw(json.loads(RESULTS.read_text())["rows"])
-        return
-    selected, rows = args.select, list[Row]()
+    selected = parser.parse_args().select
+    rows: list[Row] = []
     for group in selected or GROUPS:
         for measured in GROUPS[group]():
             rows.append(measured)
             print(f"{group:<9} {measured['what']:<58} {measured['now']:>10,.4g} {measured['unit']}")
     if not selected:
-        draw(rows)
         RESULTS.write_text(json.dumps({"machine": machine(), "rows": rows}, indent=1) + "\n")
 
 
