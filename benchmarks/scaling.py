@@ -35,7 +35,14 @@ def environments() -> list[Row]:
         cases = [(n, 1, 17) for n in BATCHES] + [(MANY, threads, 17) for threads in THREADS[1:]] + [(16, 1, s) for s in SIDES[1:]]
         for num_envs, threads, side in cases:
             clock = time.thread_time if threads == 1 else time.perf_counter
-            us = play({"": {"threads": threads, "rows": side}}, actor == "expert", num_envs, STEPS, rounds=1, clock=clock)[""]
+            us = play(
+                {"": {"threads": threads, "rows": side}},
+                actor == "expert",
+                num_envs,
+                STEPS,
+                rounds=2 if num_envs < 16 else 1,
+                clock=clock,
+            )[""]
             rows.append(row("scaling", f"{actor}, {num_envs} environments, {threads} threads, {side} a side", 1e6 / us, "steps/s"))
             print(f"{rows[-1]['what']:<60} {rows[-1]['now']:>10,.0f}", flush=True)
     return rows
