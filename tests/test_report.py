@@ -100,6 +100,9 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     assert report.best_of("ClothReach-v0", [*careless, *safe], now, True) == "PPO: 0.84 at no cost in 2 min"
     assert report.best_of("ClothDrape-v0", other, now, True) == "–"
     assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}, True).endswith("2 min **(old)**")
+    # what is of this code goes before a better score of older code
+    mixed = [result(0.9), result(0.7, learner="sac_scratch", digest="later")]
+    assert report.best_of("ClothReach-v0", mixed, {"ClothReach-v0": "later"}, True) == "SAC: 0.70 in 2 min"
 
 
 def test_controls_are_rows_by_what_was_changed(report):

@@ -166,7 +166,8 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
 
 
 def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_scratch: bool) -> str:
-    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts.
+    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts.  Results of the
+    present behavior go before old ones.
 
     from_scratch: of those that see no expert, or else of those that do.
     """
@@ -175,8 +176,9 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_sc
     if not found:
         return "–"
     means = [interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in rows) for _, rows in found]
-    success, (label, rows) = max(zip(means, found), key=lambda one: one[0])
-    old = _old(all(is_present(row, digests) for row in rows))
+    present = [all(is_present(row, digests) for row in rows) for _, rows in found]
+    now, success, (label, rows) = max(zip(present, means, found), key=lambda one: one[:2])
+    old = _old(now)
     at = " at no cost" if "safe_success_rate" in rows[0] else ""
     return f"{label}: {success:.2f}{at} in {max(_minutes(rows), 1):.0f} min{old}"
 
