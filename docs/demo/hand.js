@@ -2,7 +2,7 @@
 // A sheet to play with: it moves by itself, see cloth.js, and is drawn as an episode of a single moment that changes.
 
 const PINNED_AT = 0.125, HELD_UP = 1.25, SWUNG_OUT = 0.12; // of pins from the corners, in sides; height of the upper hem [m], and its start
-const BALL = { center: [0, 0, 0.35], radius: 0.22 }, DROPPED_FROM = 0.85; // [m]
+const DROPPED_FROM = 0.85; // height above the floor [m]
 const WIND = [0, 3.5, 0.4], GUSTS = 2.5; // [m/s], and the time of one [s]
 const HEAVY = 9.81; // [m/s^2]
 const CATCH = 44; // how near a particle a finger takes hold of it, in pixels
@@ -22,9 +22,9 @@ class Hand {
 
   // Begin again, with the fabric, the start and the switches as they are now.
   again() {
-    const data = { ...SHEETS.common, ...SHEETS.fabrics[this.fabric] }, { rows, cols, solids } = data, ball = this.start === "drop";
+    const data = { ...SHEETS.common, ...SHEETS.fabrics[this.fabric] }, { rows, cols, solids } = data, ball = this.start === "drop" && solids.find(({ plane }) => !plane);
     const cloth = new Cloth({ ...data, solids: ball ? solids : solids.filter(({ plane }) => plane) });
-    Object.assign(this, { cloth, held: null, burst: 0, left: 0, shape: [rows, cols], side: data.side, points: rows * cols + Number(ball) });
+    Object.assign(this, { cloth, held: null, burst: 0, left: 0, shape: [rows, cols], side: data.side, points: rows * cols + (ball ? 1 : 0), ball });
     const x = new Float32Array(3 * cloth.n);
     for (let p = 0; p < cloth.n; p++) {
       // upright and swung out by a little, or flat above the ball
@@ -37,7 +37,7 @@ class Hand {
       const top = (rows - 1) * cols, inset = Math.round(PINNED_AT * (cols - 1));
       for (const p of [top + inset, top + cols - 1 - inset]) cloth.pin(p, this.#at(p));
     }
-    this.solids = ball ? [{ kind: "sphere", holds: true, axes: [1, 0, 0, 0, 1, 0, 0, 0, 1], half: [0, 0, 0], radius: BALL.radius, color: [176, 176, 180], shown: [0, 1] }] : [];
+    this.solids = ball ? [{ kind: "sphere", holds: true, axes: [1, 0, 0, 0, 1, 0, 0, 0, 1], half: [0, 0, 0], radius: ball.radius, color: [176, 176, 180], shown: [0, 1] }] : [];
     // after this moment come the corners of what the picture has to show
     this.positions = new Float32Array(3 * 3 * this.points);
     this.#write();
@@ -68,7 +68,7 @@ class Hand {
     for (let c = 0; c < 3; c++) {
       for (let p = 0; p < cloth.n; p++) positions[3 * p + c] = cloth.x[c][p];
     }
-    if (this.points > cloth.n) positions.set(BALL.center, 3 * cloth.n);
+    if (this.points > cloth.n) positions.set(this.ball.point, 3 * cloth.n);
   }
 
   // Take as many steps as have passed.  Returns what there is to tell.

@@ -29,7 +29,7 @@ PIN_SPEED = 6.0  # of what is held on the page [m/s]
 MOST_VALUES = 256  # different numbers of an array that a byte can name
 SIDE, ROWS, AIR_DRAG = 1.0, 33, 0.2  # of the page's sheet: side [m], particles a side, and drag [1/s]
 FABRICS = {"penava_cotton": "Cotton", "silk": "Silk", "wool": "Wool", "knit": "Knit"}
-BALL = Sphere(center=(0, 0, 0.35), radius=0.22)  # as in hand.js
+BALL = Sphere(center=(0, 0, 0.35), radius=0.22)
 
 
 def sheet_of(simulation: Simulation) -> dict[str, Any]:
