@@ -12,6 +12,7 @@ from clothgym import folders
 from clothgym.registration import register
 
 if TYPE_CHECKING:
+    from clothgym import evaluation as evaluation
     from clothgym import garments as garments
     from clothgym import policies as policies
     from clothgym.attachments import Gripper as Gripper
@@ -54,7 +55,7 @@ _HOMES = {
     "triangle_mesh": "clothgym.triangles",
 }
 # packages that are loaded when first used, too
-_PACKAGES = ("adapters", "collisions", "envs", "garments", "integrators", "policies", "render", "starts")
+_PACKAGES = ("adapters", "collisions", "envs", "evaluation", "garments", "integrators", "policies", "render", "starts")
 
 __all__ = [*_HOMES, "policies"]
 

@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     export = command(_export, "export", "a scene or an environment as a picture, a film or meshes for Blender")
     export.add_argument("name", metavar="NAME", help="a scene or an environment's id, see list")
     export.add_argument(
-        "--out", required=True, type=_writable, help=".png, .gif, .mp4 or .glb; without an extension, a folder of meshes"
+        "--out", required=True, type=_writable, help=".png, .webp, .gif, .mp4 or .glb; without an extension, a folder of meshes"
     )
     export.add_argument("--kind", choices=("obj", "glb"), default="obj", help="format of the meshes in a folder (default: obj)")
     export.add_argument("--seconds", type=_positive, help="duration (default: 5 s of a scene, or a whole episode)")

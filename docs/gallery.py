@@ -1,66 +1,147 @@
-"""The moving pictures of docs/gallery.md and of the README: every scene of the playground and every task.
+"""The films of docs/gallery.md, of the tasks' pages and of the README: scenes of the playground, and policies in every task.
 
-python docs/gallery.py                  # all of them, in some minutes
+python docs/gallery.py                  # all of them, in about a quarter of an hour
 python docs/gallery.py flag cape        # some
+python docs/gallery.py --hero           # the README's alone
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pictures import FILLED, framed, played, side_by_side, slopes  # a script in this folder
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from clothgym.playground.exporting import moments, painter, stage_named
-from clothgym.playground.recording import Frame
-from clothgym.render import write_video
+import clothgym
+from clothgym.forces import structural_strain
+from clothgym.mesh import ClothMesh
+from clothgym.playground.exporting import moments, stage_named
+from clothgym.render import Camera, Drawn, Renderer, write_video
+from clothgym.render.heat import largest_at_particles
+from clothgym.render.looks import LOOKS
 
 HERE = Path(__file__).parent / "gallery"
-SIZE, FPS = 320, 15
-HOLD = 12  # frames for which the end of what comes to an end stands still
+WIDTH, HEIGHT, FPS = 480, 360, 30
+HELD_OUT = 1_000_000  # the first seed of held-out episodes
+STEADY = 0.4  # how slowly the camera follows [s]
+RESTS, HOLD = 0.03, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
 
 
 class Clip(NamedTuple):
-    """A clip of a scene or an environment with a seed, for ``seconds``, or to its end; from ``start`` on [s].
+    """A clip of a scene for ``seconds`` from ``start`` on [s], or of an episode of an environment.
 
+    policy: who acts: "expert", or "learned", the committed policy.  speed: seconds of the episode in a second of the film.
     loop: where the motion has no end, frames over which the sheet passes from the last moments into the first.  at_least: the clip
-    is the piece, at least so long [s], that begins and ends most alike; None for all.  settings: see ``Settings``.
+    is the piece, at least so long [s], that begins and ends most alike; None for all.  look: of the fabric, see ``LOOKS``; or
+    "gingham".  color: "fabric" or "strain".  settings: of a scene, see ``Settings``; kwargs: of an environment.
     """
 
     name: str
     seconds: float | None = None
     start: float = 0.0
-    seed: int = 0
+    seed: int = HELD_OUT
+    policy: str = "learned"
+    speed: int = 1
     loop: int = 0
     at_least: float | None = None
+    look: str = "gingham"
     color: str = "fabric"
     settings: dict[str, Any] = {}  # noqa: RUF012 - never written to
+    kwargs: dict[str, Any] = {}  # noqa: RUF012
 
 
 CLIPS = {
-    "patch": Clip("patch", 3.0, color="strain"),
-    "flag": Clip("flag", 9.0, start=1.0, seed=1, loop=8, at_least=2.5),
-    "sphere": Clip("sphere", 2.4),
-    "box": Clip("box", 2.4),
-    "pawn": Clip("pawn", 2.6),
-    "cape": Clip("cape", 2 * np.pi / 0.9 + 8 / FPS, start=3.0, loop=8),  # a figure of eight
-    "fold": Clip("fold", 5.5),
-    "reach": Clip("ClothReach-v0", seed=7),
-    "drape": Clip("ClothDrape-v0", seed=7),
-    "gripper": Clip("ClothDrapeGripper-v0", seed=9),
-    "strain": Clip("ClothStrain-v0", seed=7, color="strain"),
+    "patch": Clip("patch", 3.0, color="strain", seed=0),
+    "flag": Clip("flag", 9.0, start=1.0, seed=1, loop=16, at_least=2.5, look="silk"),
+    "sphere": Clip("sphere", 2.4, seed=0),
+    "box": Clip("box", 2.4, seed=0, look="cotton_broad"),
+    "pawn": Clip("pawn", 2.6, seed=0, look="denim"),
+    "cape": Clip("cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille"),  # a figure of eight
+    "fold": Clip("fold", 5.5, seed=0, look="wool_tropical"),
+    "ClothReach-v0": Clip("ClothReach-v0", look="knit"),
+    "ClothDrape-v0": Clip("ClothDrape-v0"),
+    "ClothDrapeGripper-v0": Clip("ClothDrapeGripper-v0", look="cotton_broad"),
+    "ClothHang-v0": Clip("ClothHang-v0", look="polyester_tropical"),
+    "ClothHook-v0": Clip("ClothHook-v0", look="denim"),
+    "ClothStrain-v0": Clip("ClothStrain-v0", color="strain"),
+    "ClothFold-v0": Clip("ClothFold-v0", look="wool_tropical"),
+    "ClothFold-Hard-v0": Clip("ClothFold-Hard-v0", look="silk", policy="expert"),
+    "ClothFoldGoal-v0": Clip("ClothFoldGoal-v0", look="polyester"),
+    "ClothFlatten-v0": Clip("ClothFlatten-v0", look="polyester_faille", speed=2),
+    "ClothFling-v0": Clip("ClothFling-v0"),
+    "ClothFling-Hard-v0": Clip("ClothFling-Hard-v0", look="silk", policy="expert"),
 }
+HERO = ("ClothFling-v0", "ClothFold-v0", "ClothDrape-v0")  # side by side, each begins again when it is over
+HERO_SIZE, HERO_FPS, HERO_SECONDS = (320, 240), 20, 9.0
 
 
-def looped(frames: Sequence[Frame], over: int, at_least: int | None) -> list[Frame]:
-    """A piece of a motion whose last frames are moved towards what comes before its first: it is the sheet that is mixed, not its
-    picture, so that nothing is seen twice.  at_least: frames of the piece, or None for all."""
-    x = np.stack([frame.positions for frame in frames])
-    first, last = over, len(frames)
+@dataclass(frozen=True)
+class Shot:
+    """One moment.  positions: of each sheet [m], (sheets, particles, 3); solids and markers as ``Renderer`` takes them."""
+
+    positions: NDArray[np.float32]
+    solids: Sequence[Drawn]
+    markers: Sequence[Drawn] = ()
+
+
+@dataclass(frozen=True)
+class Take:
+    """Moments of a sheet, ``step`` apart [s]; camera: where they are seen from; strained: the strain at which its colors end."""
+
+    mesh: ClothMesh
+    step: float
+    camera: Camera
+    strained: float
+    shots: list[Shot]
+
+
+# --- what happens ---------------------------------------------------------------------------------------------------------
+
+
+def taken(clip: Clip) -> Take:
+    """Simulate a clip."""
+    if not clip.name.startswith("Cloth"):
+        stage = stage_named(clip.name, clip.seed, settings=clip.settings)
+        for _ in range(round(clip.start / stage.recording.time_step)):
+            stage.advance()
+        shots = [Shot(frame.positions, frame.solids) for frame in moments(stage, clip.seconds, FPS)]
+        if clip.loop:
+            shots = looped(shots, clip.loop, None if clip.at_least is None else round(clip.at_least * FPS))
+        recording = stage.recording
+        return Take(recording.mesh, 1 / FPS, recording.camera, recording.strained, shots)
+    if clip.policy == "learned":
+        policy = clothgym.policies.load(clip.name)
+        # the sheet settles in steps, so that it can be seen
+        kwargs = policy.about["env_kwargs"] | {"settling": "steps"} | clip.kwargs
+        episode = played(clip.name, clip.seed, lambda env, seen: policy(seen), **kwargs)
+    else:
+        episode = played(clip.name, clip.seed, **clip.kwargs)
+    task = episode.task
+    shots = [Shot(moment.positions[None], moment.solids, moment.markers) for moment in episode.moments[:: clip.speed]]
+    step = task.physics.time_step
+    return Take(task.physics.mesh, step, task.camera(), task.strain_shown, until_rest(shots, step))
+
+
+def until_rest(shots: list[Shot], step: float) -> list[Shot]:
+    """The shots up to where the sheet lies still, which stands for a while; step: between them [s]."""
+    last = len(shots) - 1
+    while last > 1 and np.abs(shots[last].positions - shots[last - 1].positions).max() < RESTS * step:
+        last -= 1
+    return shots[: last + 1] + [shots[last]] * round(HOLD / step)
+
+
+def looped(shots: Sequence[Shot], over: int, at_least: int | None) -> list[Shot]:
+    """A piece of a motion whose last moments are moved towards what comes before its first: it is the sheet that is mixed, not its
+    picture, so that nothing is seen twice.  at_least: moments of the piece, or None for all."""
+    x = np.stack([shot.positions for shot in shots])
+    first, last = over, len(shots)
     if at_least is not None:
         pairs = [(i, j) for i in range(over, len(x)) for j in range(i + max(at_least, over), len(x) + 1)]
         first, last = min(
@@ -69,38 +150,95 @@ def looped(frames: Sequence[Frame], over: int, at_least: int | None) -> list[Fra
     shares = (np.arange(over) + 1) / (over + 1)
     eased = shares * shares * (3 - 2 * shares)
     mixed = [
-        replace(frame, positions=((1 - share) * frame.positions + share * before.positions).astype(np.float32))
-        for share, frame, before in zip(eased, frames[last - over : last], frames[first - over : first])
+        replace(shot, positions=((1 - share) * shot.positions + share * before.positions).astype(np.float32))
+        for share, shot, before in zip(eased, shots[last - over : last], shots[first - over : first])
     ]
-    return [*frames[first : last - over], *mixed]
+    return [*shots[first : last - over], *mixed]
 
 
-def film(clip: Clip) -> list[NDArray[np.uint8]]:
-    """The frames of a clip, (SIZE, SIZE, 3) each, so that the last goes with the first, and with the sheet in sight in all."""
-    from pictures import corners, framed  # a script in this folder
+# --- how it is seen -------------------------------------------------------------------------------------------------------
 
-    stage = stage_named(clip.name, clip.seed, settings=clip.settings)
-    for _ in range(round(clip.start / stage.recording.time_step)):
-        stage.advance()
-    frames = list(moments(stage, clip.seconds, FPS))
-    if clip.loop:
-        frames = looped(frames, clip.loop, None if clip.at_least is None else round(clip.at_least * FPS))
-    large = [
-        [solid for solid in frame.solids if max(solid.rounded_box()[1].max(), solid.rounded_box()[2]) > 0.05] for frame in frames
-    ]
-    points = [*(frame.positions.reshape(-1, 3) for frame in frames), *map(corners, large)]
-    draw = painter(stage.recording, SIZE, 3, clip.color, framed(stage.recording.camera, np.concatenate(points)))
-    return [draw(frame) for frame in frames] + ([] if clip.loop else [draw(frames[-1])] * HOLD)
+
+def followed(camera: Camera, seen: Sequence[NDArray], aspect: float, step: float, closed: bool) -> list[Camera]:
+    """Cameras in one place that turn and zoom with what moves, slowly, and always have it in sight.
+
+    seen: points of each moment [m], (points, 3).  closed: whether the first moment follows the last.
+    """
+    mode, sigma, eye = "wrap" if closed else "nearest", STEADY / step, np.asarray(camera.eye)
+    targets = np.stack([framed(camera, points, aspect).target for points in seen]) - eye
+    ways = gaussian_filter1d(targets / np.linalg.norm(targets, axis=1, keepdims=True), sigma, axis=0, mode=mode)
+    turned = [replace(camera, target=tuple(eye + camera.distance * way / np.linalg.norm(way))) for way in ways]
+    halves = np.array([float((np.abs(slopes(one, points)) / (aspect, 1)).max()) for one, points in zip(turned, seen)])
+    halves = gaussian_filter1d(maximum_filter1d(halves, 2 * math.ceil(2 * sigma) + 1, mode=mode), sigma, mode=mode) / FILLED
+    return [replace(one, vertical_fov=math.degrees(2 * math.atan(half))) for one, half in zip(turned, halves)]
+
+
+def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDArray[np.uint8]], float, float]:
+    """Frames of a clip, (height, width, 3) each; the time between two [s]; and the mean share of the cloth in the pictures."""
+    take = taken(clip)
+    mesh, front_and_back = take.mesh, {}
+    if clip.look != "gingham":
+        look = LOOKS[clip.look]
+        front_and_back = {"front": look.front, "back": look.back, "check": look.check}
+    points = [shot.positions.reshape(-1, 3) for shot in take.shots]
+    cameras = followed(take.camera, points, width / height, take.step, clip.loop > 0)
+    frames, shares, last = [], [], None
+    for number, (shot, camera) in enumerate(zip(take.shots, cameras)):
+        if shot is not last:
+            uv = mesh.rest_positions[:, :2]
+            renderer = Renderer(mesh.triangles, uv, camera, width, height, 2, 1, grid_shape=mesh.shape, **front_and_back)
+            frames.append(drawn(renderer, take, shot, clip.color))
+            if number % 10 == 0:
+                shares.append(share_of_cloth(renderer, shot))
+        else:
+            frames.append(frames[-1])
+        last = shot
+    return frames, take.step, float(np.mean(shares))
+
+
+def drawn(renderer: Renderer, take: Take, shot: Shot, color: str) -> NDArray[np.uint8]:
+    """A picture of all sheets of a moment, of which the nearest is seen."""
+    pictures, depths = [], []
+    for x in shot.positions:
+        values = None
+        if color == "strain":
+            values = largest_at_particles(take.mesh, structural_strain(take.mesh, x[None]))[0] / np.float32(take.strained)
+        pictures.append(renderer.rgb(x, shot.solids, shot.markers, values))
+        depths.append(renderer.depth(x, shot.solids, shot.markers))
+    nearest = np.argmin(depths, axis=0)[None, :, :, None]
+    return np.take_along_axis(np.stack(pictures), nearest, axis=0)[0]
+
+
+def share_of_cloth(renderer: Renderer, shot: Shot) -> float:
+    """Share of the pixels in which a moment's first sheet is seen."""
+    x = shot.positions[0]
+    return float((renderer.depth(x, shot.solids) != renderer.depth(x - (0, 0, 100), shot.solids)).mean())
+
+
+def hero() -> Iterator[NDArray[np.uint8]]:
+    """Frames of the README's film: three clips side by side, each of which begins again when it is over."""
+    reels = []
+    for name in HERO:
+        frames, step, _ = film(CLIPS[name], *HERO_SIZE)
+        count = round(len(frames) * step * HERO_FPS)
+        reels.append([frames[min(round(k / HERO_FPS / step), len(frames) - 1)] for k in range(count)])
+    for k in range(round(HERO_SECONDS * HERO_FPS)):
+        yield side_by_side([reel[k % len(reel)] for reel in reels])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clips", nargs="*", metavar="NAME", choices=[[], *CLIPS], help=f"any of {', '.join(CLIPS)}; all by default")
+    parser.add_argument("--hero", action="store_true", help="the README's film alone")
+    options = parser.parse_args()
     HERE.mkdir(exist_ok=True)
-    for name in parser.parse_args().clips or CLIPS:
-        path = HERE / f"{name}.gif"
-        write_video(path, film(CLIPS[name]), FPS)
-        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB", flush=True)
+    for name in [] if options.hero else options.clips or CLIPS:
+        path = HERE / f"{name}.webp"
+        frames, step, share = film(CLIPS[name])
+        write_video(path, frames, 1 / step)
+        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB, {1 / step:.0f} frames/s, {100 * share:.0f} % cloth", flush=True)
+    if options.hero or not options.clips:
+        write_video(HERE.parent / "hero.webp", hero(), HERO_FPS)
 
 
 if __name__ == "__main__":

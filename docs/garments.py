@@ -1,7 +1,7 @@
 """The pictures of docs/garments.md.
 
-python docs/garments.py                                  # garments.png, and garment_shirts.png
-python docs/garments.py --kinds tshirt towel --seed 1    # garments.png with some kinds and other sizes
+python docs/garments.py                                  # garments.webp, and garment_shirts.webp
+python docs/garments.py --kinds tshirt towel --seed 1    # garments.webp with some kinds and other sizes
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ def draw_kinds(kinds: Sequence[str], seed: int) -> None:
         strips.append(side_by_side(images))
     rows = [side_by_side(strips[k : k + 2]) for k in range(0, len(strips), 2)]
     whole = Image.fromarray(side_by_side(rows, axis=0))
-    write(HERE / "garments.png", np.asarray(whole.resize([round(SMALLER * side) for side in whole.size], Image.Resampling.LANCZOS)))
+    smaller = [round(SMALLER * side) for side in whole.size]
+    write(HERE / "garments.webp", np.asarray(whole.resize(smaller, Image.Resampling.LANCZOS)))
 
 
 def draw_shirts() -> None:
@@ -94,7 +95,7 @@ def draw_shirts() -> None:
     cloth.reset(positions=x[:, [0, 2, 1]] * [1, -1, 1] + [0, 0, 0.5])
     cloth.move_anchors(cloth.positions[0][shoulders] * [0.8, 1, 1])
     hung = labeled(picture(garment.mesh, after(cloth, HANGING), Camera((0.5, -2.0, 0.9), (0, 0, 0.5)), []), "from its shoulders")
-    write(HERE / "garment_shirts.png", side_by_side([over, hung]))
+    write(HERE / "garment_shirts.webp", side_by_side([over, hung]))
 
 
 def main() -> None:

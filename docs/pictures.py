@@ -1,12 +1,8 @@
 """The pictures of the README and of the pages.
 
-python docs/pictures.py                                            # the strips: scripted agents in each task; and contact
-python docs/pictures.py --strips reach.png fold.png                # some of them
-python docs/pictures.py --contact                                  # contact alone
-python docs/pictures.py --folds                                    # a film of the three folds
-python docs/pictures.py --learned ClothDrape-v0 drape.gif          # a film of a committed policy
-python docs/pictures.py --learned ClothStrain-v0 strain.gif        # in the colors of the strain, with their scale
-python docs/pictures.py --expert ClothHang-Hard-v0 hang.gif        # or of a scripted expert
+python docs/pictures.py                                  # the strips: scripted agents in each task; and contact
+python docs/pictures.py --strips reach.webp fold.webp    # some of them
+python docs/pictures.py --contact                        # contact alone
 """
 
 from __future__ import annotations
@@ -23,17 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-import clothgym
 from clothgym import Box, MeshCollider, Plane, Simulation, grid
 from clothgym.forces import structural_strain
-from clothgym.render import Camera, Drawn, Renderer, write_video
+from clothgym.render import Camera, Drawn, Renderer
 from clothgym.render.heat import heat_colors, largest_at_particles
 from clothgym.render.solids import drawn
 from clothgym.starts import MANEUVERS
 
 HERE = Path(__file__).parent
-SIZE, FILMED, GAP = 300, 240, 4  # pixels of a picture, of one in a film, and of the white between two
-HELD_OUT = 1_000_000  # the first seed of held-out episodes
+SIZE, GAP = 300, 4  # pixels of a picture, and of the white between two
 FILLED = 0.92  # share of a picture that what happens takes up
 INK = (43, 45, 66)
 
@@ -60,10 +54,8 @@ def side_by_side(images: Sequence[NDArray[np.uint8]], axis: int = 1) -> NDArray[
 
 
 def write(path: Path, image: NDArray[np.uint8]) -> None:
-    """A picture in 256 colors of its own, which is half as large and looks the same."""
-    picture = Image.fromarray(image)
-    palette = picture.quantize(256, method=Image.Quantize.MEDIANCUT, kmeans=1)
-    picture.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(path, optimize=True)
+    """A picture, with a loss that cannot be seen."""
+    Image.fromarray(image).save(path, quality=80, method=6)
 
 
 def scale_of_strain(width: int, most: float) -> NDArray[np.uint8]:
@@ -83,20 +75,27 @@ def scale_of_strain(width: int, most: float) -> NDArray[np.uint8]:
 # --- cameras --------------------------------------------------------------------------------------------------------------
 
 
-def framed(camera: Camera, points: NDArray) -> Camera:
-    """A camera in the same place that has all these points [m], (points, 3), in its square picture, and no more around them."""
+def slopes(camera: Camera, points: NDArray) -> NDArray:
+    """Where a camera sees these points [m], (points, 3): to the right and up, over the distance ahead, (points, 2)."""
+    away = (points - np.asarray(camera.eye)) @ np.stack(list(map(np.asarray, camera.axes)), axis=1)
+    return away[:, :2] / away[:, 2:]
+
+
+def framed(camera: Camera, points: NDArray, aspect: float = 1.0) -> Camera:
+    """A camera in the same place that has all these points [m], (points, 3), in its picture, and no more around them.
+
+    aspect: width of the picture over its height.
+    """
     eye = np.asarray(camera.eye)
     for _ in range(4):
         right, up, forward = map(np.asarray, camera.axes)
-        away = (points - eye) @ np.stack([right, up, forward], axis=1)
-        slopes = away[:, :2] / away[:, 2:]
-        low, high = slopes.min(axis=0), slopes.max(axis=0)
+        seen = slopes(camera, points)
+        low, high = seen.min(axis=0), seen.max(axis=0)
         x, y = (low + high) / 2
+        half = float(((high - low) / (aspect, 1)).max()) / 2
         way = forward + x * right + y * up
         target = eye + camera.distance * way / np.linalg.norm(way)
-        camera = replace(
-            camera, target=tuple(target), vertical_fov=math.degrees(2 * math.atan(float((high - low).max()) / 2 / FILLED))
-        )
+        camera = replace(camera, target=tuple(target), vertical_fov=math.degrees(2 * math.atan(half / FILLED)))
     return camera
 
 
@@ -200,33 +199,33 @@ class Row(NamedTuple):
 
 SHAPES = {shape: {"target": {"shape": shape, "center": (0.0, 0.0)}} for shape in ("sphere", "box", "post")}
 STRIPS: dict[str, list[Row]] = {
-    "drape.png": [Row(shape, "ClothDrape-v0", (0, 22, 34), 7, target) for shape, target in SHAPES.items()],
-    "gripper.png": [
+    "drape.webp": [Row(shape, "ClothDrape-v0", (0, 22, 34), 7, target) for shape, target in SHAPES.items()],
+    "gripper.webp": [
         Row("flat", "ClothDrapeGripper-v0", (0, 12, 28, 42), 9, {"rumpled": False}),
         Row("rumpled", "ClothDrapeGripper-v0", (0, 14, 30, 46), 9, {"rumpled": True}),
     ],
-    "strain.png": [
+    "strain.webp": [
         Row("scripted expert", "ClothStrain-v0", (0, 30, 50, 75), 7, color="strain"),
         Row("straight, at full speed", "ClothStrain-v0", (0, 12, 22, 35), 7, act=careless, color="strain"),
     ],
-    "hang.png": [
+    "hang.webp": [
         Row("ClothHang-v0", "ClothHang-v0", (0, 12, 18, 30), 7),
         Row("ClothHang-Hard-v0", "ClothHang-Hard-v0", (0, 24, 56, 72), 9, {"rumpled": True}),
     ],
-    "hook.png": [
+    "hook.webp": [
         Row("ClothHook-v0", "ClothHook-v0", (0, 24, 46, 60), 7),
         Row("ClothHook-Hard-v0", "ClothHook-Hard-v0", (0, 30, 80, 112), 9, {"rumpled": True}),
     ],
-    "flatten.png": [
+    "flatten.webp": [
         Row("ClothFlatten-v0", "ClothFlatten-v0", (0, 40, 80, 110), 1_000_106),
         Row("ClothFlatten-Hard-v0", "ClothFlatten-Hard-v0", (0, 40, 80, 110), 1_000_000),
     ],
-    "fling.png": [
+    "fling.webp": [
         Row("ClothFling-v0", "ClothFling-v0", (0, 40, 72, 78), 1_000_000),
         Row("ClothFling-Hard-v0", "ClothFling-Hard-v0", (0, 44, 82, 90), 1_000_001),
     ],
-    "reach.png": [Row("ClothReach-v0", "ClothReach-v0", (0, 6, 12, 18), 7)],
-    "fold.png": [
+    "reach.webp": [Row("ClothReach-v0", "ClothReach-v0", (0, 6, 12, 18), 7)],
+    "fold.webp": [
         Row("in half", "ClothFold-v0", (0, 16, 30, 44), 7, kwargs={"fold": "half"}),
         Row("diagonal", "ClothFold-v0", (0, 18, 36, 54), 7, kwargs={"fold": "diagonal"}),
         Row("ClothFold-Hard-v0: twice", "ClothFold-Hard-v0", (0, 30, 60, 100), 8),
@@ -240,46 +239,6 @@ def draw_strips(names: Iterable[str]) -> None:
         if STRIPS[name][0].color == "strain":
             picture = np.concatenate([picture, scale_of_strain(picture.shape[1], 0.1)])
         write(HERE / name, picture)
-
-
-# --- films --------------------------------------------------------------------------------------------------------------
-
-
-def film(path: Path, episodes: Sequence[Episode], stride: int, color: str = "fabric") -> None:
-    """Episodes side by side, every so many moments of them; what has ended stands still."""
-    painters = [episode.painter(FILMED, 2, color) for episode in episodes]
-    step = episodes[0].task.physics.time_step
-    longest = max(len(episode.moments) for episode in episodes)
-    still: list[Any] = [None] * len(episodes)
-    frames = []
-    for k in range(0, longest + stride, stride):
-        for place, (episode, draw) in enumerate(zip(episodes, painters)):
-            if k - stride < len(episode.moments) - 1:
-                still[place] = draw(episode.moments[min(k, len(episode.moments) - 1)])
-        frames.append(side_by_side(still))
-        if color == "strain":
-            frames[-1] = np.concatenate([frames[-1], scale_of_strain(frames[-1].shape[1], episodes[0].task.strain_shown)])
-    # the end stands for a second
-    write_video(path, frames + frames[-1:] * round(1 / step / stride), fps=1 / step / stride)
-
-
-def film_learned(env_id: str, path: Path) -> None:
-    """Three held-out episodes of a committed policy."""
-    policy = clothgym.policies.load(env_id)
-    kwargs = policy.about["env_kwargs"] | {"settling": "steps"}
-    episodes = [played(env_id, HELD_OUT + k, lambda env, seen: policy(seen), **kwargs) for k in range(3)]
-    film(path, episodes, 2, "strain" if env_id == "ClothStrain-v0" else "fabric")
-
-
-def film_expert(env_id: str, path: Path) -> None:
-    """Two held-out episodes of a scripted expert."""
-    film(path, [played(env_id, HELD_OUT + k) for k in range(2)], 4)
-
-
-def film_folds() -> None:
-    """The three folds."""
-    folds = (("ClothFold-v0", "half"), ("ClothFold-v0", "diagonal"), ("ClothFold-Hard-v0", "quarter"))
-    film(HERE / "fold.gif", [played(env_id, 7, fold=fold) for env_id, fold in folds], 4)
 
 
 # --- contact ------------------------------------------------------------------------------------------------------------
@@ -333,7 +292,7 @@ def draw_contact() -> None:
         x = heap.simulation.positions[0]
         x = x - x[:, :2].mean(axis=0) @ np.eye(2, 3)
         images.append(labeled(picture(heap.simulation.mesh, x, Camera(eye=(0.75, -0.8, 0.5), target=(0, 0, 0.02)), []), title))
-    write(HERE / "contact.png", side_by_side(images))
+    write(HERE / "contact.webp", side_by_side(images))
 
 
 def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any:
@@ -345,25 +304,13 @@ def picture(mesh: Any, positions: Any, camera: Camera, solids: list[Any]) -> Any
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--strips", nargs="+", choices=STRIPS, metavar="PNG", help="draw some strips alone")
-    parser.add_argument(
-        "--learned", nargs=2, metavar=("ENV", "GIF"), help="id whose committed policy is filmed, and the film's name"
-    )
-    parser.add_argument("--expert", nargs=2, metavar=("ENV", "GIF"), help="id whose scripted expert is filmed, and the film's name")
+    parser.add_argument("--strips", nargs="+", choices=STRIPS, metavar="WEBP", help="draw some strips alone")
     parser.add_argument("--contact", action="store_true", help="draw contact alone")
-    parser.add_argument("--folds", action="store_true", help="film the folds alone")
     options = parser.parse_args()
-    if options.learned is not None:
-        film_learned(options.learned[0], HERE / options.learned[1])
-    elif options.expert is not None:
-        film_expert(options.expert[0], HERE / options.expert[1])
-    elif options.folds:
-        film_folds()
-    else:
-        if not options.contact:
-            draw_strips(options.strips or STRIPS)
-        if not options.strips:
-            draw_contact()
+    if not options.contact:
+        draw_strips(options.strips or STRIPS)
+    if not options.strips:
+        draw_contact()
 
 
 if __name__ == "__main__":

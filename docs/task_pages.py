@@ -23,11 +23,6 @@ from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
 HERE = Path(__file__).parent
-FILMS = {
-    "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif", "ClothHang-v0": "hang.png",
-    "ClothHang-Hard-v0": "hang.gif", "ClothFling-v0": "fling.gif", "ClothFling-Hard-v0": "fling.png",
-    "ClothHook-v0": "hook.png", "ClothHook-Hard-v0": "hook.gif",
-}  # fmt: skip
 ROOT, PAGES = HERE.parent, HERE / "tasks"
 RESULTS = ROOT / "benchmarks" / "results" / "suite.json"
 COMMAND = "python training/evaluate.py --suite --json benchmarks/results/suite.json"
@@ -35,7 +30,8 @@ for folder in (HERE, ROOT / "training"):
     if str(folder) not in sys.path:
         sys.path.insert(0, str(folder))
 
-import gallery  # noqa: E402 - a script in this folder
+import gallery  # noqa: E402 - scripts in this folder
+import pictures  # noqa: E402
 import results  # noqa: E402 - scripts of training/
 import suite  # noqa: E402
 
@@ -74,9 +70,9 @@ def _linked(text: str, own: str) -> str:
 
 
 def _picture(env_id: str) -> str:
-    """A link to the id's picture, if the repository has one."""
-    clips = [gallery.HERE / f"{name}.gif" for name, clip in gallery.CLIPS.items() if clip.name == env_id]
-    for path in ([HERE / FILMS[env_id]] if env_id in FILMS else []) + clips:
+    """A link to the id's film, or to pictures of its scripted expert, if the repository has one."""
+    strips = [HERE / name for name, rows in pictures.STRIPS.items() if env_id in {row.env_id for row in rows}]
+    for path in [gallery.HERE / f"{env_id}.webp", *strips]:
         if path.exists():
             return f"![{env_id}](../{path.relative_to(HERE).as_posix()})"
     return ""
@@ -182,7 +178,16 @@ def index(scores: Suite) -> str:
         f"or learned policies (`{COMMAND}`).",
         "`python docs/task_pages.py` generates the pages.",
     ]
-    return "\n".join(["# Tasks", "", *rows, "", *said]) + "\n"
+    return "\n".join(["# Tasks", "", *tiles(), "", *rows, "", *said]) + "\n"
+
+
+def tiles(across: int = 3) -> list[str]:
+    """Lines of a table of the films that there are, each a link to its task."""
+    names = [env_id for env_id in ENVIRONMENTS if (gallery.HERE / f"{env_id}.webp").exists()]
+    cells = [f"[![{name}](../gallery/{name}.webp)]({name}.md)<br>{name}" for name in names]
+    cells += [""] * (-len(cells) % across)
+    lines = [f"| {' | '.join(cells[first : first + across])} |" for first in range(0, len(cells), across)]
+    return [f"| {'| ' * across}".rstrip() + "", f"| {'--- | ' * across}".rstrip(), *lines]
 
 
 def main() -> None:

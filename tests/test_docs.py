@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 TASKS = sorted((ROOT / "docs" / "tasks").glob("*.md"))
-PICTURES = {".gif", ".png"}
+PICTURES = {".png", ".webp"}
 
 
 def headings(text):

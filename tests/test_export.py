@@ -174,13 +174,27 @@ def frames():
     return [np.full((32, 48, 3), 20 * i, np.uint8) for i in range(5)]
 
 
-def test_gif_keeps_frames_and_loops(tmp_path):
+@pytest.mark.parametrize("ending", ["gif", "webp"])
+def test_films_keep_frames_and_loop(tmp_path, ending):
     image = pytest.importorskip("PIL.Image")
-    write_video(tmp_path / "a.gif", frames(), fps=10)
-    with image.open(tmp_path / "a.gif") as gif:
-        assert (gif.n_frames, gif.size, gif.info["loop"], gif.info["duration"]) == (5, (48, 32), 0, 100)
-        gif.seek(4)
-        assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - 80).max() <= 4
+    write_video(tmp_path / f"a.{ending}", frames(), fps=10)
+    with image.open(tmp_path / f"a.{ending}") as film:
+        film.seek(4)
+        assert np.abs(np.asarray(film.convert("RGB")).astype(int) - 80).max() <= 4
+        assert (film.n_frames, film.size, film.info["loop"], film.info["duration"]) == (5, (48, 32), 0, 100)
+
+
+def test_a_webp_keeps_the_rate_of_thirty_a_second(tmp_path):
+    """33 or 34 ms each, so that three of them are a tenth of a second."""
+    image = pytest.importorskip("PIL.Image")
+    write_video(tmp_path / "a.webp", [np.full((8, 8, 3), 40 * i, np.uint8) for i in range(6)], fps=30)
+    with image.open(tmp_path / "a.webp") as film:
+        durations = []
+        for k in range(film.n_frames):
+            film.seek(k)
+            film.load()
+            durations.append(film.info["duration"])
+    assert durations == [33, 34, 33, 33, 34, 33]
 
 
 def test_a_small_thing_keeps_its_color_in_a_gif(tmp_path):
@@ -215,7 +229,7 @@ def test_mp4_keeps_frames(tmp_path):
 
 
 def test_wrong_videos_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"must end in .gif or .mp4"):
+    with pytest.raises(ValueError, match=r"must end in .webp, .gif or .mp4"):
         write_video(tmp_path / "a.avi", frames())
     with pytest.raises(ValueError, match="empty"):
         write_video(tmp_path / "a.gif", [])
@@ -225,14 +239,14 @@ def test_wrong_videos_are_refused(tmp_path):
         write_video(tmp_path / "a.gif", [frames()[0], np.zeros((3, 3, 3), np.uint8)])
 
 
-@pytest.mark.parametrize(("ending", "package"), [("gif", "PIL"), ("mp4", "imageio_ffmpeg")])
+@pytest.mark.parametrize(("ending", "package"), [("gif", "PIL"), ("webp", "PIL"), ("mp4", "imageio_ffmpeg")])
 def test_a_missing_package_names_the_extra(tmp_path, monkeypatch, ending, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=r"clothgym\[video\]"):
         write_video(tmp_path / f"a.{ending}", frames())
 
 
-@pytest.mark.parametrize(("ending", "package"), [("gif", "PIL"), ("mp4", "imageio_ffmpeg")])
+@pytest.mark.parametrize(("ending", "package"), [("gif", "PIL"), ("webp", "PIL"), ("mp4", "imageio_ffmpeg")])
 def test_an_error_on_the_way_keeps_the_frames_before_it(tmp_path, ending, package):
     pytest.importorskip(package)
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from policies import Policy
 from tqdm import tqdm
 
-HELD_OUT = 1_000_000
+from clothgym.evaluation import FIRST_HELD_OUT
+
+HELD_OUT = FIRST_HELD_OUT
 BATCH = 250
 
 

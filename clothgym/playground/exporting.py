@@ -31,7 +31,7 @@ from clothgym.render.meshes import KINDS, without_frames
 from clothgym.simulation import GRAVITY
 
 SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
-NEEDED = {".png": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
+NEEDED = {".png": "PIL", ".webp": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
 # what a visitor can save
 SAVED = {
     "png": "picture (PNG)",
@@ -195,7 +195,7 @@ def export(
 
     Args:
         name: of a scene or an environment.
-        out: ``.png`` for a picture of the end, ``.gif`` or ``.mp4`` for a film, ``.glb`` for a mesh that moves; without an ending
+        out: ``.png`` for a picture of the end, ``.webp``, ``.gif`` or ``.mp4`` for a film, ``.glb`` for a mesh that moves; without an ending
             a folder of meshes, one for each frame.
         seconds: how long; a scene's 5 and an episode's whole length by default.
         fps: frames a second, 30 or the scene's own by default; size: pixels of a side.
@@ -208,8 +208,8 @@ def export(
         RuntimeError: the sheet has blown up; what came before is kept.
     """
     path = Path(out).expanduser()
-    if path.suffix not in ("", ".png", ".gif", ".mp4", ".glb"):
-        raise ValueError(f"out={str(out)!r}: must end in .png, .gif, .mp4 or .glb, or be a folder (without an ending) for meshes")
+    if path.suffix not in ("", ".glb", *NEEDED):
+        raise ValueError(f"out={str(out)!r}: must end in .png, .webp, .gif, .mp4 or .glb, or be a folder (without an ending) for meshes")
     if path.suffix in ("", ".glb") and color != "fabric":
         raise ValueError(f"color={color!r}: meshes only have the fabric's color; ask for a picture or a film")
     if size is not None:

@@ -8,11 +8,14 @@ import itertools
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym import files
+
+QUALITY = 40  # of a webp, of 100
 
 
 def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
@@ -28,17 +31,15 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
     image = np.asarray(image)
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"image has shape {image.shape} and dtype {image.dtype}: must be (height, width, 3) uint8")
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise ImportError("a .png needs pillow: pip install 'clothgym[video]'") from error
     content = io.BytesIO()
-    Image.fromarray(image).save(content, "png", optimize=True)
+    _pillow(".png").fromarray(image).save(content, "png", optimize=True)
     files.write(path, content.getvalue())
 
 
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
-    """Write frames, (height, width, 3) uint8 each, as a looped ``.gif`` or an ``.mp4``.
+    """Write frames, (height, width, 3) uint8 each, as a looped ``.webp`` or ``.gif``, or as an ``.mp4``.
+
+    A ``.webp`` has all colors, and a third of the size of a ``.gif``.
 
     Frames may come from a generator, and are written to an ``.mp4`` one by one.  If it raises, the frames so far are kept next to
     ``path``, as ``NAME.part.mp4``, and the error says so.
@@ -46,11 +47,11 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     Raises:
         ValueError: another ending, no frames, frames of different sizes, or an fps that is not positive.
         OSError: the disk is full, or the folder cannot be written; then nothing is kept.
-        ImportError: pillow (for a gif) or imageio-ffmpeg (for an mp4) is missing.
+        ImportError: pillow (for a webp or a gif) or imageio-ffmpeg (for an mp4) is missing.
     """
     path = Path(path).expanduser()
-    if path.suffix not in (".gif", ".mp4"):
-        raise ValueError(f"video path={str(path)!r}: must end in .gif or .mp4")
+    if path.suffix not in WRITERS:
+        raise ValueError(f"video path={str(path)!r}: must end in .webp, .gif or .mp4")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps={fps!r}: must be positive and finite")
     images = _checked(frames)
@@ -60,7 +61,7 @@ def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: floa
     kept = path.with_name(f"{path.stem}.part{path.suffix}")
     with files.replacing(path) as scratch:
         try:
-            (_write_gif if path.suffix == ".gif" else _write_mp4)(scratch, first, images, fps)
+            WRITERS[path.suffix](scratch, first, images, fps)
         except OSError:
             raise
         except BaseException as error:
@@ -83,12 +84,30 @@ def _checked(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]
         yield image
 
 
-def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
-    """All frames with one palette."""
+def _write_webp(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Each frame as what differs from the one before; times are rounded to milliseconds, and do not drift."""
+    pillow = _pillow(".webp")
+    pages = [pillow.fromarray(first)]
+    try:
+        pages.extend(map(pillow.fromarray, others))
+    finally:
+        ends = [round(1000 * (k + 1) / fps) for k in range(len(pages))]
+        durations = [end - begin for begin, end in zip([0, *ends], ends)]
+        pages[0].save(path, "webp", save_all=True, append_images=pages[1:], duration=durations, loop=0, quality=QUALITY, method=4)
+
+
+def _pillow(suffix: str) -> Any:
+    """``PIL.Image``; raises ImportError that names the ending and the extra."""
     try:
         from PIL import Image
     except ImportError as error:
-        raise ImportError("a .gif needs pillow: pip install 'clothgym[video]'") from error
+        raise ImportError(f"a {suffix} needs pillow: pip install 'clothgym[video]'") from error
+    return Image
+
+
+def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """All frames with one palette."""
+    pillow = _pillow(".gif")
     images = [first]
     try:
         for image in others:
@@ -96,8 +115,8 @@ def _write_gif(path: Path, first: NDArray[np.uint8], others: Iterator[NDArray[np
     finally:
         # one palette for all frames, from a sample of them: with one each, the floor would flicker
         sample = np.concatenate(images[:: max(1, len(images) // 8)], axis=0)
-        palette = Image.fromarray(_with_rare_colors(sample)).quantize(256, method=Image.Quantize.MEDIANCUT)
-        pages = [Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
+        palette = pillow.fromarray(_with_rare_colors(sample)).quantize(256, method=pillow.Quantize.MEDIANCUT)
+        pages = [pillow.fromarray(image).quantize(palette=palette, dither=pillow.Dither.FLOYDSTEINBERG) for image in images]
         # a gif counts in hundredths of a second; players slow down anything below two of them
         hundredths, film = max(2, round(100 / fps)), io.BytesIO()
         pages[0].save(film, "gif", save_all=True, append_images=pages[1:], duration=10 * hundredths, loop=0, optimize=True)
@@ -141,3 +160,6 @@ def _is_whole(path: Path) -> bool:
                 return name == b"moov"
             file.seek(size - len(head), io.SEEK_CUR)
     return False
+
+
+WRITERS = {".webp": _write_webp, ".gif": _write_gif, ".mp4": _write_mp4}
