@@ -74,7 +74,7 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
         text = re.sub(rf"\]\({folders}\.\./{re.escape(name)}(#[\w-]+)?\)", f"]({folders}{place}.md)", text)
     if page == "peers":
         readme = (ROOT / "README.md").read_text()
-        table = re.search(r"^## Comparison with other projects\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
+        table = re.search(r"^## Comparison with other learning benchmarks\n(.*?\n)\n[^|]", readme, re.DOTALL | re.MULTILINE)
         assert table, "README.md has no table of other projects"
         text = text.replace("\n## ", f"\n{table[1]}\n## ", 1)
     if page == "index" and DEMO.exists():

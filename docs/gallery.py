@@ -31,7 +31,7 @@ HERE = Path(__file__).parent / "gallery"
 WIDTH, HEIGHT, FPS = 480, 360, 30
 HELD_OUT = 1_000_000  # the first seed of held-out episodes
 STEADY = 0.4  # how slowly the camera follows [s]
-RESTS, HOLD = 0.03, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
+RESTS, HOLD = 0.08, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
 
 
 class Clip(NamedTuple):
