@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pictures import FILLED, framed, played, side_by_side, slopes  # a script in this folder
+from pictures import FILLED, corners, framed, played, side_by_side, slopes  # a script in this folder
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 import clothgym
@@ -25,13 +25,13 @@ from clothgym.mesh import ClothMesh
 from clothgym.playground.exporting import moments, stage_named
 from clothgym.render import Camera, Drawn, Renderer, write_video
 from clothgym.render.heat import largest_at_particles
-from clothgym.render.looks import LOOKS
+from clothgym.render.looks import LOOKS, PLAIN
 
 HERE = Path(__file__).parent / "gallery"
 WIDTH, HEIGHT, FPS = 480, 360, 30
 HELD_OUT = 1_000_000  # the first seed of held-out episodes
 STEADY = 0.4  # how slowly the camera follows [s]
-RESTS, HOLD = 0.08, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
+RESTS, HOLD = 0.15, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
 
 
 class Clip(NamedTuple):
@@ -39,8 +39,9 @@ class Clip(NamedTuple):
 
     policy: who acts: "expert", or "learned", the committed policy.  speed: seconds of the episode in a second of the film.
     loop: where the motion has no end, frames over which the sheet passes from the last moments into the first.  at_least: the clip
-    is the piece, at least so long [s], that begins and ends most alike; None for all.  look: of the fabric, see ``LOOKS``; or
-    "gingham".  color: "fabric" or "strain".  settings: of a scene, see ``Settings``; kwargs: of an environment.
+    is the piece, at least so long [s], that begins and ends most alike; None for all.  look: of the fabric, see ``LOOKS``, or
+    "gingham".  color: "fabric" or "strain".  goals: whether spheres that mark goals stay in sight, too.  settings: of a scene, see
+    ``Settings``.  kwargs: of an environment.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Clip(NamedTuple):
     at_least: float | None = None
     look: str = "gingham"
     color: str = "fabric"
+    goals: bool = False
     settings: dict[str, Any] = {}  # noqa: RUF012 - never written to
     kwargs: dict[str, Any] = {}  # noqa: RUF012
 
@@ -65,7 +67,7 @@ CLIPS = {
     "pawn": Clip("pawn", 2.6, seed=0, look="denim"),
     "cape": Clip("cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille"),  # a figure of eight
     "fold": Clip("fold", 5.5, seed=0, look="wool_tropical"),
-    "ClothReach-v0": Clip("ClothReach-v0", look="knit"),
+    "ClothReach-v0": Clip("ClothReach-v0", look="knit", goals=True),
     "ClothDrape-v0": Clip("ClothDrape-v0"),
     "ClothDrapeGripper-v0": Clip("ClothDrapeGripper-v0", look="cotton_broad"),
     "ClothHang-v0": Clip("ClothHang-v0", look="polyester_tropical"),
@@ -176,17 +178,18 @@ def followed(camera: Camera, seen: Sequence[NDArray], aspect: float, step: float
 def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDArray[np.uint8]], float, float]:
     """Frames of a clip, (height, width, 3) each; the time between two [s]; and the mean share of the cloth in the pictures."""
     take = taken(clip)
-    mesh, front_and_back = take.mesh, {}
-    if clip.look != "gingham":
-        look = LOOKS[clip.look]
-        front_and_back = {"front": look.front, "back": look.back, "check": look.check}
+    mesh, colors = take.mesh, {} if clip.look == "gingham" else LOOKS[clip.look]._asdict()
+    # cloth of one color lies in the middle of a stripe, and of a yarn
+    uv = mesh.rest_positions[:, :2] + (0.525 * PLAIN if colors.get("check") == PLAIN else 0)
     points = [shot.positions.reshape(-1, 3) for shot in take.shots]
+    if clip.goals:
+        balls = [[ball for ball in shot.markers if ball.kind == "sphere"] for shot in take.shots]
+        points = [np.concatenate([seen, corners(found)]) for seen, found in zip(points, balls)]
     cameras = followed(take.camera, points, width / height, take.step, clip.loop > 0)
     frames, shares, last = [], [], None
     for number, (shot, camera) in enumerate(zip(take.shots, cameras)):
         if shot is not last:
-            uv = mesh.rest_positions[:, :2]
-            renderer = Renderer(mesh.triangles, uv, camera, width, height, 2, 1, grid_shape=mesh.shape, **front_and_back)
+            renderer = Renderer(mesh.triangles, uv, camera, width, height, 2, 1, grid_shape=mesh.shape, **colors)
             frames.append(drawn(renderer, take, shot, clip.color))
             if number % 10 == 0:
                 shares.append(share_of_cloth(renderer, shot))
