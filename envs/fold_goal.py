@@ -12,7 +12,7 @@ from clothgym._jit import inlined
 from clothgym.checks import one_of
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, FoldTask, along_arc
+from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, PICKING, FoldTask, along_arc
 from clothgym.envs.gripper_task import (
     CORNERS,
     LARGE_SILK,
@@ -25,7 +25,7 @@ from clothgym.envs.gripper_task import (
 )
 from clothgym.envs.measures import SPEED2, distance
 from clothgym.envs.observing import POSITION_BOUND, Observation
-from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow
+from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow, taking
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import REWARD_MODES
@@ -55,6 +55,17 @@ def _measure(own, rules, sheet):
 def _near(own, rules, sheet):
     """Share of the initial mean distance that is covered, in [0, 1]."""
     return min(max(1 - own.away / own.began, 0.0), 1.0)
+
+
+@inlined
+def _potential(own, rules, sheet):
+    """Progress of grasping the corners that are to be carried, and of the fold."""
+    taken, carried = 0.0, 0
+    for k in range(own.carried.shape[0]):
+        if own.carried[k] >= 0:
+            place, carried = rules.corners[own.carried[k]], carried + 1
+            taken += taking(sheet.holder[place] >= 0, rules, sheet, place, k)
+    return PICKING * taken / carried + (1 - PICKING) * _near(own, rules, sheet)
 
 
 @inlined
@@ -102,7 +113,7 @@ class FoldGoalTask(ManipulationTask):
         reward_mode: "goal", or what ``Task`` takes.
     """
 
-    kernels = Kernels(_near, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
+    kernels = Kernels(_potential, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
     acting_steps = 80
     settling_steps = 40
     obs_modes = ("keypoints", "particles")
@@ -260,7 +271,8 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     ``copy_info_dict=True``.
     $rewards
 
-    During the episode the potential is ``1 - d/d0``, see below.
+    During the episode the potential is 0.7 times ``1 - d/d0``, see below, plus 0.3 times the mean over the corners that are to be
+    carried of 1 for a held corner, else ``1/2 / (1 + (d/0.15 L)^2)`` with its gripper's distance d.
 
     ## Evaluation
     ``info["distance"]`` is the mean distance d of the corners from their goals, in sides, and ``distance_max`` the largest, after

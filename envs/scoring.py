@@ -37,7 +37,13 @@ def falloff(distance, scale):
 @inlined
 def grasp(taken, rules, sheet, k):
     """1 for a gripper that has taken its place, at most a half for one that nears it."""
-    away = distance(sheet.x[:, rules.places[k]], sheet.attachments[k])
+    return taking(taken, rules, sheet, rules.places[k], k)
+
+
+@inlined
+def taking(taken, rules, sheet, place, k):
+    """The same of a gripper and any particle."""
+    away = distance(sheet.x[:, place], sheet.attachments[k])
     return 1.0 if taken else 0.5 / falloff(away, PICK_SCALE * rules.side)
 
 

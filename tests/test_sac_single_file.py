@@ -143,6 +143,19 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
     assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
 
 
+def test_a_loss_weighs_no_more_than_the_least_reward(single):
+    """The sheet is torn: corners move apart at full speed."""
+    config = {"env": "ClothDrape-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
+    found = {}
+    for least in (-1e6, -0.02):
+        kwargs, own = {"physics": "fast", "action_repeat": 60}, {"n_envs": 1, "least_reward": least}
+        run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **own))}, None)
+        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[-1, 0, 0, 0, 1, 0, 0, 0]], float))
+        run.collect(at_random=True)
+        found[least] = run.replay.rows["reward"][0]
+    assert found[-1e6] < -1 and found[-0.02] == np.float32(-0.2)
+
+
 def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
     """The buffer is that of an environment that settles at once."""
     config, found = {"env": "ClothDrape-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}, {}

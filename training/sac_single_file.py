@@ -46,8 +46,8 @@ LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 LIMITS = {
     "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
     "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1), "tau": (0, 1), "first_alpha": (1e-6, 10),
-    "reward_scale": (1e-6, 1e6), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1), "evaluations": (1, 10**4),
-    "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
+    "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
+    "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
 }  # fmt: skip
 
 
@@ -66,6 +66,7 @@ class Options:
     tau: float = 0.01  # share of the critics that their targets take over in an update
     first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
+    least_reward: float = -1e6  # of a decision: what is lost by a release, or at an episode's end, weighs no more than this
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -398,7 +399,8 @@ class Run:
         last["reward"] += self.options.reward_scale * reward
         last["following"], last["goes_on"] = following, ~terminated
         self.settling = info["settling"]
-        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
+        earned = last | {"reward": np.maximum(last["reward"], self.options.reward_scale * self.options.least_reward)}
+        self.replay.add(**{name: part[~self.settling] for name, part in earned.items()})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it."""
