@@ -81,7 +81,7 @@ def test_each_gripper_sees_its_ways_to_the_corners():
     assert ways == pytest.approx((x[:, None] - tips[:, :, None]) / (SIDE / 10), abs=1e-4)
 
 
-def test_the_potential_is_how_far_corners_have_come_on_the_average_and_success_asks_for_rest():
+def test_the_potential_is_grasps_and_how_far_corners_have_come_and_success_asks_for_rest():
     env = gym.make(ID).unwrapped
     seen, _ = env.reset(seed=1_000_003)
     task = env.task
@@ -89,11 +89,21 @@ def test_the_potential_is_how_far_corners_have_come_on_the_average_and_success_a
     def mean(seen):
         return np.linalg.norm((seen["achieved_goal"] - seen["desired_goal"]).reshape(4, 3), axis=1).mean()
 
-    began = mean(seen)
+    def taken():
+        """Mean over both grippers: 1 for a corner that is held, less the farther its gripper is."""
+        simulation, scores = task.simulation, []
+        for tip, corner in zip(simulation.grippers.positions[0], np.array(CORNERS)[task.episode["carried"][0]]):
+            away = np.linalg.norm(simulation.positions[0, corner].astype(float) - tip)
+            scores.append(1 if simulation.grippers.holder[0, corner] >= 0 else 0.5 / (1 + (away / (0.15 * SIDE)) ** 2))
+        return np.mean(scores)
+
+    began, held = mean(seen), 0
     for step in range(task.acting_steps + task.settling_steps - 1):
         seen, *_, info = env.step(env.expert_action())
         if step % 10 == 0:
-            assert task.episode["potential"][0] == pytest.approx(1 - mean(seen) / began, abs=1e-5)
+            assert task.episode["potential"][0] == pytest.approx(0.3 * taken() + 0.7 * (1 - mean(seen) / began), abs=1e-5)
+            held = max(held, taken())
+    assert held == 1
     state = env.get_state()
     for speed in (0.0, 0.6):
         state.simulation.velocities[0] = (0, 0, speed)
