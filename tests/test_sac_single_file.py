@@ -28,7 +28,7 @@ def options(single, **kwargs):
 
 def transitions(count, seed=0):
     rng = np.random.default_rng(seed)
-    shapes = {"observation": (58,), "action": (3,), "reward": (), "following": (58,), "goes_on": ()}
+    shapes = {"observation": (58,), "action": (3,), "reward": (), "following": (58,), "goes_on": (), "cost": ()}
     drawn = {name: rng.normal(size=(count, *shape)).astype(np.float32) for name, shape in shapes.items()}
     return drawn | {"action": np.tanh(drawn["action"]), "goes_on": (drawn["goes_on"] < 1).astype(np.float32)}
 
@@ -143,17 +143,19 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
     assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
 
 
-def test_a_loss_weighs_no_more_than_the_least_reward(single):
-    """The sheet is torn: corners move apart at full speed."""
-    config = {"env": "ClothDrape-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
-    found = {}
-    for least in (-1e6, -0.02):
-        kwargs, own = {"physics": "fast", "action_repeat": 60}, {"n_envs": 1, "least_reward": least}
-        run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **own))}, None)
-        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[-1, 0, 0, 0, 1, 0, 0, 0]], float))
-        run.collect(at_random=True)
-        found[least] = run.replay.rows["reward"][0]
-    assert found[-1e6] < -1 and found[-0.02] == np.float32(-0.2)
+def test_costs_have_a_price_that_grows_and_a_loss_weighs_no_more_than_the_least_reward(single):
+    """The sheet is torn: corners move apart at full speed, and each remaining step costs 1."""
+    import torch
+
+    config = {"env": "ClothStrain-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}}
+    kwargs, own = {"action_repeat": 150}, {"n_envs": 2, "cost_price": 0.01, "least_reward": -0.5}
+    run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **own))}, None)
+    run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float))
+    run.collect(at_random=True)
+    assert run.replay.rows["cost"][:2].tolist() == [150, 0] and run.replay.rows["goes_on"][:2].tolist() == [0, 0]
+    reward, cost = torch.tensor([3.0, 3.0]), torch.tensor([20.0, 200.0])
+    for run.done, want in ((0, [3, 3]), (250, [2, -5]), (500, [1, -5]), (750, [1, -5])):
+        assert run.charged(reward, cost).tolist() == pytest.approx(want)
 
 
 def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):

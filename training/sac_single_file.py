@@ -46,7 +46,7 @@ LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 LIMITS = {
     "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
     "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1), "tau": (0, 1), "first_alpha": (1e-6, 10),
-    "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
+    "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "cost_price": (0, 1e6), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
     "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
 }  # fmt: skip
 
@@ -67,6 +67,7 @@ class Options:
     first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
     least_reward: float = -1e6  # of a decision: what is lost by a release, or at an episode's end, weighs no more than this
+    cost_price: float = 0.0  # of a cost, in rewards, in the second half of the run; it grows from nothing in the first
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -270,7 +271,8 @@ class Replay:
     """The last transitions, row after row: arrays (buffer_size, ...)."""
 
     def __init__(self, size: int, observations: int, actions: int) -> None:
-        shapes = {"observation": (observations,), "action": (actions,), "reward": (), "following": (observations,), "goes_on": ()}
+        shapes: dict[str, tuple[int, ...]] = {"observation": (observations,), "action": (actions,), "following": (observations,)}
+        shapes |= dict.fromkeys(("reward", "cost", "goes_on"), ())
         self.rows = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
         self.size, self.added = size, 0
 
@@ -366,10 +368,16 @@ class Run:
                 self.agent.set_rate(options.learning_rate * max(1 - self.done / self.config["timesteps"], LEAST_RATE))
                 for batch in self.replay.minibatches(options.updates, options.batch_size, self.rng, self.normalizer):
                     self.updates += 1
+                    batch["reward"] = self.charged(batch["reward"], batch["cost"])
                     self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
             yield options.n_envs * self.env.task.control_steps
             if self.easy and self.done >= self.config["curriculum"]["n_timesteps"]:
                 self.enter()
+
+    def charged(self, reward: Any, cost: Any) -> Any:
+        """Rewards, which have their scale, less costs at the present price, and none below the least."""
+        scale, grown = self.options.reward_scale, min(2 * self.done / self.config["timesteps"], 1.0)
+        return (reward - scale * self.options.cost_price * grown * cost).clamp(min=scale * self.options.least_reward)
 
     def collect(self, at_random: bool) -> None:
         """One decision of each environment, into the replay buffer.
@@ -388,19 +396,22 @@ class Run:
                 action = self.agent.act(self.normalizer(before))[0].numpy()
         observation, reward, terminated, truncated, info = self.env.step(action)
         following = self.observation = self.flat(observation)
+        cost = info.get("cost", np.zeros(len(reward))).copy()
         # in same-step mode an environment that has ended shows the next episode's first observation already
         if (ended := np.flatnonzero(terminated | truncated)).size:
             following = following.copy()
             for i in ended:
                 following[i] = self.flat(info["final_obs"][i])
             final = info["final_info"]
+            cost[ended] = final.get("cost", cost)[ended]
             self.episodes.extend(zip(final["is_success"][ended].tolist(), final["normalized_performance"][ended].tolist()))
-        last["observation"][acting], last["action"][acting], last["reward"][acting] = before[acting], action[acting], 0
-        last["reward"] += self.options.reward_scale * reward
+        last["observation"][acting], last["action"][acting] = before[acting], action[acting]
+        for name, earned in (("reward", self.options.reward_scale * reward), ("cost", cost)):
+            last[name][acting] = 0
+            last[name] += earned
         last["following"], last["goes_on"] = following, ~terminated
         self.settling = info["settling"]
-        earned = last | {"reward": np.maximum(last["reward"], self.options.reward_scale * self.options.least_reward)}
-        self.replay.add(**{name: part[~self.settling] for name, part in earned.items()})
+        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it."""
