@@ -19,6 +19,7 @@ from clothgym.lab.bench import machine
 from clothgym.lab.scenes import Drape, bending_length, cantilever, cusick_drape
 from clothgym.material import PRESETS, Material, rigidity_percentile
 from clothgym.render import Camera, Renderer
+from clothgym.render.looks import LOOKS, PLAIN
 
 RESULT = Path(__file__).parent / "results" / "materials.json"
 PICTURE = Path(__file__).parent.parent / "docs" / "materials.png"
@@ -32,21 +33,6 @@ BANDS = {"penava_cotton": (60, 76), "silk": (20, 40), "wool": (40, 70), "denim":
 HEIGHT = 0.17  # of the supporting disc in the picture [m]
 SIZE, GAP = 300, 4
 LARGE_DISC = 0.09  # radius of the disc [m]
-PLAIN = 20.0  # width of a stripe that is wider than any specimen [m]; these lie in the middle of it, and of a yarn
-# how each looks in the picture: front, back, and width of a stripe of its gingham [m]
-LOOKS = {
-    "median": ((158, 152, 142), (120, 115, 108), 0.010),
-    "cotton_broad": ((64, 112, 170), (64, 112, 170), 0.020),
-    "polyester_tropical": ((30, 120, 116), (30, 120, 116), 0.004),
-    "wool_tropical": ((150, 104, 60), (120, 84, 50), 0.006),
-    "polyester_faille": ((150, 50, 96), (120, 40, 80), 0.003),
-    "penava_cotton": ((206, 64, 50), (206, 64, 50), 0.025),
-    "knit": ((70, 136, 70), (70, 136, 70), 0.012),
-    "polyester": ((104, 74, 150), (90, 64, 130), 0.002),
-    "silk": ((232, 196, 120), (232, 196, 120), PLAIN),
-    "wool": ((84, 80, 76), (84, 80, 76), 0.007),
-    "denim": ((46, 68, 122), (150, 166, 196), PLAIN),
-}
 
 Row = dict[str, Any]
 
@@ -151,6 +137,7 @@ def draw(drapes: dict[str, Drape]) -> None:
         camera = Camera(eye, target=(0.0, 0.0, HEIGHT if view == 0 else 0.1), vertical_fov=28.0)
         for number, (name, drape) in enumerate(drapes.items()):
             front, back, check = LOOKS[name]
+            # plain specimens lie in the middle of a stripe, and of a yarn
             triangles, uv = drape.mesh.triangles, drape.mesh.rest_positions[:, :2] + 0.525 * PLAIN
             renderer = Renderer(triangles, uv, camera, SIZE, SIZE, antialias=3, front=front, back=back, check=check)
             line, column = divmod(number, columns)

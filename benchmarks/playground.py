@@ -5,7 +5,7 @@
 
 An update is a new sheet that the server has simulated and sent; 30 a second is as fast as time itself.  Frames are what the
 browser has drawn meanwhile: without a graphics card, on the processors that also simulate, they are fewer.  "strict" is the sheet
-over a sphere, 25 x 25, that also touches itself strictly.
+over a sphere with strict self-collision.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from typing import Any
 from playwright.sync_api import sync_playwright
 
 from clothgym.lab.bench import machine
-from clothgym.playground.scenes import TITLES
 from clothgym.playground.server import Playground, serve
 from clothgym.playground.stage import SceneStage
 
@@ -53,7 +52,7 @@ def visits(playground: Playground, count: int) -> list[Any]:
     """The visitors' side on the server, when all have come."""
     end = time.monotonic() + 60
     while time.monotonic() < end:
-        come = list(playground.visits.values())
+        come = list(playground.visits)
         if len(come) == count and all(visit.page is not None for visit in come):
             return come
         time.sleep(0.05)
@@ -71,7 +70,7 @@ def measure(playground: Playground, browser: Any, scene: str, visitors: int, sec
         tab.evaluate(DRAWN_TWICE)
     loaded, spent = time.perf_counter() - begun, processor_time() - spent
     for visit in come:
-        visit.page.order("open", TITLES["sphere" if scene == "strict" else scene])
+        visit.page.order("open", "sphere" if scene == "strict" else scene)
         if scene == "strict":
             visit.page.order("change", {"self_collision": "strict"})
         visit.page.order("change", {"gravity": 9.81})

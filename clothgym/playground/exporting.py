@@ -23,6 +23,7 @@ from clothgym.playground.episode import EpisodeStage, Race
 from clothgym.playground.gallery import Gallery, policies_of
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.scenes import FRAME, SCENES, scene_named
+from clothgym.playground.show import look_of
 from clothgym.playground.stage import STEPS, SceneStage, Stage
 from clothgym.registration import ACTORS, actor_named
 from clothgym.render import Camera, Drawn, MeshSequence, Renderer, write_animation, write_picture, write_video
@@ -55,7 +56,8 @@ def painter(
     """
     one_of("color", color, "fabric", "strain")
     mesh, seen = recording.mesh, camera or recording.camera
-    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], seen, size, size, antialias, grid_shape=mesh.shape)
+    look = look_of(recording)._asdict()
+    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], seen, size, size, antialias, grid_shape=mesh.shape, **look)
 
     def draw(frame: Frame) -> NDArray[np.uint8]:
         pictures, depths = [], []
