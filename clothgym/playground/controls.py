@@ -30,7 +30,7 @@ ADVICE = "Drag the cloth to pull and throw it; click it to pin it or to free it.
 AGAIN = "Start again"
 PRESETS: dict[str, tuple[str, Mapping[str, Any]]] = {
     AGAIN: ("", {}),
-    "Storm": ("", {"gravity": GRAVITY, "wind": 6.0, "gust": 4.0, "fabric": "penava_cotton", "air_drag": 0.4}),
+    "Storm": ("", {"gravity": GRAVITY, "wind": 5.0, "gust": 3.0, "fabric": "penava_cotton", "air_drag": 0.4}),
     # 4 substeps of 4.2 ms are far beyond what an explicit method bears with yarns as stiff as denim's
     "Make it explode": (
         "",

@@ -22,10 +22,8 @@ STEPS = 2  # control steps of a scene between two frames
 GUSTS = 3600  # control steps after which the gusts repeat
 KEPT = 900  # most recent frames that are kept: half a minute, 26 MB of a sheet of 49 x 49
 EDGE_OF_VIEW = 9.0  # of each coordinate [m]
-SHREDS, FLYING = (
-    0.35,
-    30,
-)  # how far the shreds of a sheet that has blown up fly [m]: its real position is out of sight; in how many frames
+# how far the shreds of a sheet that has blown up fly [m], in how many frames, and particles along a side of one
+SHREDS, FLYING, SHRED = 0.35, 30, 6
 EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
 REMEDY = "Take more substeps, a softer fabric or another integrator."
 # parts of a state that go on in a new simulation of the same sheet
@@ -245,10 +243,15 @@ class SceneStage(Stage):
         return Frame(self.time, visible(s.positions), tuple(self.scene.solids(s)), measured(s, self.cost))
 
     def _torn(self) -> list[Frame]:
-        """The sheet that has just blown up, the last frame first: its shreds fly apart over a second, slower and slower."""
-        before = self.frame
+        """The sheet that has just blown up, the last frame first: its shreds fly apart over a second, slower and slower.
+
+        Each is a square of the grid, and flies where its first particle went.
+        """
+        before, (_, columns) = self.frame, self.scene.mesh.grid_shape
+        row, column = np.divmod(np.arange(self.scene.mesh.num_particles), columns)
+        first = row // SHRED * SHRED * columns + column // SHRED * SHRED
         away = np.nan_to_num(self.simulation.positions - before.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
-        away = np.clip(away, -SHREDS, SHREDS).astype(np.float32)
+        away = np.clip(away[:, first], -SHREDS, SHREDS).astype(np.float32)
         nothing = {name: np.array([np.nan]) for name in before.readings}
         shares = 1 - (1 - np.arange(1, FLYING + 1, dtype=np.float32) / FLYING) ** 2
         return [Frame(self.time, before.positions + share * away, before.solids, nothing) for share in shares[::-1]]

@@ -10,7 +10,8 @@ from playwright.sync_api import sync_playwright
 FOLDER = Path(__file__).parent
 SIZE, MOST = {"width": 1200, "height": 630}, 120_000  # pixels, and bytes
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-STYLE = "#panel { opacity: 0; height: 20px } h1 { font-size: 64px; } header { padding: 60px; max-width: 33rem } header p { font-size: 27px }"
+STYLE = """#panel { opacity: 0; height: 20px } h1 { font-size: 64px; }
+header { padding: 60px; max-width: 33rem } header p { font-size: 27px }"""
 
 
 def main() -> None:

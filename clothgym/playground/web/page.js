@@ -4,6 +4,7 @@
 const ICONS = { paused: "M4 2l12 7-12 7z", over: "M4 2l12 7-12 7z", playing: "M3 2h4v14H3zM11 2h4v14h-4z" };
 const SLOW_FRAMES = 0.05; // of a scene whose frames are so far apart [s], what is between is drawn, too
 const TOLD_FOR = 12; // of a message [s]
+const SLOW = 0.045, COARSEST_SHARE = 0.5; // a page that takes longer for a frame [s] draws fewer pixels, at least that share
 const $ = (selector) => document.querySelector(selector);
 
 function made(tag, properties, ...children) {
@@ -16,7 +17,7 @@ class Page {
   constructor() {
     this.viewer = new Viewer($("#stage"));
     this.orbit = new Orbit();
-    Object.assign(this, { controls: {}, scene: null, next: null, before: 0, stale: false, dragged: null, saving: "" });
+    Object.assign(this, { controls: {}, scene: null, next: null, before: 0, usual: 0, share: 1, stale: false, dragged: null, saving: "" });
     const changed = () => (this.stale = true);
     this.fingers = watchPointers($("#stage"), this.orbit, {
       grab: (place, { shiftKey }) => this.#grab(place, shiftKey), drag: (place) => (this.dragged = place), letGo: () => this.#letGo(),
@@ -126,12 +127,14 @@ class Page {
     } else if ($(`#${name}`)) $(`#${name}`).textContent = value ?? "";
   }
 
+  // The last note: of an evaluation its verdict, and what it says of it.
   #judge(notes) {
-    const verdict = $("#verdict"), [head, tail] = { burst: ["It has burst"], evaluation: notes.map(([, words]) => words.split(": ")).at(-1) }[notes.at(-1)?.[0]] ?? [];
-    const words = notes.at(-1)?.[0] === "evaluation" ? tail : notes.at(-1)?.[1];
-    verdict.classList.toggle("told", notes.length > 0);
-    verdict.classList.toggle("failed", notes.length > 0 && !/^(Success|You win|A draw)/.test(head ?? ""));
-    if (notes.length) verdict.replaceChildren(...(head ? [made("b", { textContent: head })] : []), made("span", { textContent: words }));
+    const verdict = $("#verdict"), [subject, words] = notes.at(-1) ?? [];
+    verdict.classList.toggle("told", Boolean(subject));
+    if (!subject) return;
+    const [head, tail] = { burst: ["It has burst", words], evaluation: words.split(": ") }[subject] ?? ["", words];
+    verdict.classList.toggle("failed", !/^(Success|You win|A draw)/.test(head));
+    verdict.replaceChildren(made("b", { textContent: head }), made("span", { textContent: tail }));
     this.stale = true;
   }
 
@@ -219,6 +222,8 @@ class Page {
   #tick(now) {
     const seconds = Math.min((now - this.before) / 1000, 0.1);
     this.before = now;
+    this.usual += 0.1 * (seconds - this.usual);
+    if (this.usual > SLOW && this.share > COARSEST_SHARE) Object.assign(this, { usual: 0, share: 0.8 * this.share });
     if (this.dragged && this.#grasped) this.#drag();
     if (!this.fingers.held && this.orbit.coasts) {
       this.orbit.coast(seconds);
@@ -234,7 +239,7 @@ class Page {
   }
 
   draw() {
-    const stage = $("#stage"), scale = Math.min(devicePixelRatio || 1, 2), panel = $("#panel").getBoundingClientRect();
+    const stage = $("#stage"), scale = this.share * Math.min(devicePixelRatio || 1, 2), panel = $("#panel").getBoundingClientRect();
     const [width, height] = [Math.round(stage.clientWidth * scale), Math.round(stage.clientHeight * scale)];
     if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
     const phone = innerWidth <= 640, { slope } = this.scene;

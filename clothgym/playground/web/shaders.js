@@ -145,6 +145,7 @@ in vec3 point, turned;
 in vec2 cloth;
 in float stretched;
 
+const float TORN = 1.5; // strain of cloth that is not there any more
 const float YARNS = 20.0, COARSEST = 0.0024;  // yarns in a stripe, and width of one at most [m]
 
 vec3 hot(float share) {
@@ -184,7 +185,7 @@ vec3 alight(vec3 own, float share, float over) {
 }
 
 void main() {
-  if (!fabric && point.z < 0.0) discard;  // what is under the floor is not seen
+  if (fabric ? stretched > TORN : point.z < 0.0) discard;  // what is under the floor is not seen
   vec3 toEye = normalize(eye - point), normal = normalize(turned);
   if (!gl_FrontFacing) normal = -normal;
   float facing = clamp(dot(normal, toEye), 0.0, 1.0), toLamp = dot(normal, lamp);
