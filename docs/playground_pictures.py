@@ -9,6 +9,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from pictures import write
 from playwright.sync_api import sync_playwright
 
 from clothgym.playground.server import serve
@@ -44,11 +45,12 @@ def main() -> None:
         page.order("press", "play")
         page.order("preset", "Make it explode")
         wait(tab, lambda: "burst" in page.stage.notes)
-        tab.wait_for_timeout(600)
+        wait(tab, lambda: len(page.stage.recording.frames) > 12)
+        page.order("press", "play")
         shots.append(shot(tab))
         browser.close()
     playground.stop()
-    iio.imwrite(HERE / "playground.png", np.concatenate(shots, axis=0))
+    write(HERE / "playground.png", np.concatenate(shots, axis=0))
     print(f"written to {HERE / 'playground.png'}")
 
 

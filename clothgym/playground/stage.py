@@ -251,7 +251,8 @@ class SceneStage(Stage):
         row, column = np.divmod(np.arange(self.scene.mesh.num_particles), columns)
         first = row // SHRED * SHRED * columns + column // SHRED * SHRED
         away = np.nan_to_num(self.simulation.positions - before.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
-        away = np.clip(away[:, first], -SHREDS, SHREDS).astype(np.float32)
+        scattered = np.random.default_rng(self.seed).uniform(0.1, 1.0, (len(first), 1))[first]
+        away = (scattered * np.clip(away[:, first], -SHREDS, SHREDS)).astype(np.float32)
         nothing = {name: np.array([np.nan]) for name in before.readings}
         shares = 1 - (1 - np.arange(1, FLYING + 1, dtype=np.float32) / FLYING) ** 2
         return [Frame(self.time, before.positions + share * away, before.solids, nothing) for share in shares[::-1]]

@@ -8,7 +8,7 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 FOLDER = Path(__file__).parent
-SIZE, MOST = {"width": 1200, "height": 630}, 120_000  # pixels, and bytes
+MOST = 120_000  # bytes
 FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 STYLE = """#panel { opacity: 0; height: 20px } h1 { font-size: 64px; }
 header { padding: 60px; max-width: 33rem } header p { font-size: 27px }"""
@@ -17,7 +17,7 @@ header { padding: 60px; max-width: 33rem } header p { font-size: 27px }"""
 def main() -> None:
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
-        tab = browser.new_page(viewport=SIZE)
+        tab = browser.new_page(viewport={"width": 1200, "height": 630})
         tab.goto((FOLDER / "index.html").as_uri() + "#hand")
         tab.add_style_tag(content=STYLE)
         tab.evaluate("page.hand.set('start', 'drop'), page.hand.set('start', 'hang')")

@@ -2,17 +2,19 @@
 // The page: which episode is shown, at what time, and from where.
 
 const PAUSE_AT_END = 3.5; // before it starts again [s]
-const SLOW = 0.045, COARSEST = 0.6; // a frame that takes longer [s] is drawn with fewer pixels from then on, at least that share
 const ICONS = { play: "M4 2l12 7-12 7z", pause: "M3 2h4v14H3zM11 2h4v14h-4z" };
-const $ = (selector) => document.querySelector(selector);
 const percent = (share) => `${(100 * Math.max(share, 0)).toFixed(1)} %`;
 
-class Page {
+class Page extends Picture {
   constructor() {
-    this.viewer = new Viewer($("#stage"));
-    this.orbit = new Orbit();
-    this.loaded = new Map();
-    Object.assign(this, { time: 0, playing: true, waited: 0, stale: true, before: 0, usual: 0, share: 1 });
+    const hand = (deed) => (...given) => this.episode && this.episode === this.hand && deed(this.hand, ...given);
+    super({
+      grab: hand((one, place) => one.grab(this.viewer, place, this.size)),
+      drag: hand((one, place) => one.held && one.drag(this.viewer, place)),
+      letGo: hand((one) => one.held && one.letGo(one.pinning !== one.held.pinned)),
+      hover: hand((one, place) => one.near(this.viewer, place, this.size)),
+    });
+    Object.assign(this, { time: 0, playing: true, waited: 0, loaded: new Map() });
     const heat = `linear-gradient(90deg, ${HEAT.map((color) => `rgb(${color})`)})`;
     $("#scale").style.background = $("#legend div").style.background = heat;
     for (const { name, title } of [{ name: "hand", title: "Hold a sheet" }, ...EPISODES]) {
@@ -26,22 +28,8 @@ class Page {
     $("#color").onclick = () => this.colorByStrain(!this.viewer.strained);
     $("#scrubber input").oninput = (event) => this.seek(Number(event.target.value) * this.episode.duration);
     addEventListener("keydown", (event) => this.#key(event));
-    addEventListener("resize", () => (this.stale = true));
     addEventListener("hashchange", () => this.open(this.#named()));
-    const stage = $("#stage"), size = () => [stage.clientWidth, stage.clientHeight], isLive = () => this.episode && this.episode === this.hand;
-    this.fingers = watchPointers(stage, this.orbit, {
-      grab: (place) => isLive() && this.hand.grab(this.viewer, place, size()),
-      drag: (place) => this.hand.held && this.hand.drag(this.viewer, place),
-      letGo: () => this.hand.held && this.hand.letGo(this.hand.pinning !== this.hand.held.pinned),
-      hover: (place) => isLive() && this.hand.near(this.viewer, place, size()),
-      changed: () => (this.stale = true),
-    });
-    $("#home").onclick = () => {
-      this.orbit.home();
-      this.stale = true;
-    };
     this.open(this.#named());
-    requestAnimationFrame((now) => this.#tick(now));
   }
 
   #named() {
@@ -71,7 +59,7 @@ class Page {
   }
 
   #show(episode) {
-    this.episode = episode;
+    Object.assign(this, { episode, ready: true });
     const { middle, reach } = boundsOf(episode, true);
     this.moment = new Float32Array(3 * episode.points);
     this.viewer.show(Object.assign(episode, { size: [episode.side, episode.side], middle, reach }));
@@ -181,34 +169,19 @@ class Page {
     verdict.classList.toggle("told", over);
   }
 
-  #tick(now) {
-    const seconds = Math.min((now - this.before) / 1000, 0.1);
-    this.before = now;
-    this.usual += 0.1 * (seconds - this.usual);
-    if (this.usual > SLOW && this.share > COARSEST) Object.assign(this, { usual: 0, share: 0.8 * this.share });
-    if (this.episode && this.episode === this.hand) this.#hold(seconds);
-    else if (this.episode && this.playing) {
+  advance(seconds) {
+    if (this.episode === this.hand) this.#hold(seconds);
+    else if (this.playing) {
       if (this.time < this.episode.duration) this.seek(this.time + seconds);
       else if ((this.waited += seconds) > PAUSE_AT_END) this.seek(0);
     }
-    if (this.episode && !this.fingers.held && this.orbit.coasts) {
-      this.orbit.coast(seconds);
-      this.stale = true;
-    }
-    if (this.episode && this.stale) this.draw();
-    requestAnimationFrame((then) => this.#tick(then));
   }
 
-  draw() {
-    const stage = $("#stage"), moves = this.playing || this.fingers.held;
-    const scale = (moves ? this.share : 1) * Math.min(devicePixelRatio || 1, 2);
-    const [width, height] = [Math.round(stage.clientWidth * scale), Math.round(stage.clientHeight * scale)];
-    if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
-    // the panel covers the lower part, and on a phone the heading the upper one
+  // The panel covers the lower part, and on a phone the heading the upper one.
+  free() {
     const below = 1 - $("#panel").getBoundingClientRect().top / innerHeight;
     const above = innerWidth < 640 ? $("header > p").getBoundingClientRect().bottom / innerHeight : 0.02;
-    this.viewer.draw(this.orbit.camera, this.slopes, [Math.min(below, 0.5), 1 - Math.min(above, 0.3)]);
-    this.stale = false;
+    return [Math.min(below, 0.5), 1 - Math.min(above, 0.3)];
   }
 
   #key(event) {
@@ -221,12 +194,6 @@ class Page {
     } else return;
     event.preventDefault();
   }
-}
-
-function trouble(error) {
-  $("#trouble").textContent = error.message;
-  $("#trouble").style.display = "grid";
-  console.error(error);
 }
 
 let page;

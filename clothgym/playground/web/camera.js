@@ -1,7 +1,9 @@
 "use strict";
-// Where a scene is seen from, and what fingers and a mouse do to it: hold the cloth, or turn the view.
+// A page's picture: where a scene is seen from, what fingers and a mouse do to it, and when it is drawn.
 
 const LOWEST = 0.06, HIGHEST = 1.5; // of the eye above the horizon [rad]: never under the floor
+const SLOW = 0.045, COARSEST = 0.6; // a frame that takes longer [s] is drawn with fewer pixels from then on, at least that share
+const $ = (selector) => document.querySelector(selector);
 const CATCH = 44; // how near the cloth a finger takes hold of it [pixels]
 
 // Around a target, by angles, and how fast they turn by themselves after a drag.
@@ -123,4 +125,53 @@ function watchPointers(canvas, orbit, { grab, drag, letGo, hover, changed }) {
     changed();
   }, { passive: false });
   return { get held() { return fingers.size > 0; } };
+}
+
+// What both pages are: a canvas, a viewer and a camera.  A page has advance(seconds, now), free(), slopes, and ready once there is
+// something to draw; its own pointers are those of watchPointers().
+class Picture {
+  constructor(pointers) {
+    Object.assign(this, { viewer: new Viewer($("#stage")), orbit: new Orbit(), before: 0, usual: 0, share: 1, stale: true, ready: false });
+    const changed = () => (this.stale = true);
+    this.fingers = watchPointers($("#stage"), this.orbit, { ...pointers, changed });
+    addEventListener("resize", changed);
+    $("#home").onclick = () => {
+      this.orbit.home();
+      changed();
+    };
+    requestAnimationFrame((now) => this.#tick(now));
+  }
+
+  get size() {
+    return [$("#stage").clientWidth, $("#stage").clientHeight];
+  }
+
+  #tick(now) {
+    const seconds = Math.min((now - this.before) / 1000, 0.1);
+    this.before = now;
+    this.usual += 0.1 * (seconds - this.usual);
+    if (this.usual > SLOW && this.share > COARSEST) Object.assign(this, { usual: 0, share: 0.8 * this.share });
+    if (this.ready) {
+      this.advance(seconds, now);
+      if (!this.fingers.held && this.orbit.coasts) {
+        this.orbit.coast(seconds);
+        this.stale = true;
+      }
+      if (this.stale) this.draw();
+    }
+    requestAnimationFrame((then) => this.#tick(then));
+  }
+
+  draw() {
+    const stage = $("#stage"), scale = this.share * Math.min(devicePixelRatio || 1, 2);
+    const [width, height] = this.size.map((pixels) => Math.round(pixels * scale));
+    if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
+    this.viewer.draw(this.orbit.camera, this.slopes, this.free());
+    this.stale = false;
+  }
+}
+
+function trouble(error) {
+  $("#trouble").textContent = error.message;
+  $("#trouble").style.display = "grid";
 }

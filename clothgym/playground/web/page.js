@@ -4,8 +4,6 @@
 const ICONS = { paused: "M4 2l12 7-12 7z", over: "M4 2l12 7-12 7z", playing: "M3 2h4v14H3zM11 2h4v14h-4z" };
 const SLOW_FRAMES = 0.05; // of a scene whose frames are so far apart [s], what is between is drawn, too
 const TOLD_FOR = 12; // of a message [s]
-const SLOW = 0.045, COARSEST_SHARE = 0.5; // a page that takes longer for a frame [s] draws fewer pixels, at least that share
-const $ = (selector) => document.querySelector(selector);
 
 function made(tag, properties, ...children) {
   const element = Object.assign(document.createElement(tag), properties);
@@ -13,29 +11,17 @@ function made(tag, properties, ...children) {
   return element;
 }
 
-class Page {
+class Page extends Picture {
   constructor() {
-    this.viewer = new Viewer($("#stage"));
-    this.orbit = new Orbit();
-    Object.assign(this, { controls: {}, scene: null, next: null, before: 0, usual: 0, share: 1, stale: false, dragged: null, saving: "" });
-    const changed = () => (this.stale = true);
-    this.fingers = watchPointers($("#stage"), this.orbit, {
+    super({
       grab: (place, { shiftKey }) => this.#grab(place, shiftKey), drag: (place) => (this.dragged = place), letGo: () => this.#letGo(),
-      hover: (place) => this.#near(place), changed,
+      hover: (place) => this.#near(place),
     });
-    this.#grasped = null;
+    Object.assign(this, { controls: {}, scene: null, next: null, dragged: null, saving: "" });
     for (const [name, value] of [["play", "play"], ["step", "step"]]) $(`#${name}`).onclick = () => this.turn("play", value);
     $("#again").onclick = () => this.turn("presets", "Start again");
-    $("#home").onclick = () => {
-      this.orbit.home();
-      changed();
-    };
-    $("#handle").onclick = () => {
-      $("#panel").classList.toggle("open");
-      changed();
-    };
+    $("#handle").onclick = () => (this.stale = $("#panel").classList.toggle("open") || true);
     $("#moment").oninput = (event) => this.turn("moment", Number(event.target.value));
-    addEventListener("resize", changed);
     addEventListener("keydown", (event) => {
       if (event.key !== " " || event.target.matches("button, input, select, summary")) return;
       event.preventDefault();
@@ -49,7 +35,6 @@ class Page {
       this[what](content);
     };
     this.socket.onclose = () => trouble(new Error("The playground has ended, or is full. Reload this page to try again."));
-    requestAnimationFrame((now) => this.#tick(now));
   }
 
   #grasped; // what the finger holds: its depth in the picture, and where it is [m]
@@ -69,7 +54,7 @@ class Page {
     this.scene = scene;
     this.viewer.show(scene);
     this.orbit.take(scene.camera, scene.middle);
-    Object.assign(this, { next: null, last: null });
+    Object.assign(this, { next: null, last: null, ready: false, slopes: [scene.slope, scene.slope] });
     $("#labels").replaceChildren(...scene.labels.map((label) => made("span", { textContent: label })));
   }
 
@@ -216,41 +201,31 @@ class Page {
     for (let k = end; k < numbers.length; k += 3) held.push([...numbers.subarray(k, k + 3)]);
     const moment = numbers.subarray(2, end), slow = this.scene.time_step > SLOW_FRAMES;
     const from = slow && this.next?.length === moment.length ? this.next : moment;
-    Object.assign(this, { last: from, next: moment, held, arrived: performance.now() / 1000, placed: false });
+    Object.assign(this, { last: from, next: moment, held, arrived: performance.now() / 1000, placed: false, ready: true });
   }
 
-  #tick(now) {
-    const seconds = Math.min((now - this.before) / 1000, 0.1);
-    this.before = now;
-    this.usual += 0.1 * (seconds - this.usual);
-    if (this.usual > SLOW && this.share > COARSEST_SHARE) Object.assign(this, { usual: 0, share: 0.8 * this.share });
+  advance(_, now) {
     if (this.dragged && this.#grasped) this.#drag();
-    if (!this.fingers.held && this.orbit.coasts) {
-      this.orbit.coast(seconds);
-      this.stale = true;
-    }
-    if (this.next && !this.placed) {
-      const share = this.last === this.next ? 1 : Math.min((now / 1000 - this.arrived) / this.scene.time_step, 1), { last, next } = this;
-      this.viewer.place(share < 1 ? next.map((value, k) => last[k] + share * (value - last[k])) : next, this.held);
-      Object.assign(this, { placed: share >= 1, stale: true });
-    }
-    if (this.next && this.stale) this.draw();
-    requestAnimationFrame((then) => this.#tick(then));
+    if (this.placed) return;
+    const share = this.last === this.next ? 1 : Math.min((now / 1000 - this.arrived) / this.scene.time_step, 1), { last, next } = this;
+    this.viewer.place(share < 1 ? next.map((value, k) => last[k] + share * (value - last[k])) : next, this.held);
+    Object.assign(this, { placed: share >= 1, stale: true });
+  }
+
+  // The panel covers the right, and on a phone the lower part, and there the heading the upper one.
+  free() {
+    const panel = $("#panel").getBoundingClientRect(), heading = $("#about").getBoundingClientRect();
+    if (innerWidth > 640) return [0, 0.97, 0, panel.left / innerWidth];
+    return [1 - panel.top / innerHeight, 1 - heading.bottom / innerHeight];
   }
 
   draw() {
-    const stage = $("#stage"), scale = this.share * Math.min(devicePixelRatio || 1, 2), panel = $("#panel").getBoundingClientRect();
-    const [width, height] = [Math.round(stage.clientWidth * scale), Math.round(stage.clientHeight * scale)];
-    if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
-    const phone = innerWidth <= 640, { slope } = this.scene;
-    const free = phone ? [1 - panel.top / innerHeight, 1 - $("header").getBoundingClientRect().bottom / innerHeight, 0, 1] : [0, 0.97, 0, panel.left / innerWidth];
-    this.viewer.draw(this.orbit.camera, [slope, slope], free);
+    super.draw();
     this.#label();
     if (this.bar) {
       this.bar.style.background = `linear-gradient(90deg, ${(this.viewer.strained ? HEAT : ["206, 200, 190", ...FIRE]).map((color) => `rgb(${color})`)})`;
       $("#most").textContent = `${+(100 * this.scene.strain_shown).toPrecision(3)} % or more`;
     }
-    this.stale = false;
   }
 
   // Names above the sheets.
@@ -262,7 +237,7 @@ class Page {
         const seen = this.viewer.toPicture(x.subarray(v, v + 3));
         if (seen[1] > up) [across, up] = seen;
       }
-      Object.assign(label.style, { left: `${50 + 50 * across}%`, top: `calc(${50 - 50 * up}% - 8px)` });
+      Object.assign(label.style, { left: `clamp(64px, ${50 + 50 * across}%, 100% - 64px)`, top: `calc(${50 - 50 * up}% - 8px)` });
     });
   }
 
@@ -273,9 +248,8 @@ class Page {
   }
 
   #near(place) {
-    const stage = $("#stage");
     // of several sheets the first is the visitor's
-    return this.next && caught(this.viewer, this.viewer.sheets[0].sheet, (p) => this.#at(p), place, [stage.clientWidth, stage.clientHeight]);
+    return this.next && caught(this.viewer, this.viewer.sheets[0].sheet, (p) => this.#at(p), place, this.size);
   }
 
   #grab(place, shift) {
@@ -300,11 +274,6 @@ class Page {
     if (!moved && !this.dragged) this.send("touch", [shift, point, minus(point, this.orbit.camera.eye)]);
     this.dragged = this.#grasped = null;
   }
-}
-
-function trouble(error) {
-  $("#trouble").textContent = error.message;
-  $("#trouble").style.display = "grid";
 }
 
 let page;
