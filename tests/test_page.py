@@ -111,8 +111,14 @@ def test_it_loads_from_this_machine_alone_and_the_gravity_slider_moves_the_cloth
     visitor.until(lambda: visitor.stage.frame.positions[0, :, 2].min() < 0.35)
     assert np.array_equal(visitor.stage.frame.positions[0][pins], start[pins])
     visitor.until(lambda: np.mean(np.abs(visitor.picture() - before).max(axis=2) > 25) > 0.05)
-    # red of the fabric on a gray floor
-    assert np.mean(visitor.picture()[..., 0] - visitor.picture()[..., 1] > 60) > 0.03
+    # red of the fabric on a gray floor; cream where strain is colored, and nothing is strained
+    red = np.mean(visitor.picture()[..., 0] - visitor.picture()[..., 1] > 60)
+    visitor.tab.evaluate("document.querySelectorAll('details').forEach((one) => (one.open = true))")
+    visitor.box("Color by").select_option("strain")
+    visitor.until(lambda: np.mean(visitor.picture()[..., 0] - visitor.picture()[..., 1] > 60) < 0.5 * red)
+    assert red > 0.03
+    visitor.box("Color by").select_option("fabric")
+    visitor.tab.evaluate("document.querySelectorAll('details').forEach((one) => (one.open = false))")
 
 
 def test_a_phone_has_a_sheet_at_the_bottom_and_every_task_is_drawn_without_a_word_to_the_console(playground, chromium):
@@ -166,7 +172,10 @@ def test_the_cloth_is_grabbed_thrown_and_pinned_with_the_mouse(visitor):
     place, still = now(), visitor.stage.frame.positions[0]
     listen = "() => { const send = page.send; window.sent = []; page.send = (...one) => (sent.push(one), send.apply(page, one)); }"
     visitor.tab.evaluate(listen)
+    mouse.move(60, 500)
+    assert visitor.tab.evaluate("document.querySelector('#stage').style.cursor") == "grab"
     mouse.move(across, down)
+    assert visitor.tab.evaluate("document.querySelector('#stage').style.cursor") == "pointer"
     mouse.down()
     for step in range(1, 9):
         mouse.move(across, down - 10 * step)

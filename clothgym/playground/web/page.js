@@ -44,6 +44,7 @@ class Page extends Picture {
   }
 
   turn(name, value) {
+    if (name === "show") this.#color(value);
     this.send("turn", [name, value]);
   }
 
@@ -187,10 +188,12 @@ class Page extends Picture {
       if (kind === "switch") part.checked = value;
       else if (value !== null) part.value = value;
     }
-    if (name === "show") {
-      this.viewer.strained = value === "strain";
-      this.stale = true;
-    }
+    if (name === "show") this.#color(value);
+  }
+
+  #color(by) {
+    this.viewer.strained = by === "strain";
+    this.stale = true;
   }
 
   // --- drawing ---------------------------------------------------------------------------------------------------------
