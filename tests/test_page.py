@@ -13,6 +13,7 @@ playwright = pytest.importorskip("playwright.sync_api", reason="driving a browse
 if CHROMIUM is None:
     pytest.skip("no Chromium on this machine: apt-get install chromium", allow_module_level=True)
 
+from clothgym.playground.recording import Recording  # noqa: E402
 from clothgym.playground.server import serve  # noqa: E402
 
 pytestmark = pytest.mark.slow
@@ -153,6 +154,14 @@ def test_the_view_stays_above_the_floor_and_comes_home(visitor):
 def test_a_link_opens_the_page_with_its_settings(playground, chromium):
     other = Visitor(playground, chromium, query="?scene=sphere&gravity=2.5&fabric=silk")
     assert other.stage.name == "sphere" and (other.stage.settings.gravity, other.stage.settings.fabric) == (2.5, "silk")
+    # its own link is the same, and what it saves arrives
+    other.tab.click("summary:has-text('Save and share')")
+    other.until(lambda: "?scene=sphere&fabric=silk&gravity=2.5" in other.tab.input_value("#link"))
+    other.tab.select_option("#folder-Save-and-share select", "npz")
+    with other.tab.expect_download() as arrived:
+        other.tab.click("button:text-is('Save')")
+    assert arrived.value.suggested_filename == "sphere.npz"
+    assert Recording.load(arrived.value.path()).title == "Sheet over a sphere"
     other.tab.close()
 
 

@@ -108,9 +108,8 @@ class Page extends Picture {
       const rows = (value ?? []).map((row) => made("tr", {}, ...row.map((cell) => made("td", { textContent: cell }))));
       ($("#readings") ?? this.#added("Readings", "table", "readings")).replaceChildren(...rows);
     } else if (name === "verdict") this.#judge(value ?? []);
-    else if (name === "link") {
-      if ($("#link")) $("#link").value = value ?? "";
-    } else if ($(`#${name}`)) $(`#${name}`).textContent = value ?? "";
+    else if (name === "link") ($("#link") ?? this.#added("Save and share", "input", "link")).value = value ?? "";
+    else if ($(`#${name}`)) $(`#${name}`).textContent = value ?? "";
   }
 
   // The last note: of an evaluation its verdict, and what it says of it.
