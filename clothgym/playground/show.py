@@ -51,9 +51,9 @@ def scene_of(recording: Recording) -> dict[str, Any]:
 def solid_of(solid: Drawn) -> dict[str, Any]:
     """A solid: a box swept by a ball, or a mesh, around the origin."""
     axes, half, radius = solid.rounded_box()
-    told: dict[str, Any] = {"kind": solid.kind, "half": half.tolist(), "color": solid.color}
+    told: dict[str, Any] = {"kind": solid.kind, "half": rounded(half), "color": solid.color}
     if solid.kind != "mesh":
-        return told | {"axes": axes.ravel().tolist(), "radius": radius, "holds": True}
+        return told | {"axes": rounded(axes), "radius": round(radius, 5), "holds": True}
     mesh = solid.mesh()
     return told | {
         "positions": rounded(mesh.positions),
