@@ -137,7 +137,7 @@ def draw(drapes: dict[str, Drape]) -> None:
         camera = Camera(eye, target=(0.0, 0.0, HEIGHT if view == 0 else 0.1), vertical_fov=28.0)
         for number, (name, drape) in enumerate(drapes.items()):
             front, back, check = LOOKS[name]
-            # in the middle of a stripe, and of a yarn
+            # plain specimens lie in the middle of a stripe, and of a yarn
             triangles, uv = drape.mesh.triangles, drape.mesh.rest_positions[:, :2] + 0.525 * PLAIN
             renderer = Renderer(triangles, uv, camera, SIZE, SIZE, antialias=3, front=front, back=back, check=check)
             line, column = divmod(number, columns)

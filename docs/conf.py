@@ -59,6 +59,7 @@ html_theme_options: dict[str, Any] = {
 # pages of the site that are files of the root; in docs/ a line stands in their place
 OF_THE_ROOT = {"about/changelog": "CHANGELOG.md", "about/contributing": "CONTRIBUTING.md"}
 DEMO = HERE / "demo" / "index.html"
+SHARED = "../../clothgym/playground/web"  # with the playground's page; in the demo's own folder on the site
 LINK_TO_DEMO = '<a class="demo" href="demo/index.html">Take hold of a sheet, in your browser</a>'
 
 
@@ -103,9 +104,14 @@ def help_of_commands() -> str:
 
 
 def take_demo(app: Any, error: Exception | None) -> None:
-    """Copy the recorded episodes, which are a page of their own."""
+    """Copy the demo, which is a page of its own, with what it shares with the playground's page."""
     if error is None and app.builder.format == "html" and DEMO.exists():
-        shutil.copytree(DEMO.parent, Path(app.outdir) / "demo", dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "*.md"))
+        there = Path(app.outdir) / "demo"
+        shutil.copytree(DEMO.parent, there, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.py", "*.md"))
+        page = (there / DEMO.name).read_text()
+        for name in re.findall(rf'"{re.escape(SHARED)}/([\w.]+)"', page):
+            shutil.copy(DEMO.parent / SHARED / name, there)
+        (there / DEMO.name).write_text(page.replace(f"{SHARED}/", ""))
 
 
 def setup(app: Any) -> None:

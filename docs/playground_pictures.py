@@ -9,6 +9,7 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+from pictures import write
 from playwright.sync_api import sync_playwright
 
 from clothgym.playground.server import serve
@@ -33,25 +34,23 @@ def main() -> None:
         browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         tab = browser.new_page(viewport=WINDOW)
         tab.goto(playground.url)
-        wait(tab, lambda: any(visit.page is not None for visit in playground.visits.values()))
-        page = next(iter(playground.visits.values())).page
+        wait(tab, lambda: any(visit.page is not None for visit in playground.visits))
+        page = playground.visits[0].page
         assert page is not None
-        # the library's warning that the browser has no graphics card, unless it has gone by itself
-        warning = tab.get_by_role("alert").get_by_role("button")
-        if warning.count():
-            warning.first.dispatch_event("click")
         shots = []
         page.order("change", {"gravity": 9.81})
         wait(tab, lambda: page.stage.frame.positions[0, :, 2].min() < 0.3)
-        page.order("press", "play / pause")
+        page.order("press", "play")
         shots.append(shot(tab))
-        page.order("press", "play / pause")
-        page.order("preset", "make it explode")
+        page.order("press", "play")
+        page.order("preset", "Make it explode")
         wait(tab, lambda: "burst" in page.stage.notes)
+        wait(tab, lambda: len(page.stage.recording.frames) > 12)
+        page.order("press", "play")
         shots.append(shot(tab))
         browser.close()
     playground.stop()
-    iio.imwrite(HERE / "playground.png", np.concatenate(shots, axis=0))
+    write(HERE / "playground.png", np.concatenate(shots, axis=0))
     print(f"written to {HERE / 'playground.png'}")
 
 

@@ -1,9 +1,7 @@
-"""Stages as the playground's tests want them, and a viewer that shows nothing: tests read what a page creates, and move its
-controls as a visitor would."""
+"""Stages as the playground's tests want them, and a browser that shows nothing: tests read what it is told, and turn its controls
+as a visitor would."""
 
-import asyncio
-from contextlib import contextmanager
-from types import SimpleNamespace
+import numpy as np
 
 from clothgym.playground.gallery import Gallery
 from clothgym.playground.page import Page
@@ -25,91 +23,52 @@ def ticked(visitor, times=1):
         visitor.tick()
 
 
-class Handle:
-    """A control or a node with its properties as attributes."""
-
-    def __init__(self, kind, content=None, value=None, **properties):
-        self.kind, self.content, self.value, self.callbacks = kind, content, value, []
-        self.__dict__.update(properties)
-
-    def on_update(self, callback):
-        self.callbacks.append(callback)
-
-    def on_drag(self, button):
-        return self.on_update
-
-    def _call(self, **event):
-        for callback in self.callbacks:
-            outcome = callback(SimpleNamespace(target=self, client_id=0, **event))
-            if asyncio.iscoroutine(outcome):
-                asyncio.run(outcome)
-
-    def drag(self, phase, start, end):
-        """Act as a visitor: drag a node from one position to another."""
-        self._call(phase=phase, start_position=start, end_position=end)
-
-    def turn(self, value=None):
-        """Act as a visitor: set a control to a value, or press a button."""
-        self.value = value
-        self._call()
-
-    def remove(self):
-        self.removed = True
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        return None
-
-
-class Part:
-    """A viewer's scene or controls: ``add_...`` makes a handle, kept by its name or label; all other calls are ignored."""
-
-    def __init__(self):
-        self.handles, self.clicks = {}, {}
-        self.main_panel = SimpleNamespace(dock_right=lambda: None, set_width=lambda _: None)
-
-    def on_click(self, modifier=None):
-        return lambda callback: self.clicks.setdefault(modifier, callback)
-
-    def click(self, origin, direction, modifier=None):
-        """Act as a visitor: click where a ray leads."""
-        asyncio.run(self.clicks[modifier](SimpleNamespace(ray_origin=origin, ray_direction=direction, modifier=modifier)))
-
-    def reset(self):
-        self.handles.clear()
-
-    def __getattr__(self, name):
-        def call(label=None, *values, **properties):
-            if name.startswith("add_"):
-                value = properties.get("initial_value", values[-1] if values else None)
-                handle = Handle(name.removeprefix("add_"), label, value, **properties)
-                self.handles[label] = handle
-                return handle
-
-        return call
+def turned(visitor, **values):
+    """Turn controls, by name, and let the page act on it."""
+    for name, value in values.items():
+        visitor.take(["turn", [name, value]])
+    visitor.tick()
 
 
 class NullClient:
-    """Stands in for a client of viser."""
+    """Stands in for a visitor's browser.
 
-    client_id = 0
+    Attributes:
+        controls: what the browser knows of each; opened: the scene; solids: all that it knows of it.
+        said: title and words of each message; frame: the last one, as numbers; files: by name.
+    """
 
     def __init__(self):
-        self.scene, self.gui = Part(), Part()
-        self.camera = SimpleNamespace(
-            position=(1.0, -1.0, 1.0), look_at=(0.0, 0.0, 0.0), fov=0.6, image_width=1280, image_height=800
-        )
-        self.files, self.notifications = {}, []
+        self.controls, self.opened, self.solids, self.look, self.said, self.waits, self.files = {}, {}, [], {}, [], [], {}
+        self.frame = np.zeros(0, np.float32)
 
-    @contextmanager
-    def atomic(self):
-        yield
+    def tell(self, what, content):
+        if what == "set":
+            for name, new in content.items():
+                self.controls.setdefault(name, {}).update(new)
+        elif what == "open":
+            self.opened, self.solids, self.look = content, [], content["look"]
+        elif what == "solids":
+            self.solids += content
+        elif what == "look":
+            self.look = content
+        else:
+            {"say": self.said, "wait": self.waits}[what].append(content)
 
-    def send_file_download(self, filename, content):
-        self.files[filename] = content
+    def give(self, name, content):
+        self.files[name] = content
 
-    def add_notification(self, title, body, **_):
-        self.notifications.append(f"{title}: {body}")
-        return Handle("notification")
+    def draw(self, frame):
+        self.frame = np.frombuffer(frame, "<f4")
+
+    @property
+    def sheets(self):
+        """Positions in the last frame [m], (sheets, particles, 3)."""
+        count = self.opened["sheets"] * np.prod(self.opened.get("shape") or [len(self.opened.get("uv", [])) // 2])
+        return self.frame[2 : 2 + 3 * count].reshape(self.opened["sheets"], -1, 3)
+
+    @property
+    def places(self):
+        """Centers of the solids that it knows [m], and held points, (points, 3) each."""
+        rest = self.frame[2 + self.sheets.size :].reshape(-1, 3)
+        return rest[: int(self.frame[1])], rest[int(self.frame[1]) :]

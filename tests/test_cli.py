@@ -112,8 +112,8 @@ def refused(commands, heavy):
         loaded = [module for module in heavy if module in sys.modules]
         assert not loaded, (command, loaded)
     print(refused)
-refused({list(BY_VALUE)}, ["numba", "clothgym.envs", "torch", "viser", "matplotlib"])
-refused({list(BY_NAME)}, ["torch", "stable_baselines3", "viser", "matplotlib", "imageio", "mujoco"])
+refused({list(BY_VALUE)}, ["numba", "clothgym.envs", "torch", "websockets", "matplotlib"])
+refused({list(BY_NAME)}, ["torch", "stable_baselines3", "websockets", "matplotlib", "imageio", "mujoco"])
 """
 
 

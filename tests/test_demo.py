@@ -32,8 +32,10 @@ def opened(tmp_path_factory):
     playwright = pytest.importorskip("playwright.sync_api", reason="driving a browser needs playwright: pip install playwright")
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine: apt-get install chromium")
-    folder = tmp_path_factory.mktemp("demo") / "demo"
+    root = tmp_path_factory.mktemp("demo")
+    folder = root / "docs" / "demo"
     shutil.copytree(DEMO, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(DEMO.parent.parent / "clothgym" / "playground" / "web", root / "clothgym" / "playground" / "web")
     record.written("walk", walk(), folder / "episodes")
     with playwright.sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -84,7 +86,7 @@ def test_the_page_shows_what_the_committed_policy_does(opened):
     # the drawn surface goes through the particles: every fourth vertex of it, in both directions
     middle = len(sheets) // 2
     tab.evaluate("(frame) => page.seek(frame * page.episode.time_step)", middle)
-    fine = np.array(tab.evaluate("Array.from(page.viewer.sheet.positions)")).reshape(33, 33, 3)
+    fine = np.array(tab.evaluate("Array.from(page.viewer.sheets[0].sheet.positions)")).reshape(33, 33, 3)
     assert np.abs(fine[::4, ::4].reshape(-1, 3) - sheets[middle]).max() < 1e-4
     # and it ends as the episode did
     tab.evaluate("page.seek(page.episode.duration)")
@@ -96,7 +98,7 @@ def test_every_episode_is_drawn_without_a_word_to_the_console(opened):
     tab, said = opened
     for name in record.EPISODES:
         tab.evaluate("(name) => page.open(name).then(() => page.play(false))", name)
-        sheet = np.array(tab.evaluate("Array.from(page.viewer.sheet.positions)"))
+        sheet = np.array(tab.evaluate("Array.from(page.viewer.sheets[0].sheet.positions)"))
         assert np.isfinite(sheet).all()
         if name == "fold":
             tab.wait_for_function("!page.stale")

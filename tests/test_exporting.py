@@ -105,7 +105,7 @@ def test_an_export_of_a_diverging_scene_explains_and_keeps_earlier_frames(tmp_pa
             ["export", "patch", "--out", str(tmp_path / f"a.{ending}"), "--size", "64"]
             + ["--set", "integrator=explicit_euler", "substeps=2", "stretch_stiffness=5000"]
         )
-    assert "explicit_euler burst" in caught.value.code and f"a.part.{ending}" in caught.value.code
+    assert "Explicit Euler burst" in caught.value.code and f"a.part.{ending}" in caught.value.code
     assert [file.name for file in tmp_path.iterdir()] == [f"a.part.{ending}"]
 
 

@@ -76,7 +76,7 @@ OUT_OF_HAND = {
 }
 STRINGS_ONLY = {"clothgym", "clothgym.registration"}
 LOWEST = {"gymnasium": 7, "stable_baselines3": 8, "torch": 8, "matplotlib": 8}
-NEVER_AT_MODULE_LEVEL = {"imageio", "trimesh", "viser", "scipy", "mujoco", "PIL", "matplotlib"}
+NEVER_AT_MODULE_LEVEL = {"imageio", "trimesh", "websockets", "scipy", "mujoco", "PIL", "matplotlib"}
 
 
 def _source_files():

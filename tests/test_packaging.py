@@ -38,6 +38,9 @@ def test_wheel_ships_clothgym_only(wheel):
     assert {name.split("/")[0].split("-")[0] for name in names} == {"clothgym"}
     assert "clothgym/envs/drape.py" in names and "clothgym/envs/drape_reference.json" in names and "clothgym/py.typed" in names
     assert not any("test" in name for name in names)
+    # with all files of the playground's page
+    web = {path.relative_to(ROOT).as_posix() for path in (ROOT / "clothgym" / "playground" / "web").iterdir()}
+    assert len(web) == 7 and web <= set(names)
     # each package of the source is listed in pyproject.toml
     packages = {path.parent.relative_to(ROOT) for path in (ROOT / "clothgym").rglob("__init__.py")}
     assert {f"{package.as_posix()}/__init__.py" for package in packages} <= set(names)

@@ -1,5 +1,6 @@
 """Floor 8: who may visit the playground, asked of the running server; and what a hostile browser may send."""
 
+import asyncio
 import contextlib
 import http.client
 import socket
@@ -10,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from stages import page
+from stages import page, turned
 
-import clothgym
 from clothgym.cli import main
 from clothgym.playground import access, server
 from clothgym.playground.controls import MOST_SUBSTEPS
@@ -26,7 +26,7 @@ DEADLINE = 60.0  # seconds for what is waited for
 
 @pytest.fixture(scope="module")
 def running():
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     playground = server.serve("patch", port=0, tell=lambda _: None)
     yield playground
     playground.stop()
@@ -43,11 +43,9 @@ def asked(port, host=None, origin=None, path="/", cookie=None):
 
 def connected(port, origin=None, path="/"):
     """A websocket."""
-    import viser
     from websockets.sync.client import connect
 
-    protocols = [f"viser-v{viser.__version__}"]
-    return connect(f"ws://127.0.0.1:{port}{path}", subprotocols=protocols, origin=origin, open_timeout=20, proxy=None)
+    return connect(f"ws://127.0.0.1:{port}{path}", origin=origin, open_timeout=20, proxy=None)
 
 
 def visited(port, origin, path="/"):
@@ -66,15 +64,6 @@ def answered(port, *lines):
     with socket.create_connection(("127.0.0.1", port), timeout=20) as client:
         client.sendall(b"\r\n".join([*lines, b"Connection: close", b"", b""]))
         return b"".join(iter(lambda: client.recv(65536), b""))
-
-
-def come(client):
-    """Say where the visitor looks from, as a page does first: then the visit begins."""
-    import msgspec
-
-    size = {"near": 0.1, "far": 10.0, "fov": 0.6, "image_height": 9, "image_width": 9}
-    place = {"wxyz": [1, 0, 0, 0], "position": [1, -1, 1], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
-    client.send(msgspec.msgpack.encode({"type": "ViewerCameraMessage", **place, **size}))
 
 
 def until(what):
@@ -135,7 +124,7 @@ def test_a_malformed_request_is_refused_and_leaves_no_traceback(running, lines, 
 
 
 def test_beyond_loopback_a_token_is_needed_and_the_page_remembers_it():
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     said = []
     playground = server.serve("patch", host="0.0.0.0", port=0, tell=said.append)
     try:
@@ -159,25 +148,6 @@ def test_beyond_loopback_a_token_is_needed_and_the_page_remembers_it():
         playground.stop()
 
 
-@pytest.mark.parametrize("open_to", ["everything", "websockets", "pages"])
-def test_a_viser_that_cannot_be_guarded_is_not_opened(monkeypatch, open_to):
-    pytest.importorskip("viser")
-    guarded = access.Access.guarded
-
-    def half(self, process):
-        strict = guarded(self, process)
-
-        def process_request(connection, request):
-            kind = "websockets" if "Upgrade" in request.headers else "pages"
-            return (process if open_to in ("everything", kind) else strict)(connection, request)
-
-        return process_request
-
-    monkeypatch.setattr(access.Access, "guarded", half)
-    with pytest.raises(RuntimeError, match="cannot be guarded"):
-        server.Playground(Gallery(), "patch", port=0)
-
-
 @pytest.mark.parametrize(
     ("host", "alone"),
     [("127.0.0.1", True), ("127.8.8.8", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("", False)],
@@ -187,19 +157,10 @@ def test_only_loopback_needs_no_token(host, alone):
 
 
 def test_a_full_playground_says_so(running, monkeypatch):
-    monkeypatch.setattr(running, "visits", dict.fromkeys(range(access.MOST_VISITS)))
+    monkeypatch.setattr(running, "visits", [None] * access.MOST_VISITS)
     status, _, text = asked(running.access.port)
     assert status == 503 and f"full, with {access.MOST_VISITS} visitors" in text
     assert visited(running.access.port, None) == 503
-
-
-def test_websockets_that_begin_no_visit_fill_it_too(running, monkeypatch):
-    monkeypatch.setattr(server, "MOST_VISITS", 2)
-    port = running.access.port
-    until(lambda: visited(port, None) == 101)  # those of other tests have gone
-    with connected(port), connected(port):
-        assert visited(port, None) == 503 == asked(port)[0] and not running.visits
-    until(lambda: visited(port, None) == 101)
 
 
 def test_a_visit_ends_with_its_visitor_whose_thread_counts_until_it_does(running, monkeypatch):
@@ -214,11 +175,10 @@ def test_a_visit_ends_with_its_visitor_whose_thread_counts_until_it_does(running
     monkeypatch.setattr(server, "MOST_VISITS", 1)
     port = running.access.port
     try:
-        until(lambda: visited(port, None) == 101)
-        with connected(port) as client:
-            come(client)
+        until(lambda: not running._busy())
+        with connected(port):
             assert inside.wait(DEADLINE)
-            (visit,) = running.visits.values()
+            (visit,) = running.visits
             for _ in range(1000):
                 visit.page.order("press", "step")
         # they have left in the midst of a step, with orders still to come
@@ -235,55 +195,78 @@ def test_a_visit_ends_with_its_visitor_whose_thread_counts_until_it_does(running
 # --- what a browser may send --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("message", [b"\xc1", b"\x05", "text", {"type": "no such"}, {"type": "GuiUpdateMessage"}])
-def test_a_message_that_cannot_be_read_ends_its_visit_with_a_sentence(running, message, capsys, caplog):
-    import msgspec
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"\xc1",
+        "text",
+        "7",
+        '["turn", 5]',
+        '["turn", ["no such", 1]]',
+        '["turn", [[], 1]]',
+        '["stop", 1]',
+        '["grasp", ["start"]]',
+        '{"a": 1}',
+    ],
+)
+def test_a_message_that_makes_no_sense_ends_its_visit_with_a_sentence(running, message, capsys, caplog):
     from websockets.exceptions import ConnectionClosed
 
     with connected(running.access.port) as client, pytest.raises(ConnectionClosed, match="cannot be read"):
-        client.send(msgspec.msgpack.encode(message) if isinstance(message, dict) else message)
+        visit = until(lambda: running.visits[-1] if running.visits else None)
+        until(lambda: visit.page)
+        client.send(message)
         while True:
             client.recv(timeout=DEADLINE)
     said = capsys.readouterr().err
     assert said.startswith("A visitor has sent what makes no sense: ") and said.count("\n") == 1
     assert not any(record.exc_info for record in caplog.records)
-
-
-def test_a_message_that_cannot_be_followed_is_a_sentence_and_the_visit_goes_on(running, capsys, caplog):
-    import msgspec
-
     until(lambda: not running.visits)
-    with connected(running.access.port) as client:
-        come(client)
-        visit = until(lambda: next(iter(running.visits.values()), None))
-        until(lambda: visit.frames)
-        (uuid, *_) = visit.page.client.gui._gui_input_handle_from_uuid
-        client.send(msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"no such": 1}}))
-        said = until(lambda: capsys.readouterr().err)
-        frames = visit.frames
-        until(lambda: visit.frames > frames)
-    assert said.startswith("A visitor has sent what makes no sense: AssertionError") and said.count("\n") == 1
-    assert not any(record.exc_info for record in caplog.records)
+
+
+def test_what_is_sent_are_messages_in_order_and_of_the_frames_that_wait_the_last():
+    loop = asyncio.new_event_loop()
+    client, sent = server.Client(loop), []
+
+    class Connection:
+        async def send(self, message):
+            sent.append(message)
+
+    async def send_for_a_while():
+        await asyncio.wait_for(client.send_to(Connection()), 0.2)
+
+    client.draw(b"first")
+    client.tell("solids", [1])
+    client.draw(b"second")
+    client.give("a.npz", b"content")
+    with pytest.raises(TimeoutError):
+        loop.run_until_complete(send_for_a_while())
+    loop.close()
+    assert sent == ['{"solids": [1]}', '{"file": "a.npz"}', b"content", b"second"]
+
+
+def test_the_page_and_its_parts_are_served_and_nothing_else(running):
+    port = running.access.port
+    for name, kind in (("/", "text/html"), ("/viewer.js", "text/javascript"), ("/look.css", "text/css")):
+        status, headers, text = asked(port, path=name)
+        assert status == 200 and headers["Content-Type"].startswith(kind) and len(text.encode()) == int(headers["Content-Length"])
+    for name in ("/server.py", "/../server.py", "/web/viewer.js", "/%2e%2e/server.py"):
+        assert asked(port, path=name)[0] == 404
 
 
 @pytest.mark.parametrize("value", [1e9, float("inf"), float("nan"), -1e12, "1e9", None, [3]])
 def test_sliders_stay_within_their_ranges_for_any_input(value):
     visitor, client = page()
-    controls = visitor.controls
-    controls["auto"].turn(False)
+    turned(visitor, auto=False)
     for name in ("substeps", "stretch_stiffness", "gravity", "wind", "moment"):
-        controls[name].max = 1e300  # a browser may change a control's own range, too
-        controls[name].turn(value)
-        visitor.tick()
-    controls["seed"].value = value
-    controls["time"].turn("reset")
-    visitor.tick()
+        turned(visitor, **{name: value})
+    turned(visitor, seed=value, play="reset")
     settings, stage = visitor.stage.settings, visitor.stage
     if value not in (1e9, -1e12, "1e9"):
         # neither the lowest nor the largest: nothing changes
         assert settings == SceneStage("patch").settings.changed(substeps=settings.substeps) and stage.seed == 0
-        assert any("Not possible: gravity m/s²=" in said for said in client.notifications)
-        assert controls["gravity"].value == settings.gravity
+        assert any(title == "Not possible" and words.startswith("Gravity, m/s²=") for title, words in client.said)
+        assert client.controls["gravity"]["value"] == settings.gravity
     assert 1 <= settings.substeps <= MOST_SUBSTEPS and 0 <= settings.stretch_stiffness <= 2000
     assert 0 <= settings.gravity <= 9.81 and 0 <= settings.wind <= 12 and 0 <= visitor.moment < len(stage.recording.frames)
     assert np.isfinite(stage.frame.positions).all()
@@ -294,8 +277,7 @@ def test_a_choice_that_is_none_changes_nothing():
     before = visitor.stage.settings
     for name in ("scene", "fabric", "integrator", "bending", "self_collision", "show", "kind", "presets"):
         for value in ("no such thing", None, [3]):
-            visitor.controls[name].turn(value)
-            visitor.tick()
+            turned(visitor, **{name: value})
     assert visitor.stage.settings == before and visitor.stage.name == "patch" and visitor.playing
 
 
@@ -303,12 +285,13 @@ def test_a_choice_that_is_none_changes_nothing():
 def test_a_drag_or_a_click_to_nowhere_moves_nothing_to_nowhere(value):
     visitor, client = page()
     visitor.tick()
-    place, node = tuple(visitor.stage.frame.positions[0, 144].tolist()), client.scene.handles["/sheet0/front0"]
+    place = visitor.stage.frame.positions[0, 144].tolist()
     for phase in ("start", "update", "end"):
-        node.drag(phase, (value,) * 3, (value,) * 3)
-        node.drag(phase, place, (0.0, value, 0.0))
-    client.scene.click((value,) * 3, (0.0, 0.0, -1.0))
-    client.scene.click(place, (value,) * 3, "shift")
+        for there in ([value] * 3, [0.0, value, 0.0], "here", [[]], 7):
+            visitor.take(["grasp", [phase, there]])
+    for where, way in (([value] * 3, [0.0, 0.0, -1.0]), (place, [value] * 3), (None, "down")):
+        visitor.take(["touch", [False, where, way]])
+        visitor.take(["touch", [True, where, way]])
     for _ in range(5):
         visitor.tick()
     assert np.isfinite(visitor.stage.frame.positions).all() and not visitor.stage.notes
@@ -337,7 +320,7 @@ def test_orders_and_frames_that_take_long_are_cut_short_and_only_on_a_page(monke
     clock = iter(np.arange(0, 1e6, FRAME_BUDGET * 0.6))
     monkeypatch.setattr("clothgym.playground.page.time.monotonic", lambda: float(next(clock)))
     for _ in range(10):
-        visitor.order("look")
+        visitor.order("drop")
     visitor.tick()
     assert len(visitor._later) == 9
     clock = iter(np.arange(0, 1e3, FRAME_BUDGET * 1.1))
@@ -374,23 +357,20 @@ def test_loopback_is_the_default_and_a_port_in_use_gives_the_next(running):
     ],
 )
 def test_the_command_reports_wrong_arguments(arguments, words, capsys):
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     with pytest.raises(SystemExit):
         main(["view", *arguments])
     assert words in capsys.readouterr().err
 
 
-def test_only_the_server_knows_of_viser_and_without_it_there_is_a_sentence(monkeypatch, capsys):
-    for path in Path(clothgym.__file__).parent.rglob("*.py"):
-        assert path.name == "server.py" or "envs" in path.parts or "import viser" not in path.read_text(), path
-    monkeypatch.setitem(sys.modules, "viser", None)
+def test_without_its_server_there_is_a_sentence(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "websockets.asyncio.server", None)
     with pytest.raises(SystemExit):
         main(["view"])
     assert "pip install 'clothgym[view]'" in capsys.readouterr().err
 
 
 def test_nothing_listens_beyond_loopback(running):
-    assert running.server.request_share_url() is None  # viser's own opens a tunnel to the world
     port = running.access.port
     assert listening_at(port) in ({"0100007F"}, set())
 

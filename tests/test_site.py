@@ -1,7 +1,9 @@
 """The site's checks find what is wrong with a site, and its pages are made of what is in the repository."""
 
+import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from training_runs import ROOT
@@ -70,6 +72,16 @@ def test_pages_have_what_is_elsewhere_in_the_repository(scripts, monkeypatch, tm
     monkeypatch.setattr(conf, "DEMO", tmp_path / "index.html")
     (tmp_path / "index.html").touch()
     assert prepared("index", "<!-- demo -->") == conf.LINK_TO_DEMO
+
+
+def test_the_demo_on_the_site_has_all_files_that_it_names_in_its_own_folder(scripts, tmp_path):
+    import conf
+
+    conf.take_demo(SimpleNamespace(builder=SimpleNamespace(format="html"), outdir=tmp_path), None)
+    page = (tmp_path / "demo" / "index.html").read_text()
+    names = re.findall(r'(?:src|href|og:image" content)="([\w./-]+)"', page)
+    assert {"viewer.js", "look.css", "cloth.js", "episodes/index.js", "card.jpg"} <= set(names)
+    assert ".." not in " ".join(names) and not [name for name in names if not (tmp_path / "demo" / name).is_file()]
 
 
 def test_the_commands_of_the_reference_are_all(scripts):

@@ -8,32 +8,20 @@ request also needs the token of the printed address, in its own address or in th
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import hmac
 import http
 import ipaddress
 import secrets
 import socket
-import sys
-import traceback
-from collections.abc import Callable, Iterator
-from contextvars import ContextVar
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
-from urllib.parse import parse_qs, parse_qsl, quote, unquote, urlencode, urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 from clothgym.checks import shown
 
 MOST_VISITS = 16
 PAGES = ("/", "/index.html")
-LONGEST, ASKED_FOR = 2000, 60  # letters of a query that are read, and how long a page has to ask for its websocket [s]
-ASKED: ContextVar[str] = ContextVar("asked", default="")  # the query of the page whose websocket is served in this context
-# the rest of a request for a page, and of one for a websocket
-PAGE = "Connection: close\r\n"
-WEBSOCKET = (
-    "Connection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n"
-)
 MALFORMED = http.HTTPStatus.BAD_REQUEST, "This request is malformed."
 FRAMES = "frame-ancestors 'self' http://localhost:* http://127.0.0.1:*"  # notebooks on this machine may embed the page
 EVERYWHERE = {"": "127.0.0.1", "0.0.0.0": "127.0.0.1", "::": "::1"}  # how this machine reaches a server at all its addresses
@@ -99,49 +87,9 @@ class Access:
                 response.headers["Referrer-Policy"] = "no-referrer"
                 if self.token:
                     response.headers["Set-Cookie"] = f"{self._cookie}={self.token}; HttpOnly; SameSite=Strict; Path=/"
-                if urlsplit(request.path).path in PAGES:
-                    response.headers["Set-Cookie"] = self._asked(request.path)
             return response
 
         return process_request
-
-    @contextlib.contextmanager
-    def guarding(self) -> Iterator[None]:
-        """Context in which a server is created with this access check.  Patches ``websockets``, as viser has no hook for it."""
-        from websockets.asyncio import server
-
-        plain = server.serve
-
-        def serve(handler: Any, *args: Any, process_request: Any = None, **kwargs: Any) -> Any:
-            asyncio.get_running_loop().set_exception_handler(lambda _, context: tell_of_a_message(context.get("exception")))
-
-            async def telling(connection: Any) -> None:
-                ASKED.set(unquote("".join(in_cookies(connection.request.headers, f"{self._cookie}-asked"))[:LONGEST]))
-                try:
-                    await handler(connection)
-                except Exception as error:
-                    tell_of_a_message(error)
-                    await connection.close(1003, "a message that cannot be read")
-
-            return plain(telling, *args, process_request=self.guarded(process_request), **kwargs)
-
-        server.serve = serve  # type: ignore[assignment,misc]
-        try:
-            yield
-        finally:
-            server.serve = plain  # type: ignore[misc]
-
-    def stands(self) -> bool:
-        """Whether the server refuses a page and a websocket that it must refuse; asked of the server itself."""
-        return all(map(self._refuses, (PAGE, WEBSOCKET)))
-
-    def _refuses(self, lines: str) -> bool:
-        try:
-            with socket.create_connection((EVERYWHERE.get(self.host, self.host), self.port), timeout=10) as probe:
-                probe.sendall(f"GET / HTTP/1.1\r\nHost: clothgym.invalid\r\n{lines}\r\n".encode())
-                return probe.recv(64).startswith(b"HTTP/1.1 403")
-        except OSError:  # no answer is no refusal
-            return False
 
     @property
     def _cookie(self) -> str:
@@ -155,24 +103,11 @@ class Access:
         offered = parse_qs(urlsplit(path).query).get("token", []) + in_cookies(headers, self._cookie)
         return any(hmac.compare_digest(one.encode(), self.token.encode()) for one in offered)
 
-    def _asked(self, path: str) -> str:
-        """The cookie with which the page's websocket, whose address has no query, tells what the page was asked for."""
-        told = urlencode([(name, value) for name, value in parse_qsl(urlsplit(path).query) if name != "token"])
-        kept = quote(told[:LONGEST], safe="")
-        return f"{self._cookie}-asked={kept}; Max-Age={ASKED_FOR if kept else 0}; HttpOnly; SameSite=Strict; Path=/"
-
 
 def in_cookies(headers: Any, wanted: str) -> list[str]:
     """The values that a request's cookies have for a name."""
     pairs = [part.strip().partition("=") for header in headers.get_all("Cookie") for part in header.split(";")]
     return [value for name, _, value in pairs if name == wanted]
-
-
-def tell_of_a_message(error: BaseException | None) -> None:
-    """Say in the terminal that a message made no sense: a browser can send anything, and viser would print a traceback."""
-    frames = traceback.extract_tb(error.__traceback__) if error is not None else ()
-    where = f" in {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
-    print(f"A visitor has sent what makes no sense: {shown(error)}{where}", file=sys.stderr, flush=True)
 
 
 def is_loopback(host: str) -> bool:

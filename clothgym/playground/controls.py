@@ -1,8 +1,9 @@
-"""The controls of a page: five in sight, presets, and all others in folders; readings and a legend."""
+"""The controls of a page as data: the browser draws them, and tells which one was turned."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -13,133 +14,163 @@ from clothgym.integrators import INTEGRATORS
 from clothgym.material import PRESETS as FABRICS
 from clothgym.playground.exporting import SAVED
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.scenes import CLOTH, WORLD, number_within
-from clothgym.playground.show import MODES, RAMP, STOPS
+from clothgym.playground.scenes import CLOTH, WORLD, number_within, titled
+from clothgym.playground.show import MODES
 from clothgym.playground.stage import SceneStage, Stability, Stage
 from clothgym.simulation import GRAVITY
 
 MOST_SUBSTEPS = 400
 IN_SIGHT = 2  # sliders of WORLD that are not in a folder
-WIDTH = 320  # of the panel [pixels]
+GUSTS, FABRIC, METHOD, COLORS, READINGS, SAVE = (
+    "Gusts and friction", "The fabric in numbers", "How it is computed", "Hands and colors", "Readings", "Save and share"
+)  # fmt: skip
 CLICKS = ("pins it, or frees it", "blows on it")
-ADVICE = "**Drag** the cloth to pull and throw it. **Click** it to pin it or to free it, **shift-click** to blow on it."
+ADVICE = "Drag the cloth to pull and throw it; click it to pin it or to free it."
 # what a button does at once: the scene that it opens, "" for the one that is open, and changes of its settings
-AGAIN = "start again"
+AGAIN = "Start again"
 PRESETS: dict[str, tuple[str, Mapping[str, Any]]] = {
     AGAIN: ("", {}),
-    "storm": ("", {"gravity": GRAVITY, "wind": 9.0, "gust": 4.0, "fabric": "penava_cotton", "air_drag": 0.4}),
+    "Storm": ("", {"gravity": GRAVITY, "wind": 5.0, "gust": 3.0, "fabric": "penava_cotton", "air_drag": 0.4}),
     # 4 substeps of 4.2 ms are far beyond what an explicit method bears with yarns as stiff as denim's
-    "make it explode": (
+    "Make it explode": (
         "",
         {"gravity": GRAVITY, "fabric": "denim", "integrator": "semi_implicit_euler", "self_collision": "off", "substeps": 4},
     ),
-    "race": ("race", {}),
+    "Race a policy": ("race", {}),
 }
 Order = Callable[[str, Any], None]
 
 
-class Controls(dict[str, Any]):
-    """Handles by name.
+@dataclass
+class Control:
+    """What the browser draws for one thing that can be turned or read.
+
+    Attributes:
+        kind: "slider", "number", "menu", "switch", "chips" or "button"; or "told", for what is only read.
+        label, hint: in words; folder: that it is in, "" for those in sight.
+        value: at present; low, high, step: of a slider or a number; options: values and their titles.
+    """
+
+    kind: str
+    label: str = ""
+    value: Any = None
+    hint: str = ""
+    folder: str = ""
+    low: float = 0.0
+    high: float = 1.0
+    step: float = 1.0
+    options: list[tuple[str, str]] = field(default_factory=list)
+    visible: bool = True
+    disabled: bool = False
+
+    def __post_init__(self) -> None:
+        self.turned: Callable[[Any], None] = lambda value: None
+        self.known: dict[str, Any] = {}  # what the browser knows of it
+
+
+class Controls(dict[str, Control]):
+    """Controls by name.
 
     Args:
-        gui: viser's, or a null viewer's.
         order: queues what a visitor wants.
         setting: the present value of one.
         choices: names of scenes and environments, by title.
     """
 
-    def __init__(self, gui: Any, order: Order, setting: Callable[[str], float | None], choices: Mapping[str, str]) -> None:
+    def __init__(self, order: Order, setting: Callable[[str], float | None], choices: Mapping[str, str]) -> None:
         super().__init__()
-        self._gui, self._order, self._setting, self._choices = gui, order, setting, choices
+        self._order, self._setting = order, setting
         self._now = 1  # substeps at present
-        self["about"] = gui.add_markdown("")
-        self._add("scene", gui.add_dropdown("scene", tuple(choices), hint="a scene, or a task with its policies"), "open")
-        self._add("policy", gui.add_dropdown("who acts", ("expert",), hint="in this task"), "choose")
-        self._add_sliders(WORLD[:IN_SIGHT])
-        self._add_menu("fabric", "fabric", FABRICS, "what the sheet is made of: measured fabrics")
-        self._add_menu("integrator", "integrator", INTEGRATORS, "the method that moves the cloth on in time")
-        self._add("drop", gui.add_button("Let go", hint="of the cloth: it falls, and is judged"), "drop")
-        self._add("presets", gui.add_button_group("", tuple(PRESETS)), "preset")
-        self["glance"], self["legend"], self["notes"] = gui.add_markdown(""), gui.add_html(""), gui.add_markdown("")
-        with gui.add_folder("Time", expand_by_default=False):
-            self._add("time", gui.add_button_group("", ("play / pause", "step", "reset")), "press")
-            self["state"] = gui.add_markdown("")
-            self["seed"] = gui.add_number("seed", 0, min=0, step=1, hint="of the next reset: other gusts, another episode")
-            self._add("moment", gui.add_slider("moment", 0, 1, 1, 0, hint="frames so far; drag back to see them again"), "scrub")
-        self["World"] = gui.add_folder("Gusts and friction", expand_by_default=False)
-        with self["World"]:
-            self._add_sliders(WORLD[IN_SIGHT:])
-        self["Cloth"] = gui.add_folder("The fabric in numbers", expand_by_default=False)
-        with self["Cloth"]:
-            self._add_sliders(CLOTH)
-        self["Method"] = gui.add_folder("How it is computed", expand_by_default=False)
-        with self["Method"]:
-            self._add_method()
-        with gui.add_folder("Hands and colors", expand_by_default=False):
-            self["click"] = gui.add_dropdown("a click", CLICKS, hint="a shift-click does the other")
-            hint = "fabric: strained threads light up; strain: all threads are colored"
-            self._add("show", gui.add_dropdown("color by", MODES, hint=hint), "look")
-        with gui.add_folder("Readings", expand_by_default=False):
-            self["readings"] = gui.add_markdown("")
-        with gui.add_folder("Save", expand_by_default=False):
-            self["kind"] = gui.add_dropdown("as", tuple(SAVED.values()))
-            hint = "copy this link to open the page with the present scene, settings, seed and pins"
-            self["link"] = gui.add_text("link", "", hint=hint)
-            kinds = {label: kind for kind, label in SAVED.items()}
-            self._add("save", gui.add_button("Save"), "save", lambda _: kinds.get(str(self["kind"].value), "png"))
-        gui.main_panel.dock_right()
-        gui.main_panel.set_width(WIDTH)
+        scenes = [(name, title) for title, name in choices.items()]
+        self._add("scene", Control("menu", "Scene", None, "a scene, or a task with its policies", options=scenes), "open")
+        self._add("policy", Control("menu", "Who acts", None, "in this task"), "choose")
+        self._add_sliders(WORLD[:IN_SIGHT], "")
+        self._add_menu("fabric", "Fabric", FABRICS, "what the sheet is made of: measured fabrics")
+        self._add_menu("integrator", "Integrator", INTEGRATORS, "the method that moves the cloth on in time")
+        self._add("drop", Control("button", "Let go", hint="of the cloth: it falls, and is judged"), "drop")
+        self._add("presets", Control("chips", options=[(label, label) for label in PRESETS if label != AGAIN]), "preset")
+        self._add_sliders(WORLD[IN_SIGHT:], GUSTS)
+        self._add_sliders(CLOTH, FABRIC)
+        self._add_method()
+        self["click"] = Control(
+            "menu", "A click", CLICKS[0], "a shift-click does the other", COLORS, options=[(c, c) for c in CLICKS]
+        )
+        modes = [(MODES[0], "Fabric, strained threads light up"), (MODES[1], "Strain of all threads")]
+        self["show"] = Control("menu", "Color by", MODES[0], "what the colors of the cloth say", COLORS, options=modes)
+        self["seed"] = Control("number", "Seed", 0, "of the next start: other gusts, another episode", COLORS, high=2**31 - 1)
+        self["kind"] = Control("menu", "As", "png", "what is saved", SAVE, options=list(SAVED.items()))
+        self._add("save", Control("button", "Save", folder=SAVE), "save")
+        for name in ("about", "strain", "readings", "verdict", "link", "time"):
+            self[name] = Control("told")
+        self._add("play", Control("told"), "press")
+        self._add("moment", Control("told"), "scrub")
+
+    def turn(self, name: Any, value: Any) -> None:
+        """A visitor has turned a control; what that means is queued.
+
+        Raises:
+            KeyError, TypeError: there is no such control.
+        """
+        control = self[name]
+        control.value = control.known["value"] = value
+        control.turned(value)
+
+    def news(self) -> dict[str, dict[str, Any]]:
+        """What the browser does not know yet: properties that have changed, by control."""
+        news = {}
+        for name, control in self.items():
+            now = {item.name: getattr(control, item.name) for item in fields(control)}
+            if new := {key: value for key, value in now.items() if key not in control.known or control.known[key] != value}:
+                news[name], control.known = new, now
+        return news
 
     # --- of the open stage ------------------------------------------------------------------------------------------------
 
     def suit(self, stage: Stage) -> None:
         """Show the controls of a stage that has just been opened."""
         scene = isinstance(stage, SceneStage)
-        self["about"].content = f"{stage.about}\n\n{ADVICE}" if scene else stage.about
-        self["scene"].value = next(title for title, name in self._choices.items() if name == stage.name)
-        for name in ("gravity", "wind", "fabric", "integrator", "World", "Cloth", "Method"):
-            self[name].visible = scene
+        self["about"].value = f"{stage.about} {ADVICE}" if scene else stage.about
+        self["scene"].value = stage.name
+        for name, control in self.items():
+            if name in ("gravity", "wind", "fabric", "integrator", "click") or control.folder in (GUSTS, FABRIC, METHOD):
+                control.visible = scene
         self["drop"].visible = stage.drops
-        self["click"].visible = scene
         self["seed"].value = stage.seed
         self["policy"].visible = bool(stage.policies)
         if stage.policies:
-            self["policy"].options = tuple(stage.policies)
+            self["policy"].options = [(name, titled(name)) for name in stage.policies]
             self["policy"].value = stage.policy
-        self["show"].value = MODES[0]
 
     def fill(self, stage: SceneStage) -> None:
         """Set the controls to a scene's settings, which queues no orders."""
         settings = stage.settings
         for name, _, largest, _, unit, _ in (*WORLD, *CLOTH):
             value = round((getattr(settings, name) or 0.0) / unit, 9)
-            self[name].max = max(largest, value)
+            self[name].high = max(largest, value)
             self[name].value = value
         for name in ("fabric", "integrator", "bending", "self_collision"):
             self[name].value = getattr(settings, name)
         self._now = now = stage.simulation.substeps
         self["auto"].value = self["substeps"].disabled = settings.substeps == "auto"
-        self["substeps"].max = max(MOST_SUBSTEPS, now)
+        self["substeps"].high = max(MOST_SUBSTEPS, now)
         self["substeps"].value = now
 
     # --- how they are made ------------------------------------------------------------------------------------------------
 
-    def _add(self, name: str, control: Any, what: str, meant: Callable[[Any], Any] = lambda value: value) -> None:
-        """Let a control queue an order when a visitor moves it, not when the page sets it."""
+    def _add(self, name: str, control: Control, what: str, meant: Callable[[Any], Any] = lambda value: value) -> None:
+        """Let a control queue an order when a visitor turns it."""
         self[name] = control
 
-        def turned(event: Any) -> None:
-            if event.client_id is not None:
-                try:
-                    self._order(what, meant(event.target.value))
-                except ValueError as error:
-                    self._order("refuse", str(error))
+        def turned(value: Any) -> None:
+            try:
+                self._order(what, meant(value))
+            except ValueError as error:
+                self._order("refuse", str(error))
 
-        (control.on_click if hasattr(control, "on_click") else control.on_update)(turned)
+        control.turned = turned
 
-    def _add_sliders(self, sliders: tuple[Any, ...]) -> None:
+    def _add_sliders(self, sliders: tuple[Any, ...], folder: str) -> None:
         for name, label, largest, step, unit, hint in sliders:
-            slider = self._gui.add_slider(label, 0.0, largest, step, 0.0, hint=hint)
 
             def meant(
                 value: Any, name: str = name, label: str = label, largest: float = largest, unit: float = unit
@@ -149,17 +180,19 @@ class Controls(dict[str, Any]):
                 given = round(number_within(label, value, 0.0, max(largest, present)) * unit, 12)
                 return {name: None if name == "strain_limit" and not given else given}
 
-            self._add(name, slider, "change", meant)
+            self._add(name, Control("slider", label, 0.0, hint, folder, high=largest, step=step), "change", meant)
 
-    def _add_menu(self, name: str, label: str, names: Any, hint: str) -> None:
-        self._add(name, self._gui.add_dropdown(label, tuple(names), hint=hint), "change", lambda value: {name: value})
+    def _add_menu(self, name: str, label: str, names: Any, hint: str, folder: str = "") -> None:
+        options = [(one, titled(one)) for one in names]
+        self._add(name, Control("menu", label, None, hint, folder, options=options), "change", lambda value: {name: value})
 
     def _add_method(self) -> None:
-        self._add_menu("bending", "bending", BENDING, "how the sheet resists being bent")
-        self._add_menu("self_collision", "touches itself", ("off", "fast", "strict"), "strict: it never passes through itself")
-        auto = self._gui.add_checkbox("safe substeps", True, hint="as many as the method needs to be stable")
+        self._add_menu("bending", "Bending", BENDING, "how the sheet resists being bent", METHOD)
+        hint = "whether the sheet feels itself"
+        self._add_menu("self_collision", "Self-collision", ("off", "fast", "strict"), hint, METHOD)
+        auto = Control("switch", "Safe substeps", True, "as many as the method needs to be stable", METHOD)
         hint = "into which 1/60 s is divided; too few, and an explicit method explodes"
-        for name, control in (("auto", auto), ("substeps", self._gui.add_slider("substeps", 1, MOST_SUBSTEPS, 1, 1, hint=hint))):
+        for name, control in (("auto", auto), ("substeps", Control("slider", "Substeps", 1, hint, METHOD, 1, MOST_SUBSTEPS))):
             self._add(name, control, "change", lambda _: {"substeps": self._substeps()})
 
     def _substeps(self) -> int | str:
@@ -175,47 +208,22 @@ class Controls(dict[str, Any]):
 NOTHING = "–"  # where there is nothing to read
 
 
-def readings_table(recording: Recording, frame: Frame, stability: Stability | None = None) -> str:
-    """The readings as a table, a column for each sheet; stability: of a scene's."""
+def readings_table(recording: Recording, frame: Frame, stability: Stability | None = None) -> list[list[str]]:
+    """The readings as rows of a name and a cell for each sheet; stability: of a scene's."""
     readings = frame.readings
-    rows = [
-        ("time", [f"{frame.time:.2f} s"]),
-        ("largest stretch", numbers(100 * readings["strain"], "{:.2f} %")),
-        ("energy", numbers(1e3 * readings["energy"], "{:.4g} mJ")),
-        ("a step is computed in", numbers(1e3 * readings["cost"], "{:.2f} ms")),
+    rows = [["", *map(titled, recording.labels)]] if len(recording.labels) > 1 else []
+    rows += [
+        ["Largest stretch", *numbers(100 * readings["strain"], "{:.2f} %")],
+        ["Energy", *numbers(1e3 * readings["energy"], "{:.4g} mJ")],
+        ["Cost of a step", *numbers(1e3 * readings["cost"], "{:.2f} ms")],
     ]
     if stability is not None:
-        rows.append(("substep", [f"{1e3 * stability.substep:.3g} ms"]))
-        rows.append(("its bound", [f"{1e3 * stability.bound:.3g} ms" if stability.bound > 0 else "none"]))
-        rows.append(("stability", [stability.verdict]))
-    rows += [(f"reward: {name}", [f"{value:+.4f}"]) for name, value in frame.terms.items()]
-    count = len(recording.labels)
-    head = "| |" + "|".join(label.replace("_", " ") for label in recording.labels) + "|\n|---|" + "---:|" * count
-    lines = [f"| {name} | " + " | ".join([*cells] + [""] * (count - len(cells))) + " |" for name, cells in rows]
-    return "\n".join([head, *lines])
-
-
-def glance(recording: Recording, frame: Frame) -> str:
-    """The one reading that is always in sight: the largest strain of each sheet."""
-    stretched = numbers(100 * frame.readings["strain"], "{:.2f} %")
-    labels = [f"{label.replace('_', ' ')} " for label in recording.labels] if len(stretched) > 1 else [""]
-    return "Stretched at most: " + ", ".join(f"{label}**{value}**" for label, value in zip(labels, stretched)) + "."
+        rows.append(["Substep", f"{1e3 * stability.substep:.3g} ms"])
+        rows.append(["Its bound", f"{1e3 * stability.bound:.3g} ms" if stability.bound > 0 else "none"])
+        rows.append(["Stability", stability.verdict])
+    return rows + [[f"Reward: {name.replace('_', ' ')}", f"{value:+.4f}"] for name, value in frame.terms.items()]
 
 
 def numbers(values: NDArray, form: str) -> list[str]:
     """Each number in that form; nothing where there is none."""
     return [form.format(value) if np.isfinite(value) else NOTHING for value in values]
-
-
-def legend(mode: str, strained: float) -> str:
-    """The legend of the colors, as HTML; strained: where they end."""
-    # in the fabric's own colors only strained threads light up
-    low, words = (
-        (0.0, "<span>threads at rest</span>") if mode == "fabric" else (-1.0, "<span>compressed</span><span>at rest</span>")
-    )
-    stops = ", ".join(
-        f"rgb({r:.0f},{g:.0f},{b:.0f}) {100 * (s - low) / (1 - low):.0f}%" for s, (r, g, b) in zip(STOPS, RAMP) if s >= low
-    )
-    bar = f'<div style="height:8px;border-radius:4px;background:linear-gradient(to right, {stops})"></div>'
-    row = '<div style="display:flex;justify-content:space-between;font-size:0.75em">'
-    return f'<div style="margin:0 12px">{bar}{row}{words}<span>stretched: {100 * strained:.3g} %</span></div></div>'

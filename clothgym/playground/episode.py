@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym.checks import known, vector
 from clothgym.envs.episode import FAILURES, within_ball
 from clothgym.playground.recording import Frame, Recording
+from clothgym.playground.scenes import titled
 from clothgym.playground.stage import Stage, measured, visible, within_view
 from clothgym.registration import checked_id
 from clothgym.render import Camera
@@ -38,6 +39,7 @@ def random(env: Any, observation: NDArray) -> NDArray:
     return env.action_space.sample()
 
 
+FAILED = {"diverged": "blew up", "torn": "tore", "out_of_bounds": "was carried out of reach"}
 POLICIES: dict[str, Policy] = {"expert": expert, "noop": noop, "random": random}
 
 
@@ -121,7 +123,7 @@ class EpisodeStage(Stage):
         if trained is not None and trained != self.env_kwargs:
             self._begin(trained)
             options = ", ".join(f"{name}={value!r}" for name, value in trained.items()) or "the environment's own options"
-            self.notes["run"] = f"As {policy} was trained, with {options}."
+            self.notes["run"] = f"As {titled(policy)} was trained, with {options}."
         self.policy = policy
 
     def reset(self, seed: int | None = None) -> None:
@@ -217,15 +219,15 @@ class EpisodeStage(Stage):
 def judgement(info: Mapping[str, Any], total: float) -> str:
     """A sentence on the last step's ``info`` and the return."""
     if info["failure"]:
-        return f"The episode failed: {FAILURES[info['failure']].replace('_', ' ')}. Return {total:.2f}."
-    success = "a success" if info["is_success"] else "no success"
-    return f"Evaluated: {success}, performance {info['normalized_performance']:.2f}, return {total:.2f}."
+        return f"The episode failed: the sheet {FAILED[FAILURES[info['failure']]]}."
+    success = "Success" if info["is_success"] else "No success"
+    return f"{success}: a score of {info['normalized_performance']:.2f}, and a return of {total:.2f}."
 
 
 class Replay(Stage):
     """A recording that is shown again: all frames are there, and nothing can be changed."""
 
-    over = True
+    over, patience = True, 2.0
 
     def __init__(self, recording: Recording, name: str = "recording") -> None:
         super().__init__()
@@ -239,6 +241,9 @@ class Replay(Stage):
     def reset(self, seed: int | None = None) -> None:
         """Nothing to do: a recording does not change."""
 
+    def begin_again(self) -> None:
+        """Nothing to do: the page goes back to the first frame."""
+
 
 # --- a race -----------------------------------------------------------------------------------------------------------
 
@@ -246,7 +251,7 @@ class Replay(Stage):
 RACE, TASK = "race", "ClothDrape-v0"
 TITLE = f"Race a policy at {TASK}"
 YOU = "you"
-SLOWLY = 2.0  # times slower than time itself: the task gives a hand two seconds
+SLOWLY = 5.0  # times slower than time itself: the task gives a hand two seconds
 APART = 0.95  # between the lanes [m]
 OFFSETS = np.array([(0.5 * APART, 0, 0), (-0.5 * APART, 0, 0)], np.float32)  # of the visitor's sheet and of the policy's
 CAMERA = Camera(eye=(2.35, -1.55, 1.4), target=(0.05, -0.2, 0.26), vertical_fov=33.0)  # the way is to the right
@@ -270,10 +275,10 @@ class Race(Stage):
         ValueError: there is no policy.
     """
 
-    drops = True
+    drops, patience = True, 12.0
     about = (
-        "**You** in front, the learned policy behind: lay your sheet over the target. Drag it: time passes slowly while "
-        "you do. **Let go** when it hangs right."
+        "You in front, a learned policy behind: drag your sheet over the target, and press Let go when it hangs right. Time passes "
+        "slowly, and only while you drag."
     )
 
     def __init__(self, policies: Mapping[str, Policy], seed: int = 0) -> None:
@@ -311,7 +316,7 @@ class Race(Stage):
         if self.over:
             mine, theirs = (float(stage.info["normalized_performance"]) for stage in (self.mine, self.theirs))
             first = "You win" if mine > theirs else "A draw" if mine == theirs else "The policy wins"
-            self.notes["evaluation"] = f"**{first}: {mine:.2f} to {theirs:.2f}.** Yours: {self.mine.notes['evaluation']}"
+            self.notes["evaluation"] = f"{first}: you score {mine:.2f}, the policy {theirs:.2f}."
         return self._keep(self._look())
 
     def grab(self, place: ArrayLike) -> None:

@@ -23,6 +23,7 @@ from clothgym.playground.episode import EpisodeStage, Race
 from clothgym.playground.gallery import Gallery, policies_of
 from clothgym.playground.recording import Frame, Recording
 from clothgym.playground.scenes import FRAME, SCENES, scene_named
+from clothgym.playground.show import look_of
 from clothgym.playground.stage import STEPS, SceneStage, Stage
 from clothgym.registration import ACTORS, actor_named
 from clothgym.render import Camera, Drawn, MeshSequence, Renderer, write_animation, write_picture, write_video
@@ -31,7 +32,8 @@ from clothgym.render.meshes import KINDS, without_frames
 from clothgym.simulation import GRAVITY
 
 SECONDS, FPS, SIZE, PICTURE = 5.0, 30.0, 480, 960  # of a scene; frames a second; pixels of a video's side and of a picture's
-NEEDED = {".png": "PIL", ".webp": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}  # to write a file with that ending; all in the extra "video"
+# to write a file with that ending; all in the extra "video"
+NEEDED = {".png": "PIL", ".webp": "PIL", ".gif": "PIL", ".mp4": "imageio_ffmpeg"}
 # what a visitor can save
 SAVED = {
     "png": "picture (PNG)",
@@ -55,7 +57,8 @@ def painter(
     """
     one_of("color", color, "fabric", "strain")
     mesh, seen = recording.mesh, camera or recording.camera
-    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], seen, size, size, antialias, grid_shape=mesh.shape)
+    look = look_of(recording)._asdict()
+    renderer = Renderer(mesh.triangles, mesh.rest_positions[:, :2], seen, size, size, antialias, grid_shape=mesh.shape, **look)
 
     def draw(frame: Frame) -> NDArray[np.uint8]:
         pictures, depths = [], []
@@ -195,8 +198,8 @@ def export(
 
     Args:
         name: of a scene or an environment.
-        out: ``.png`` for a picture of the end, ``.webp``, ``.gif`` or ``.mp4`` for a film, ``.glb`` for a mesh that moves; without an ending
-            a folder of meshes, one for each frame.
+        out: ``.png`` for a picture of the end, ``.webp``, ``.gif`` or ``.mp4`` for a film, ``.glb`` for a mesh that moves; without
+            an ending a folder of meshes, one for each frame.
         seconds: how long; a scene's 5 and an episode's whole length by default.
         fps: frames a second, 30 or the scene's own by default; size: pixels of a side.
         color: "fabric" or "strain".
@@ -209,7 +212,8 @@ def export(
     """
     path = Path(out).expanduser()
     if path.suffix not in ("", ".glb", *NEEDED):
-        raise ValueError(f"out={str(out)!r}: must end in .png, .webp, .gif, .mp4 or .glb, or be a folder (without an ending) for meshes")
+        endings = ".png, .webp, .gif, .mp4 or .glb"
+        raise ValueError(f"out={str(out)!r}: must end in {endings}, or be a folder (without an ending) for meshes")
     if path.suffix in ("", ".glb") and color != "fabric":
         raise ValueError(f"color={color!r}: meshes only have the fabric's color; ask for a picture or a film")
     if size is not None:

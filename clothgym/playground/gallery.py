@@ -15,7 +15,7 @@ from clothgym.adapters import runs
 from clothgym.checks import known
 from clothgym.playground.episode import RACE, TASK, TITLE, EpisodeStage, Learnt, Policy, Race, Replay
 from clothgym.playground.recording import Recording
-from clothgym.playground.scenes import SCENES, TITLES
+from clothgym.playground.scenes import SCENES, TITLES, titled
 from clothgym.playground.stage import SceneStage, Stage
 from clothgym.registration import ACTORS, ENVIRONMENTS, checked_id
 
@@ -46,7 +46,7 @@ class Gallery:
             self.titles[env_id] = env_id
             for name in committed_policies(env_id):
                 learner = name.removeprefix("learned, ")
-                self.titles[f"{env_id}, {learner}"] = f"{env_id}/{learner}"
+                self.titles[f"{env_id}, {titled(learner)}"] = f"{env_id}/{learner}"
         if recording is not None:
             self.titles = {f"recording of {recording.title}": REPLAY} | self.titles
 

@@ -87,26 +87,6 @@ def nearest(x: NDArray, place: NDArray) -> int:
     return int(np.argmin(((x - place) ** 2).sum(axis=1)))
 
 
-def hit(x: NDArray, triangles: NDArray, origin: NDArray, direction: NDArray) -> NDArray | None:
-    """Where a ray first meets a sheet [m], (3,); None if it does not.
-
-    Moeller and Trumbore 1997, for all triangles at once.  x: [m], (particles, 3).
-    """
-    a, b, c = (x[triangles[:, corner]].astype(np.float64) for corner in range(3))
-    ab, ac, to = b - a, c - a, origin - a
-    p = np.cross(direction, ac)
-    det = np.einsum("ij,ij->i", ab, p)
-    with np.errstate(all="ignore"):
-        u = np.einsum("ij,ij->i", to, p) / det
-        q = np.cross(to, ab)
-        v = (q @ direction) / det
-        t = np.einsum("ij,ij->i", ac, q) / det
-        inside = (np.abs(det) > 1e-15) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
-    if not inside.any():
-        return None
-    return origin + float(t[inside].min()) * direction
-
-
 # --- breath -------------------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""The page of one visitor: their input, and the display.  It uses a viewer's interface and does not import its library."""
+"""The page of one visitor: what they want, and what their browser is to show."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from typing import Any
 
 import numpy as np
 
-from clothgym.checks import known
+from clothgym.checks import known, vector
 from clothgym.playground import hands, link
-from clothgym.playground.controls import AGAIN, CLICKS, PRESETS, Controls, glance, legend, readings_table
+from clothgym.playground.controls import AGAIN, CLICKS, PRESETS, Controls, numbers, readings_table
 from clothgym.playground.exporting import SAVED, saved
 from clothgym.playground.gallery import Gallery
 from clothgym.playground.scenes import number_within
-from clothgym.playground.show import MODES, Show
+from clothgym.playground.show import MODES, Show, look_of, scene_of
 from clothgym.playground.stage import SceneStage
 from clothgym.render import Camera
 
-ROOM = 1.15  # distance of the page's eye relative to that of a picture, since the panel makes the view narrower
-NARROW = 0.75  # width of a window relative to its height below which the eye moves back
 LARGEST_SEED = 2**31 - 1
 FRAME_BUDGET = 0.5  # of orders, and of computing, for one frame [s]
 MOST_ORDERS = 10_000  # that wait; a drag gives twenty a second, and compiling takes a minute
 READ_EVERY = 0.2  # between two updates of numbers [s]
 COMPILED = ("integrator", "bending", "strain_limit", "self_collision")  # settings that change the compiled loop
+NOWHERE = np.zeros((0, 3), np.float32)  # no held points
 FIRST = "patch"  # the scene that a preset opens where none is open
 
 
@@ -36,7 +35,7 @@ class Page:
     """One visitor's page.
 
     Args:
-        client: viser's, or a null one.
+        client: their browser: ``tell(what, content)``, ``draw(frame)`` and ``give(name, content)``, see ``server.Client``.
         gallery: what can be shown.
         start: the name shown first.
         left: whether the visitor has left.
@@ -61,16 +60,15 @@ class Page:
         self._stale = True  # whether the view must be drawn again
         self._orders: Queue[tuple[str, Any]] = Queue(MOST_ORDERS)
         self._later: list[tuple[str, Any]] = []  # orders that the last tick had no time for
-        self._waiting: Any = None  # notification that the next frame takes a while
+        self._waiting = False  # whether the browser says that the next frame takes a while
+        self._ended = 0.0  # for how long the end has been shown [s]
         self._fresh = False  # whether the stage has not advanced since it was built, and may have to compile first
         asked_for, refused = self._asked_for(asked)
         self.stage = gallery.open(asked_for.scene or start)
-        self.controls = Controls(client.gui, self.order, self._setting, self.choices)
-        for modifier in (None, "shift"):
-            client.scene.on_click(modifier=modifier)(self._clicked)
+        self.controls = Controls(self.order, self._setting, self.choices)
         self._begin()
         if refused:
-            self._say("Not possible", refused, "orange")
+            self._say("Not possible", refused)
         self._do(self._go_to, asked_for)
 
     def _setting(self, name: str) -> float | None:
@@ -102,6 +100,24 @@ class Page:
 
     # --- what a visitor does --------------------------------------------------------------------------------------------
 
+    def take(self, message: Any) -> None:
+        """A message of the browser: a control and its value, a drag, a click, or the view that is to be saved.
+
+        Raises:
+            ValueError, KeyError, TypeError: it makes no sense.
+        """
+        what, value = message
+        if what == "turn":
+            self.controls.turn(*value)
+        elif what == "touch":
+            shift, place, direction = value
+            self.order(what, ((self.controls["click"].value == CLICKS[1]) != bool(shift), place, direction))
+        elif what == "grasp":
+            phase, place = value
+            self.order(what, (phase, place))
+        else:
+            raise ValueError(f"{str(what)[:20]!r} is no message")
+
     def order(self, what: str, value: Any = None) -> None:
         """Queue what a visitor wants, for the next tick; too many orders are dropped."""
         with contextlib.suppress(Full):
@@ -123,14 +139,16 @@ class Page:
         if self._left():
             return
         self._change(changes)
-        if self.playing and not self._at_the_end:
-            self.playing = self._do(self._advance)
+        if self.playing and self._at_the_end:
+            self._do(self._stay)
+        elif self.playing:
+            self.playing, self._ended = self._do(self._advance), 0.0
         if self._stale:
             self._do(self._draw)
             self._stale = False
-        if self._waiting is not None:
-            self._waiting.remove()
-            self._waiting = None
+        if self._waiting:
+            self.client.tell("wait", "")
+            self._waiting = False
 
     def _waiting_orders(self) -> list[tuple[str, Any]]:
         """The orders that have come; of several scenes picked in a row the last one counts."""
@@ -151,6 +169,16 @@ class Page:
         """Whether the last frame is shown and the stage is over."""
         return self.stage.over and self.moment == self._last
 
+    def _stay(self) -> None:
+        """Show the end for a while, and begin again."""
+        self._ended += self.stage.recording.time_step
+        if self._ended > self.stage.patience:
+            self._ended, self.moment = 0.0, 0
+            self.stage.begin_again()
+            self.controls["seed"].value = self.stage.seed
+            if isinstance(self.stage, SceneStage):
+                self.controls.fill(self.stage)
+
     def _advance(self) -> None:
         """Advance to the next frame; when the stage is over, to the next one recorded."""
         if self.stage.over:
@@ -163,16 +191,12 @@ class Page:
         self.moment = self._last
 
     def _wait(self, why: str) -> None:
-        """Show that the next frame takes a while, as what was rebuilt may have to be compiled first; nothing old is read."""
-        self._fresh = True
-        for name in ("glance", "readings", "notes", "legend"):
-            self.controls[name].content = ""
-        if self._waiting is None:
-            words = f"{why} The first time on a machine it is compiled, which takes up to a minute."
-            self._waiting = self.client.add_notification("One moment", words, loading=True)
+        """Tell that the next frame takes a while, as what was rebuilt may have to be compiled first."""
+        self._fresh = self._waiting = True
+        self.client.tell("wait", f"{why} The first time on a machine it is compiled, which takes up to a minute.")
 
-    def _say(self, title: str, words: str, color: str) -> None:
-        self.client.add_notification(title, words, color=color, auto_close_seconds=15.0)
+    def _say(self, title: str, words: str) -> None:
+        self.client.tell("say", [title, words])
 
     def _do(self, deed: Callable[..., Any], *values: Any) -> bool:
         """Do something; returns whether it worked.  If not, a notification says why."""
@@ -180,12 +204,12 @@ class Page:
         try:
             deed(*values)
         except (ValueError, OSError, ImportError) as error:
-            self._say("Not possible", str(error), "orange")
+            self._say("Not possible", str(error))
         except Exception as error:  # policies and recordings come from users
             traceback.print_exc(file=sys.stderr)
             self.playing = False
             words = f"Stopped: {type(error).__name__}, {error}. Reset, or choose another policy or another scene."
-            self._say("Something failed", words, "red")
+            self._say("Something failed", words)
         else:
             return True
         return False
@@ -200,23 +224,24 @@ class Page:
             self._wait("Rebuilding.")
         if changes:
             self._do(lambda: stage.change(**changes))
-            self.show.wear(stage.settings.fabric)
+            self.client.tell("look", look_of(stage.recording)._asdict())
             self.controls.fill(stage)
 
     def _begin(self, name: str = "") -> None:
         """Show another scene, environment or recording, or the stage that has just been opened."""
         if name:
-            self._wait(f"Opening {name}.")
+            self._wait(f"Opening {next(title for title, one in self.choices.items() if one == name)}.")
             self.stage = self.gallery.open(name)
         self.stage.budget = FRAME_BUDGET
         self.playing, self.moment = True, 0
         self.controls.suit(self.stage)
         self._see()
 
-    def _open(self, title: Any) -> None:
-        name = self.choices.get(str(title), self.stage.name)
+    def _open(self, name: Any) -> None:
+        if name not in self.choices.values():
+            raise ValueError(f"there is no scene {str(name)[:40]!r}")
         if name != self.stage.name:
-            self._begin(name)
+            self._begin(str(name))
 
     def _preset(self, label: Any) -> None:
         known("preset", str(label), PRESETS)
@@ -227,12 +252,15 @@ class Page:
         self._change(changes)
 
     def _press(self, button: str) -> None:
+        self._ended = 0.0
         if button == "reset":
             self.stage.reset(int(number_within("seed", self.controls["seed"].value, 0, LARGEST_SEED)))
             self.moment, self.playing = 0, True
         elif button == "step":
             self.playing = False
             self._advance()
+        elif self._at_the_end:
+            self.playing, self._ended = True, self.stage.patience
         else:
             self.playing = not self.playing
 
@@ -247,26 +275,21 @@ class Page:
             self.moment = 0
             self._see()
 
-    async def _clicked(self, event: Any) -> None:
-        """A click anywhere: ``async``, since threads of a pool would not keep the order."""
-        blows = (self.controls["click"].value == CLICKS[1]) != (event.modifier == "shift")
-        self.order("touch", (blows, np.array(event.ray_origin, float), np.array(event.ray_direction, float)))
-
     def _touch(self, value: tuple[bool, Any, Any]) -> None:
         """A click on the sheet as it is now."""
-        blows, *ray = value
+        blows, place, direction = value
         if self.moment == self._last:
-            (self.stage.blow if blows else self.stage.pin)(*ray)
+            self.stage.blow(place, direction) if blows else self.stage.pin(place)
 
-    def _grasp(self, value: tuple[str, Any, Any]) -> None:
-        """A drag on the sheet: where it began, and where it is now [m]."""
-        phase, start, end = value
+    def _grasp(self, value: tuple[str, Any]) -> None:
+        """A drag on the sheet: its phase, and where it is [m]."""
+        phase, place = value
         if phase == "end":
             self.stage.let_go()
         elif self.moment == self._last:
             if phase == "start":
-                self.stage.grab(start)
-            self.stage.pull(end)
+                self.stage.grab(place)
+            self.stage.pull(place)
 
     def _drop(self, _: Any) -> None:
         """Let go of the cloth in a task."""
@@ -278,19 +301,16 @@ class Page:
             self.controls.fill(self.stage)
         raise ValueError(why)
 
-    def _look(self, _: Any) -> None:
-        """Draw again: only the view has changed."""
-
-    def _save(self, kind: str) -> None:
-        waiting = self.client.add_notification("One moment", f"Making {SAVED[kind]}.", loading=True)
-        seen = self.client.camera
-        (x, y, z), target = np.asarray(seen.position, float).tolist(), np.asarray(seen.look_at, float).tolist()
-        camera = Camera(eye=(x, y, max(z, 0.02)), target=tuple(target), vertical_fov=float(np.degrees(seen.fov)))
-        try:
-            name, content = saved(kind, self.stage, self.moment, camera, self._mode)
-        finally:
-            waiting.remove()
-        self.client.send_file_download(name, content)
+    def _save(self, view: Any) -> None:
+        """Give the visitor a file, of what they see: the eye, the target [m] and the vertical field of view [degrees]."""
+        kind = str(self.controls["kind"].value)
+        known("kind", kind, SAVED)
+        self.client.tell("wait", f"Making a {SAVED[kind]}.")
+        self._waiting = True
+        eye, target, fov = view
+        (x, y, z), looked = vector("eye", eye).tolist(), vector("target", target).tolist()
+        camera = Camera(eye=(x, y, max(z, 0.02)), target=tuple(looked), vertical_fov=number_within("view", fov, 1.0, 120.0))
+        self.client.give(*saved(kind, self.stage, self.moment, camera, self._mode))
 
     # --- display --------------------------------------------------------------------------------------------------------
 
@@ -300,39 +320,30 @@ class Page:
         return self.controls["show"].value if self.controls["show"].value in MODES else MODES[0]
 
     def _see(self) -> None:
-        """Create the nodes of the stage's recording, and place the camera where they are seen well."""
-        camera, seen = self.stage.recording.camera, self.client.camera
-        shape = seen.image_width / max(seen.image_height, 1)
-        share = ROOM * max(1.0, NARROW / max(shape, 0.1))
-        seen.position, seen.look_at = tuple(camera.target + np.subtract(camera.eye, camera.target) * share), camera.target
-        seen.near = 0.1  # a sheet is close to its solid, so depth must be resolved
-        seen.fov = float(np.radians(camera.vertical_fov))
-        self.show = Show(self.client.scene, self.stage.recording, lambda *drag: self.order("grasp", drag))
+        """Show the stage's recording from its own camera."""
+        self.show = Show()
+        self.client.tell("open", scene_of(self.stage.recording))
         self._stale, self._read_at = True, -READ_EVERY
         if isinstance(self.stage, SceneStage):
-            self.show.wear(self.stage.settings.fabric)
             self.controls.fill(self.stage)
 
     def _draw(self) -> None:
-        frames, now = self.stage.recording.frames, time.monotonic()
+        frames, now, controls = self.stage.recording.frames, time.monotonic(), self.controls
         self.moment = min(self.moment, self._last)
         frame = frames[self.moment]
-        with self.client.atomic():
-            self.show.draw(frame, self._mode, self.client.camera.position)
-            if self.moment == self._last:
-                self.show.draw_held(self.stage.held())
-        state = "■ over: reset to start again" if self._at_the_end else "▶ playing" if self.playing else "❚❚ paused"
-        if self.controls["state"].content != state:
-            self.controls["state"].content = state
+        new, drawn = self.show.draw(frame, self.stage.held() if self.moment == self._last else NOWHERE)
+        controls["play"].value = "over" if self._at_the_end else "playing" if self.playing else "paused"
+        controls["verdict"].value = list(self.stage.notes.items())
         if now - self._read_at >= READ_EVERY or not self.playing or self._at_the_end:
             self._read_at = now
-            controls, recording = self.controls, self.stage.recording
-            controls["moment"].max = max(1, self._last)
-            controls["moment"].value = self.moment
-            controls["notes"].content = "\n\n".join(f"> {note}" for note in self.stage.notes.values())
-            controls["glance"].content = glance(recording, frame)
-            controls["readings"].content = readings_table(
-                recording, frame, self.stage.stability() if isinstance(self.stage, SceneStage) else None
-            )
-            controls["legend"].content = legend(self._mode, self.show.strained)
+            stability = self.stage.stability() if isinstance(self.stage, SceneStage) else None
+            controls["strain"].value = numbers(100 * frame.readings["strain"], "{:.1f} %")[0]
+            controls["readings"].value = readings_table(self.stage.recording, frame, stability)
+            controls["moment"].high, controls["moment"].value = max(1, self._last), self.moment
+            controls["time"].value = f"{frame.time:.1f} s"
             controls["link"].value = f"{self._address}{'&' if '?' in self._address else '?'}{link.write(self.stage)}"
+        if new:
+            self.client.tell("solids", new)
+        if news := controls.news():
+            self.client.tell("set", news)
+        self.client.draw(drawn)

@@ -61,6 +61,7 @@ class Recording:
         labels: a name for each sheet.
         strained: strain at which the color scale ends.
         frames: in order.
+        fabric: a name of ``material.PRESETS``, for its looks; "" for the renderer's own.
     """
 
     title: str
@@ -70,6 +71,7 @@ class Recording:
     labels: Sequence[str] = ("",)
     strained: float = 0.05
     frames: list[Frame] = field(default_factory=list)
+    fabric: str = ""
 
     def save(self, path: str | Path) -> None:
         """Write as ``npz`` without pickle, whole or not at all.
@@ -99,7 +101,8 @@ class Recording:
                 arrays[f"{kind}: {name}"] = _column([getattr(frame, kind).get(name) for frame in frames])
         about = {
             "title": self.title, "time_step": self.time_step, "labels": list(self.labels), "strained": self.strained,
-            "camera": asdict(self.camera), "shapes": list(map(_as_text, shapes)), "grid": self.mesh.shape, "size": self.mesh.size,
+            "fabric": self.fabric, "camera": asdict(self.camera), "shapes": list(map(_as_text, shapes)), "grid": self.mesh.shape,
+            "size": self.mesh.size,
         }  # fmt: skip
         files.write_arrays(path, "recording", VERSION, {"about": np.array(json.dumps(about)), **arrays}, compressed=True)
 
@@ -145,6 +148,7 @@ def _from_arrays(arrays: dict[str, NDArray]) -> Recording:
             )
             for k in range(frames)
         ],
+        str(about.get("fabric", "")),
     )  # fmt: skip
 
 

@@ -28,18 +28,18 @@ Vector = tuple[float, float, float]
 SLIDERS = ("stretch_stiffness", "shear_stiffness", "bend_rigidity", "damping_time", "air_drag")  # of the fabric, by slider
 # sliders: setting, label, largest value, step, the slider's unit in that of the setting, and a hint
 WORLD = (
-    ("gravity", "gravity m/s²", GRAVITY, 0.01, 1.0, "pull it: from none to that of the Earth"),
-    ("wind", "wind m/s", 12.0, 0.1, 1.0, "how fast the air moves; gusts come on top"),
-    ("gust", "gusts m/s", 4.0, 0.1, 1.0, "how much the wind changes: root mean square of each component"),
-    ("friction", "friction", 1.0, 0.01, 1.0, "of solids, and of the sheet on itself: Coulomb's coefficient"),
+    ("gravity", "Gravity, m/s²", GRAVITY, 0.01, 1.0, "pull it: from none to that of the Earth"),
+    ("wind", "Wind, m/s", 12.0, 0.1, 1.0, "how fast the air moves; gusts come on top"),
+    ("gust", "Gusts, m/s", 4.0, 0.1, 1.0, "how much the wind changes: root mean square of each component"),
+    ("friction", "Friction", 1.0, 0.01, 1.0, "of solids, and of the sheet on itself: Coulomb's coefficient"),
 )
 CLOTH = (
-    ("stretch_stiffness", "stretch stiffness N/m", 2000.0, 1.0, 1.0, "of its threads: Young's modulus times thickness"),
-    ("shear_stiffness", "shear stiffness N/m", 1000.0, 1.0, 1.0, "along its diagonals: shear modulus times thickness"),
-    ("bend_rigidity", "bending stiffness µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
-    ("damping_time", "damping ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
-    ("air_drag", "air drag N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
-    ("strain_limit", "strain limit %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
+    ("stretch_stiffness", "Stretch stiffness, N/m", 2000.0, 1.0, 1.0, "of its threads: Young's modulus times thickness"),
+    ("shear_stiffness", "Shear stiffness, N/m", 1000.0, 1.0, 1.0, "along its diagonals: shear modulus times thickness"),
+    ("bend_rigidity", "Bending stiffness, µN m", 200.0, 0.1, 1e-6, "plate rigidity"),
+    ("damping_time", "Damping, ms", 5.0, 0.01, 1e-3, "retardation time of every spring"),
+    ("air_drag", "Air drag, N s/m³", 3.0, 0.01, 1.0, "linear drag, which damps swinging"),
+    ("strain_limit", "Strain limit, %", 30.0, 0.5, 1e-2, "largest strain, enforced by a strain limiter; zero for none"),
 )
 
 
@@ -73,7 +73,7 @@ class Settings:
     integrator: str = "semi_implicit_euler"
     bending: str = "springs"
     strain_limit: float | None = None
-    self_collision: str = "off"
+    self_collision: str = "fast"
     substeps: int | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
@@ -106,6 +106,26 @@ class Settings:
         if "fabric" in changes and changes["fabric"] != self.fabric:
             changes = {name: None for name in SLIDERS if name != "air_drag"} | changes
         return replace(self, **changes)
+
+
+# names that are no words
+TITLED = {
+    "rk4": "Runge-Kutta 4", "pbd": "PBD", "xpbd": "XPBD", "penava_cotton": "Cotton", "cotton": "Cotton, broadcloth",
+    "cotton_broad": "Cotton, broadcloth", "polyester_tropical": "Polyester, tropical", "polyester_faille": "Polyester, faille",
+    "wool_tropical": "Wool, tropical", "median": "Median of 618 fabrics", "explicit_euler": "Explicit Euler",
+    "implicit_euler": "Implicit Euler", "semi_implicit_euler": "Semi-implicit Euler",
+    "off": "Ignored", "fast": "Fast", "strict": "Strict: never passes through", "noop": "Nobody", "expert": "Scripted expert",
+    "random": "Random actions", "bc": "behavior cloning", "bc_ppo": "behavior cloning, then PPO", "ppo": "PPO",
+    "ppo_lagrange": "PPO with a Lagrange multiplier", "sac": "SAC from expert episodes", "sac_scratch": "SAC from scratch",
+}  # fmt: skip
+
+
+def titled(name: str) -> str:
+    """A name of the code as a person would write it."""
+    own = TITLED.get(name)
+    if own is None and name.startswith("learned, "):
+        return f"Learned: {titled(name.removeprefix('learned, '))}"
+    return own or name.replace("_", " ").capitalize()
 
 
 def number_within(label: str, value: Any, low: float, high: float) -> float:
@@ -157,7 +177,7 @@ class Scene:
     scenery: tuple[Drawn, ...] = ()
     motion: Callable[[float], tuple[NDArray, Targets]] | None = None
     rests: float = np.inf
-    strained: float = 0.05
+    strained: float = 0.1
     downwind: Vector = (1.0, 0.0, 0.0)
 
     def simulation(self, settings: Settings | None = None, **options: Any) -> Simulation:
@@ -224,6 +244,8 @@ def drive(simulation: Simulation, scene: Scene, time: float, others: Targets | N
 
 STEEL, OAK, CLAY, SAGE = (112, 118, 130), (190, 156, 116), (186, 136, 112), (148, 166, 150)  # colors of solids
 BREATH = 0.7, 0.2  # steady wind that keeps a weightless sheet spread, and gusts that ripple it [m/s]
+RIPPLE = 0.001  # [m]
+PINNED = 0.75  # distance of two pins of a sheet, relative to its width: between them it hangs in folds
 SWING_DRAG = 0.75  # linear drag that damps slow swinging [N s/m^3]
 
 
@@ -269,17 +291,25 @@ def walk(time: float) -> tuple[NDArray, float]:
     return place, float(facing)
 
 
-COLLAR = np.linspace(-1.45, 1.45, 7)  # angles of the cape's anchors about the neck, from the back [rad]
-SHOULDERS, HEM, NECK = 0.16, 0.3, 1.08  # radii of the cape at the collar and at the hem, and the height of the collar [m]
-TORSO, HEAD = np.array([0.0, 0.0, 0.63]), np.array([0.0, 0.0, 1.26])
+COLLAR = np.linspace(-1.1, 1.1, 9)  # angles of the cape's anchors about the neck, from the back [rad]
+SHOULDERS, HEM, NECK = 0.15, 0.34, 1.1  # radii of the cape at the collar and at the hem, and the height of the collar [m]
+# of the figure: centers with the heading along x [m], and radius and height of a capsule each [m]; the head is a sphere
+TORSO, HEAD, ARM, LEG = (0.0, 0.8, 0.135, 0.7), (0.0, 1.245, 0.105), (0.205, 0.79, 0.05, 0.6), (0.075, 0.31, 0.07, 0.6)
+FIGURE = [(0.0, *TORSO), *((side * part[0], 0.0, *part[1:]) for part in (ARM, LEG) for side in (-1, 1))]
+
+
+def figure_at(place: NDArray, facing: float) -> list[NDArray]:
+    """Centers of the parts of the figure, and of its head [m], (3,) each."""
+    aside = np.array([-np.sin(facing), np.cos(facing), 0.0])
+    return [*(place + across * aside + (0, 0, height) for across, _, height, *_ in FIGURE), place + (0, 0, HEAD[1])]
 
 
 def wear_the_cape(time: float) -> tuple[NDArray, Targets]:
-    """The collar's anchors around the neck of a walking person, and torso and head."""
+    """The collar's anchors around the neck of a walking person, and the person's parts."""
     place, facing = walk(time)
     way = facing + np.pi + COLLAR
     collar = np.stack([SHOULDERS * np.cos(way), SHOULDERS * np.sin(way), np.full(len(way), NECK)], axis=1)
-    return place + collar, {1: place + TORSO, 2: place + HEAD}
+    return place + collar, dict(enumerate(figure_at(place, facing), 1))
 
 
 def lay_down(time: float) -> tuple[NDArray, Targets]:
@@ -293,28 +323,54 @@ def lay_down(time: float) -> tuple[NDArray, Targets]:
 
 
 def hung(mesh: ClothMesh, top: float) -> NDArray:
-    """Positions of a grid that hangs straight down from its last row, in the plane y = 0 [m], (particles, 3)."""
-    x = mesh.rest_positions[:, [0, 2, 1]].copy()
+    """Positions of a grid that hangs straight down from its last row, around the plane y = 0 [m], (particles, 3)."""
+    x = rippled(mesh)[:, [0, 2, 1]]
     return x + (0, 0, top - x[:, 2].max())
 
 
+def rippled(mesh: ClothMesh) -> NDArray:
+    """A flat sheet with a millimeter of ripple [m], (particles, 3): one that is exactly flat never buckles where it is pushed."""
+    x = mesh.rest_positions.copy()
+    across, along = (x[:, :2] / max(mesh.size)).T
+    x[:, 2] += RIPPLE * np.sin(9.0 * across + 1.0) * np.cos(7.0 * along + 2.0 * across)
+    return x
+
+
+def gathered(mesh: ClothMesh, share: float, waves: int) -> NDArray:
+    """A sheet in waves along x, on which it is as long as at rest, that take a share of its width [m], (particles, 3)."""
+    width = mesh.size[0]
+    place = np.linspace(0, 1, 2001)
+
+    def along(height: float) -> NDArray:
+        """Length from the edge on, of waves of that height [m]."""
+        slope = height * 2 * np.pi * waves * np.cos(2 * np.pi * waves * place)
+        return np.concatenate([[0], np.cumsum(np.hypot(share * width, 0.5 * (slope[1:] + slope[:-1]))) / 2000])
+
+    heights = np.linspace(0, width / waves, 400)
+    height = heights[np.searchsorted([along(one)[-1] for one in heights], width)]
+    x = rippled(mesh)
+    at = np.interp(x[:, 0] / width + 0.5, along(height) / along(height)[-1], place)
+    x[:, 2] += height * np.sin(2 * np.pi * waves * at)
+    x[:, 0] = share * width * (at - 0.5)
+    return x
+
+
 def pinned_patch() -> Scene:
-    mesh = grid(17, 17, 0.6, 0.6)
+    mesh = grid(33, 33, 0.6, 0.6)
     return Scene(
         name="patch",
         about="A patch of cloth in a breath of air. Pull the gravity slider, and see which threads light up.",
         mesh=mesh,
-        start=mesh.rest_positions + (0, 0, 0.8),
-        settings=Settings(gravity=0.0, wind=BREATH[0], gust=BREATH[1], fabric="knit", air_drag=SWING_DRAG),
+        start=gathered(mesh, PINNED, 2) + (0, 0, 0.8),
+        settings=Settings(gravity=0.0, wind=BREATH[0], gust=BREATH[1], air_drag=SWING_DRAG),
         anchors=mesh.corners[2:],
-        camera=Camera(eye=(0.95, -1.45, 1.2), target=(0.0, 0.0, 0.6)),
-        strained=0.08,
+        camera=Camera(eye=(0.8, -1.3, 1.15), target=(0.0, 0.0, 0.56), vertical_fov=38.0),
         downwind=(0.0, -1.0, 0.0),  # away from the pins
     )
 
 
 def flag() -> Scene:
-    mesh = grid(17, 25, 0.9, 0.6)
+    mesh = grid(33, 49, 0.9, 0.6)
     columns = mesh.grid_shape[1]
     hoist = tuple(range((mesh.grid_shape[0] - 1) * columns, -1, -columns))
     start = hung(mesh, 1.5)
@@ -324,27 +380,27 @@ def flag() -> Scene:
         about="A flag of silk. The wind has a steady part and gusts; turn either down and the flag sinks to the pole.",
         mesh=mesh,
         start=start,
-        settings=Settings(wind=6.0, gust=1.0, fabric="silk"),
+        settings=Settings(wind=6.0, gust=1.5, fabric="silk", self_collision="off"),  # it flutters too fast for real time otherwise
         anchors=(hoist,),
         scenery=(pole,),
-        camera=Camera(eye=(0.35, -2.9, 1.45), target=(0.05, 0.0, 1.0)),
-        strained=0.03,
+        camera=Camera(eye=(1.15, -1.9, 1.5), target=(0.02, 0.05, 1.02)),
     )
 
 
-def sheet_over(name: str, about: str, solid: Sphere | Box | MeshCollider, color: tuple[int, int, int], top: float) -> Scene:
-    """A sheet that falls onto a solid."""
-    mesh = grid(25, 25, 0.9, 0.9)
+def sheet_over(
+    name: str, about: str, solid: Sphere | Box | MeshCollider, color: tuple[int, int, int], top: float, side: int = 41
+) -> Scene:
+    """A sheet of so many particles a side that falls onto a solid."""
+    mesh = grid(side, side, 0.9, 0.9)
     return Scene(
         name=name,
         about=about,
         mesh=mesh,
-        start=mesh.rest_positions + (0.02, 0.03, top + 0.14),
+        start=rippled(mesh) + (0.02, 0.03, top + 0.14),
         settings=Settings(air_drag=0.5),
         colliders=(Plane(), solid),
         colors={1: color},
-        camera=Camera(eye=(1.25, -1.4, 0.95), target=(0.0, 0.0, 0.2)),
-        strained=0.03,
+        camera=Camera(eye=(1.15, -1.3, 0.95), target=(0.0, 0.0, 0.2)),
     )
 
 
@@ -362,18 +418,18 @@ def sheet_over_pawn() -> Scene:
     vertices, triangles = pawn()
     solid = MeshCollider(vertices=vertices, triangles=triangles)
     about = "A sheet falls over a chess pawn, a mesh of triangles."
-    return sheet_over("pawn", about, solid, CLAY, 0.5)
+    return sheet_over("pawn", about, solid, CLAY, 0.5, 33)
 
 
 def cape() -> Scene:
-    mesh = grid(25, 25, 0.72, 0.8)
+    mesh = grid(41, 37, 0.72, 0.8)
     rows, columns = mesh.grid_shape
     top = (rows - 1) * columns
     row, column = np.divmod(np.arange(mesh.num_particles), columns)
     across, down = 2 * column / (columns - 1) - 1, 1 - row / (rows - 1)
     place, facing = walk(0.0)
     # part of a cone around the torso, wider at the hem
-    way, out = facing + np.pi + COLLAR[-1] * across, SHOULDERS + (HEM - SHOULDERS) * down
+    way, out = facing + np.pi + COLLAR[-1] * across, SHOULDERS + (HEM - SHOULDERS) * np.sqrt(down)
     start = place + np.stack([out * np.cos(way), out * np.sin(way), NECK - 0.79 * down], axis=1)
     return Scene(
         name="cape",
@@ -384,18 +440,17 @@ def cape() -> Scene:
         anchors=tuple(np.linspace(top, top + columns - 1, len(COLLAR)).round().astype(int).tolist()),
         colliders=(
             Plane(),
-            Capsule(center=tuple(place + TORSO), radius=0.14, height=1.18),
-            Sphere(center=tuple(place + HEAD), radius=0.105),
+            *(Capsule(center=tuple(at), radius=part[3], height=part[4]) for part, at in zip(FIGURE, figure_at(place, facing))),
+            Sphere(center=tuple(place + (0, 0, HEAD[1])), radius=HEAD[2]),
         ),
-        colors={1: STEEL, 2: (222, 190, 164)},
+        colors=dict.fromkeys(range(1, 6), STEEL) | {6: (222, 190, 164)},
         motion=wear_the_cape,
-        camera=Camera(eye=(-1.0, -3.1, 1.6), target=(0.0, 0.0, 0.66)),
-        strained=0.05,
+        camera=Camera(eye=(-1.0, -2.9, 1.6), target=(0.0, 0.0, 0.68)),
     )
 
 
 def folding() -> Scene:
-    mesh = grid(21, 21, 0.6, 0.6)
+    mesh = grid(33, 33, 0.6, 0.6)
     return Scene(
         name="fold",
         about="Two corners lower a sheet while they sway: it lies down on itself, and never passes through.",
@@ -406,8 +461,7 @@ def folding() -> Scene:
         colliders=(Plane(),),
         motion=lay_down,
         rests=4.4,
-        camera=Camera(eye=(1.15, -1.35, 0.95), target=(0.0, 0.02, 0.24)),
-        strained=0.03,
+        camera=Camera(eye=(0.85, -1.05, 0.75), target=(0.0, 0.02, 0.24)),
     )
 
 

@@ -14,17 +14,18 @@ from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.guards import BURST
 from clothgym.playground import hands
 from clothgym.playground.recording import Frame, Recording
-from clothgym.playground.scenes import FRAME, TITLES, Settings, begin, drive, scene_named
+from clothgym.playground.scenes import FRAME, TITLES, Settings, begin, drive, scene_named, titled
 from clothgym.simulation import Simulation
 from clothgym.wind import Wind
 
 STEPS = 2  # control steps of a scene between two frames
 GUSTS = 3600  # control steps after which the gusts repeat
-KEPT = 1800  # most recent frames that are kept
+KEPT = 900  # most recent frames that are kept: half a minute, 26 MB of a sheet of 49 x 49
 EDGE_OF_VIEW = 9.0  # of each coordinate [m]
-SHREDS = 0.12  # largest displacement at which a sheet that has blown up is drawn [m]: its real position is out of sight
+# how far the shreds of a sheet that has blown up fly [m], in how many frames, and particles along a side of one
+SHREDS, FLYING, SHRED = 0.35, 30, 6
 EXPLICIT = ("explicit_euler", "semi_implicit_euler", "verlet", "rk4")  # beyond their bounds a sheet blows up
-REMEDY = "Take more substeps, a softer fabric or another integrator, and reset."
+REMEDY = "Take more substeps, a softer fabric or another integrator."
 # parts of a state that go on in a new simulation of the same sheet
 CARRIED = (
     "holder", "attachment_positions", "attachment_targets", "openings", "wanted_openings", "colliders", "collider_homes", "steps",
@@ -53,11 +54,11 @@ class Stability(NamedTuple):
 def why_it_burst(name: str, at: Stability) -> str:
     """A sentence on a sheet that has blown up."""
     if at.bound <= 0:
-        return f"**{name}** burst: it has no bound here, {at.why}. {REMEDY}"
+        return f"{name} burst: it has no bound here, {at.why}. {REMEDY}"
     step, bound = f"{1e3 * at.substep:.3g} ms", f"{1e3 * at.bound:.3g} ms"
     if at.substep > at.bound:
-        return f"**{name}** burst: its substep of {step} is beyond its bound of {bound}: {at.why}. {REMEDY}"
-    return f"**{name}** burst, though its substep of {step} is within the bound of {bound} for a sheet at rest. {REMEDY}"
+        return f"{name} burst: its substep of {step} is beyond its bound of {bound}: {at.why}. {REMEDY}"
+    return f"{name} burst, though its substep of {step} is within the bound of {bound} for a sheet at rest. {REMEDY}"
 
 
 def measured(simulation: Simulation, cost: float) -> dict[str, NDArray]:
@@ -85,6 +86,7 @@ class Stage:
         policies: who can act, by name, and policy, who does.
         drops: whether a visitor can let the sheet fall, see ``drop``.
         budget: of computing, for one frame [s].
+        patience: how long the end is shown before it begins again by itself [s].
     """
 
     name: str
@@ -94,6 +96,7 @@ class Stage:
     policies: Any = ()
     policy: str = ""
     drops: bool = False
+    patience: float = 4.0
 
     def __init__(self) -> None:
         self.notes: dict[str, str] = {}
@@ -117,6 +120,10 @@ class Stage:
         """Start again, with that seed or the same."""
         raise NotImplementedError
 
+    def begin_again(self) -> None:
+        """After the end: with the next seed, so that something else happens."""
+        self.reset(self.seed + 1)
+
     def grab(self, place: ArrayLike) -> None:
         """Take hold of the sheet where it is nearest to a position [m], (3,)."""
 
@@ -126,11 +133,11 @@ class Stage:
     def let_go(self) -> None:
         """Release the held cloth, which flies on."""
 
-    def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        """Pin the sheet where a ray from ``origin`` [m] meets it, or take away the pin that is there."""
+    def pin(self, place: ArrayLike) -> None:
+        """Pin the sheet where it is nearest to a position [m], (3,), or take away the pin that is there."""
 
-    def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        """Blow on the sheet along a ray from ``origin`` [m]."""
+    def blow(self, place: ArrayLike, direction: ArrayLike) -> None:
+        """Blow through a position [m] along a direction, (3,) each."""
 
     def drop(self) -> None:
         """Open the grippers of a task."""
@@ -157,7 +164,9 @@ class SceneStage(Stage):
     """
 
     hand: hands.Hand
+    patience = 8.0
     _gusts: NDArray[np.float64]
+    _shreds: list[Frame]
 
     def __init__(self, name: str, settings: Settings | None = None, seed: int = 0) -> None:
         super().__init__()
@@ -166,6 +175,7 @@ class SceneStage(Stage):
         self.settings = scene.settings if settings is None else settings
         self.simulation = self._simulated(self.settings)
         self.recording = Recording(TITLES[name], scene.mesh, STEPS * FRAME, scene.camera, ("sheet",), scene.strained)
+        self.recording.fabric = self.settings.fabric
         self.reset()
 
     def _simulated(self, settings: Settings) -> Simulation:
@@ -177,13 +187,20 @@ class SceneStage(Stage):
         """Since the start [s]."""
         return self.steps * FRAME
 
+    @property
+    def over(self) -> bool:
+        """Whether the sheet has blown up, and its shreds have come to rest."""
+        return "burst" in self.notes and not self._shreds
+
     # --- going on -------------------------------------------------------------------------------------------------------
 
     def advance(self) -> Frame:
         begun, s = time.perf_counter(), self.simulation
+        if "burst" in self.notes:
+            return self._keep(self._shreds.pop()) if self._shreds else self.frame
         for _ in range(STEPS):
             # a frame that takes too long is cut short: then the cloth moves slowly, but the page answers
-            if "burst" in self.notes or time.perf_counter() - begun > self.budget:
+            if time.perf_counter() - begun > self.budget:
                 break
             gust = self.settings.gust * self._gusts[self.steps % len(self._gusts)]
             drive(s, self.scene, self.time, self._dragged)
@@ -198,8 +215,9 @@ class SceneStage(Stage):
             with np.errstate(all="ignore"):
                 strain = s.strain().max()
             if s.diverged[0] or not strain <= BURST:
-                self.notes["burst"] = why_it_burst(s.integrator.name, self.stability())
-                return self._keep(self._shreds())
+                self.notes["burst"] = why_it_burst(titled(s.integrator.name), self.stability())
+                self._shreds = self._torn()
+                return self._keep(self._shreds.pop())
         return self._keep(self._look())
 
     def reset(self, seed: int | None = None) -> None:
@@ -209,23 +227,35 @@ class SceneStage(Stage):
         self._held_anchor: int | None = None  # that the visitor holds by the sheet
         self._breath: tuple[float, NDArray, NDArray] | None = None  # until when, through where and along which way
         self._gusts = Wind(gust=1.0).series(np.random.default_rng(self.seed), GUSTS, FRAME)
+        self._shreds = []  # frames of a sheet that has blown up, the next one last
         self.notes.pop("burst", None)
         begin(self.simulation, self.scene, self.seed or None)
         self.hand = hands.Hand(self.simulation)
         self.recording.frames[:] = [self._look()]
 
+    def begin_again(self) -> None:
+        """With as many substeps as the method needs: the sheet has just blown up."""
+        self.change(substeps="auto")
+        self.reset()
+
     def _look(self) -> Frame:
         s = self.simulation
-        if "burst" in self.notes:
-            return self.frame
         return Frame(self.time, visible(s.positions), tuple(self.scene.solids(s)), measured(s, self.cost))
 
-    def _shreds(self) -> Frame:
-        """The sheet that has just blown up: in shreds, and without readings."""
-        before = self.frame
+    def _torn(self) -> list[Frame]:
+        """The sheet that has just blown up, the last frame first: its shreds fly apart over a second, slower and slower.
+
+        Each is a square of the grid, and flies where its first particle went.
+        """
+        before, (_, columns) = self.frame, self.scene.mesh.grid_shape
+        row, column = np.divmod(np.arange(self.scene.mesh.num_particles), columns)
+        first = row // SHRED * SHRED * columns + column // SHRED * SHRED
         away = np.nan_to_num(self.simulation.positions - before.positions, nan=0.0, posinf=SHREDS, neginf=-SHREDS)
-        x = before.positions + np.clip(away, -SHREDS, SHREDS).astype(np.float32)
-        return Frame(self.time, x, before.solids, {name: np.array([np.nan]) for name in before.readings})
+        scattered = np.random.default_rng(self.seed).uniform(0.1, 1.0, (len(first), 1))[first]
+        away = (scattered * np.clip(away[:, first], -SHREDS, SHREDS)).astype(np.float32)
+        nothing = {name: np.array([np.nan]) for name in before.readings}
+        shares = 1 - (1 - np.arange(1, FLYING + 1, dtype=np.float32) / FLYING) ** 2
+        return [Frame(self.time, before.positions + share * away, before.solids, nothing) for share in shares[::-1]]
 
     # --- settings -------------------------------------------------------------------------------------------------------
 
@@ -239,6 +269,7 @@ class SceneStage(Stage):
         if replace(after, wind=0.0, gust=0.0) != replace(self.settings, wind=0.0, gust=0.0):
             self._carry_over(after)
         self.settings = after
+        self.recording.fabric = after.fabric
 
     def _carry_over(self, after: Settings) -> None:
         old, new = self.simulation.get_state(), self._simulated(after)
@@ -278,10 +309,8 @@ class SceneStage(Stage):
         self._held_anchor = None
         self.hand.let_go(hands.HAND)
 
-    def pin(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        where = self._seen(origin, direction)
-        if where is None:
-            return
+    def pin(self, place: ArrayLike) -> None:
+        where = within_view(vector("place", place))
         particle = hands.nearest(self.frame.positions[0], where)
         anchor = self._anchor_of(particle)
         away = np.linalg.norm(self.hand.goals - where, axis=1)
@@ -305,22 +334,15 @@ class SceneStage(Stage):
         free = np.flatnonzero(~self.hand.held[1:])
         self.hand.take(int(free[0]) + 1 if len(free) else 1, particle)
 
-    def blow(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        where = self._seen(origin, direction)
-        if where is not None:
-            way = vector("direction", direction)
-            self._breath = self.time + hands.BREATH_TIME, where, way / max(float(np.linalg.norm(way)), 1e-9)
+    def blow(self, place: ArrayLike, direction: ArrayLike) -> None:
+        where, way = within_view(vector("place", place)), vector("direction", direction)
+        self._breath = self.time + hands.BREATH_TIME, where, way / max(float(np.linalg.norm(way)), 1e-9)
 
     def held(self) -> NDArray[np.float32]:
         s, goals = self.simulation, self.hand.goals.copy()
         goals[hands.HAND] = s.grippers.positions[0, hands.HAND]
         anchors = s.attachment_positions[0, : len(s.anchors)][s.attached[0]]
         return visible(np.concatenate([anchors, goals[self.hand.held]]))
-
-    def _seen(self, origin: ArrayLike, direction: ArrayLike) -> NDArray | None:
-        """Where a ray first meets the sheet [m], if it does."""
-        start, way = within_view(vector("origin", origin)), vector("direction", direction)
-        return hands.hit(self.frame.positions[0], self.scene.mesh.triangles, start, way)
 
     def _anchor_of(self, particle: int) -> int | None:
         """The scene's anchor that holds a particle."""

@@ -58,9 +58,40 @@ function positionsAt(episode, time, out) {
   return out;
 }
 
-function catmullRom(t) {
-  const t2 = t * t, t3 = t2 * t;
-  return [(-t + 2 * t2 - t3) / 2, (2 - 5 * t2 + 3 * t3) / 2, (t + 4 * t2 - 3 * t3) / 2, (t3 - t2) / 2];
+// What happens: every place of the sheet and of what holds it, called with a point [m] and how far it reaches along each axis.
+function everywhere({ positions, points, solids, shape }, look, markers) {
+  const particles = shape[0] * shape[1], still = [0, 0, 0];
+  const reaches = solids.map(({ axes, half, radius }) => still.map((_, c) => radius + half.reduce((sum, h, a) => sum + h * Math.abs(axes[3 * a + c]), 0)));
+  for (let k = 0; k < positions.length; k += 3) {
+    const solid = (k / 3) % points - particles;
+    if (solid >= 0 && !markers && !solids[solid].holds) continue;
+    look([positions[k], positions[k + 1], positions[k + 2]], solid < 0 ? still : reaches[solid]);
+  }
+}
+
+function boundsOf(episode, markers) {
+  const low = [1e9, 1e9, 0], high = [-1e9, -1e9, 0];
+  everywhere(episode, (point, reach) => {
+    for (let c = 0; c < 3; c++) {
+      low[c] = Math.min(low[c], point[c] - reach[c]);
+      high[c] = Math.max(high[c], point[c] + reach[c]);
+    }
+  }, markers);
+  return { middle: low.map((value, c) => (value + high[c]) / 2), reach: 0.5 * Math.hypot(...minus(high, low)) };
+}
+
+// Half the width and half the height of what happens, as seen by a camera, as shares of its distance.
+function slopesOf(episode, { eye, target }) {
+  const view = lookAt(eye, target, [0, 0, 1]), most = [0, 0];
+  everywhere(episode, (point, reach) => {
+    for (let corner = 0; corner < 8; corner++) {
+      const at = point.map((value, c) => value + ((corner >> c) & 1 ? reach[c] : -reach[c]));
+      const seen = [0, 1, 2].map((c) => view[c] * at[0] + view[4 + c] * at[1] + view[8 + c] * at[2] + view[12 + c]);
+      for (const c of [0, 1]) most[c] = Math.max(most[c], Math.abs(seen[c] / seen[2]));
+      if (reach[0] === 0) break;
+    }
+  }, false);
+  return most.map((slope) => 1.1 * slope);
 }
 
 // The frame that is shown at a time.

@@ -1,11 +1,12 @@
 "use strict";
 // A sheet to play with: it moves by itself, see cloth.js, and is drawn as an episode of a single moment that changes.
 
-const PINNED_AT = 0.125, HELD_UP = 1.25, SWUNG_OUT = 0.12; // of pins from the corners, in sides; height of the upper hem [m], and its start
+const HELD_UP = 1.25, SWUNG_OUT = 0.12; // height of the upper hem [m], and its start
+const GATHERED = 0.26, GATHERS = 1.2; // how much closer the pins come than the sheet is wide, in sides, so that it falls in folds; in which time [s]
+const RIPPLE = 0.004; // of the start: what is flat to the bit folds nowhere [m]
 const DROPPED_FROM = 0.85; // height above the floor [m]
 const WIND = [0, 3.5, 0.4], GUSTS = 2.5; // [m/s], and the time of one [s]
 const HEAVY = 9.81; // [m/s^2]
-const CATCH = 44; // how near a particle a finger takes hold of it, in pixels
 const MOST_STEPS = 3; // in a frame: what is slower than that runs in slow motion
 const SLOW_STEPS = 2; // substeps in a frame of explicit Euler, whose end would be over in one otherwise
 const SHOWN = { hang: [[-0.55, -0.4, 0], [0.55, 0.4, 1.3]], drop: [[-0.45, -0.45, 0], [0.45, 0.45, 0.9]] }; // what the picture has to show [m]
@@ -30,12 +31,12 @@ class Hand {
       // upright and swung out by a little, or flat above the ball
       const across = data.side * ((p % cols) / (cols - 1) - 0.5), along = data.side * (Math.floor(p / cols) / (rows - 1) - 0.5);
       const below = data.side / 2 - along;
-      x.set(ball ? [across, along, DROPPED_FROM] : [across, SWUNG_OUT * below, HELD_UP - below], 3 * p);
+      const ripple = RIPPLE * Math.sin(13 * across + 1) * Math.cos(5 * along);
+      x.set(ball ? [across, along, DROPPED_FROM + ripple] : [across, SWUNG_OUT * below + ripple, HELD_UP - below], 3 * p);
     }
     cloth.place(x);
     if (!ball) {
-      const top = (rows - 1) * cols, inset = Math.round(PINNED_AT * (cols - 1));
-      for (const p of [top + inset, top + cols - 1 - inset]) cloth.pin(p, this.#at(p));
+      for (const p of [(rows - 1) * cols, rows * cols - 1]) cloth.pin(p, this.#at(p));
     }
     this.solids = ball ? [{ kind: "sphere", holds: true, axes: [1, 0, 0, 0, 1, 0, 0, 0, 1], half: [0, 0, 0], radius: ball.radius, color: [176, 176, 180], shown: [0, 1] }] : [];
     // after this moment come the corners of what the picture has to show
@@ -57,6 +58,20 @@ class Hand {
     this[name] = value;
     if (name === "start" || name === "fabric") this.again();
     else this.#switch();
+  }
+
+  // The upper corners come closer, unless somebody has taken them.
+  #gather() {
+    const { pins, rows, cols } = this.cloth, step = (GATHERED * this.time_step) / GATHERS;
+    [(rows - 1) * cols, rows * cols - 1].forEach((p, k) => {
+      if (!pins.has(p) || this.held?.p === p) return;
+      const [x, y, z] = pins.get(p);
+      this.cloth.pin(p, [x + (k ? -0.5 : 0.5) * step, y, z]);
+    });
+  }
+
+  get pins() {
+    return [...this.cloth.pins.keys()].map((p) => this.#at(p));
   }
 
   #at(p) {
@@ -84,6 +99,7 @@ class Hand {
     this.left = Math.min(this.left + seconds, MOST_STEPS * this.time_step);
     for (; this.left >= this.time_step; this.left -= this.time_step) {
       const gust = this.windy ? 0.6 + 0.4 * Math.sin((2 * Math.PI * this.cloth.time) / GUSTS) : 0;
+      if (!this.ball && this.cloth.time < GATHERS) this.#gather();
       this.cloth.wind = WIND.map((value) => value * gust);
       this.cloth.step();
     }
@@ -107,20 +123,17 @@ class Hand {
     return most;
   }
 
-  // Take hold of the particle that is nearest to a place in the picture; size: of the picture in pixels.  Returns whether there is one.
+  // The particle that a finger at a place in the picture would take, see camera.js.
+  near(viewer, place, size) {
+    return caught(viewer, viewer.sheets[0].sheet, (p) => this.#at(p), place, size);
+  }
+
+  // Take hold of it.  Returns whether there is one.
   grab(viewer, place, size) {
-    let nearest = CATCH, caught = -1, front = 2;
-    for (let p = 0; p < this.cloth.n; p++) {
-      const [across, up, depth] = viewer.toPicture(this.#at(p));
-      const away = Math.hypot((across - place[0]) * size[0], (up - place[1]) * size[1]) / 2;
-      // of those right below the finger the one in front
-      if (away < Math.min(nearest, CATCH / 4) || (away < nearest && nearest > CATCH / 4) || (away < CATCH / 4 && depth < front)) {
-        [nearest, caught, front] = [away, p, depth];
-      }
-    }
-    if (caught < 0) return false;
-    this.held = { p: caught, depth: viewer.toPicture(this.#at(caught))[2], pinned: this.cloth.pins.has(caught) };
-    this.cloth.pin(caught, this.#at(caught));
+    const found = this.near(viewer, place, size);
+    if (!found) return false;
+    this.held = { ...found, pinned: this.cloth.pins.has(found.p) };
+    this.cloth.pin(found.p, this.#at(found.p));
     return true;
   }
 

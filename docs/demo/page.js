@@ -2,49 +2,19 @@
 // The page: which episode is shown, at what time, and from where.
 
 const PAUSE_AT_END = 3.5; // before it starts again [s]
-const SLOW = 0.045, COARSEST = 0.6; // a frame that takes longer [s] is drawn with fewer pixels from then on, at least that share
 const ICONS = { play: "M4 2l12 7-12 7z", pause: "M3 2h4v14H3zM11 2h4v14h-4z" };
-const $ = (selector) => document.querySelector(selector);
 const percent = (share) => `${(100 * Math.max(share, 0)).toFixed(1)} %`;
 
-// Where it is seen from: around a target, by angles, and how fast they turn by themselves after a drag.
-class Orbit {
-  // from where the episode's own camera is, but towards the middle of what happens
-  take({ eye, target }, middle) {
-    const [x, y, z] = minus(eye, target);
-    Object.assign(this, { target: middle, distance: Math.hypot(x, y, z), turn: Math.atan2(y, x), speed: [0, 0] });
-    this.rise = Math.asin(z / this.distance);
-    this.nearest = 0.35 * this.distance;
-    this.farthest = 2.5 * this.distance;
-  }
-
-  move(dx, dy) {
-    this.turn -= dx;
-    this.rise = Math.min(Math.max(this.rise + dy, 0.03), 1.5);
-  }
-
-  zoom(factor) {
-    this.distance = Math.min(Math.max(this.distance * factor, this.nearest), this.farthest);
-  }
-
-  coast(seconds) {
-    this.move(this.speed[0] * seconds, this.speed[1] * seconds);
-    this.speed = this.speed.map((value) => value * Math.exp(-5 * seconds));
-  }
-
-  get camera() {
-    const level = this.distance * Math.cos(this.rise);
-    const away = [level * Math.cos(this.turn), level * Math.sin(this.turn), this.distance * Math.sin(this.rise)];
-    return { eye: this.target.map((value, c) => value + away[c]), target: this.target };
-  }
-}
-
-class Page {
+class Page extends Picture {
   constructor() {
-    this.viewer = new Viewer($("#stage"));
-    this.orbit = new Orbit();
-    this.loaded = new Map();
-    Object.assign(this, { time: 0, playing: true, waited: 0, stale: true, before: 0, usual: 0, share: 1 });
+    const hand = (deed) => (...given) => this.episode && this.episode === this.hand && deed(this.hand, ...given);
+    super({
+      grab: hand((one, place) => one.grab(this.viewer, place, this.size)),
+      drag: hand((one, place) => one.held && one.drag(this.viewer, place)),
+      letGo: hand((one) => one.held && one.letGo(one.pinning !== one.held.pinned)),
+      hover: hand((one, place) => one.near(this.viewer, place, this.size)),
+    });
+    Object.assign(this, { time: 0, playing: true, waited: 0, loaded: new Map() });
     const heat = `linear-gradient(90deg, ${HEAT.map((color) => `rgb(${color})`)})`;
     $("#scale").style.background = $("#legend div").style.background = heat;
     for (const { name, title } of [{ name: "hand", title: "Hold a sheet" }, ...EPISODES]) {
@@ -58,11 +28,8 @@ class Page {
     $("#color").onclick = () => this.colorByStrain(!this.viewer.strained);
     $("#scrubber input").oninput = (event) => this.seek(Number(event.target.value) * this.episode.duration);
     addEventListener("keydown", (event) => this.#key(event));
-    addEventListener("resize", () => (this.stale = true));
     addEventListener("hashchange", () => this.open(this.#named()));
-    this.#pointers($("#stage"));
     this.open(this.#named());
-    requestAnimationFrame((now) => this.#tick(now));
   }
 
   #named() {
@@ -73,6 +40,7 @@ class Page {
   async open(name) {
     if (this.name === name) return;
     this.name = name;
+    $("#trouble").style.display = "";
     for (const chip of $(".chips").children) {
       chip.setAttribute("aria-pressed", chip.dataset.name === name);
       if (chip.dataset.name === name) chip.parentNode.scrollLeft = chip.offsetLeft - chip.parentNode.offsetLeft - 40;
@@ -91,16 +59,18 @@ class Page {
   }
 
   #show(episode) {
-    this.episode = episode;
-    this.viewer.show(episode);
-    this.orbit.take(episode.camera, this.viewer.stage);
-    this.slopes = this.viewer.slopes(this.orbit.camera);
+    Object.assign(this, { episode, ready: true });
+    const { middle, reach } = boundsOf(episode, true);
+    this.moment = new Float32Array(3 * episode.points);
+    this.viewer.show(Object.assign(episode, { size: [episode.side, episode.side], middle, reach }));
+    this.orbit.take(episode.camera, boundsOf(episode, false).middle);
+    this.slopes = slopesOf(episode, this.orbit.camera);
     $("#title").textContent = [episode, ...EPISODES].find(({ name }) => name === this.name).title;
     $("#goal").textContent = episode.goal;
     $("#most").textContent = `${100 * episode.strain_shown} %`;
     if (episode === this.hand) {
       this.time = 0;
-      this.viewer.place(0);
+      this.#place();
       this.play(true);
       return;
     }
@@ -129,8 +99,10 @@ class Page {
   #hold(seconds) {
     const { hand } = this;
     hand.advance(seconds);
-    if (hand.burst <= 0) this.viewer.place(0);
-    if (hand.burst <= 0) $("#strain b").textContent = percent(hand.strain);
+    if (hand.burst <= 0) {
+      this.#place();
+      $("#strain b").textContent = percent(hand.strain);
+    }
     for (const button of $("#tools").querySelectorAll("[data-flag]")) button.setAttribute("aria-pressed", hand[button.dataset.flag]);
     $("#verdict").classList.toggle("told", hand.burst > 0);
     if (hand.burst > 0) {
@@ -138,6 +110,15 @@ class Page {
       $("#verdict").innerHTML = "<b>It has burst</b><span>Explicit Euler gains energy in each step. Semi-implicit Euler does not: it begins again.</span>";
     }
     this.stale = true;
+  }
+
+  #place() {
+    const { episode, time, moment } = this, frame = frameAt(episode, time), [rows, cols] = episode.shape;
+    positionsAt(episode, time, moment);
+    episode.solids.forEach((solid, k) => {
+      if (!isShown(solid, frame)) moment[3 * (rows * cols + k)] = NaN;
+    });
+    this.viewer.place(moment, episode.pins ?? []);
   }
 
   play(on) {
@@ -163,7 +144,7 @@ class Page {
   seek(time) {
     this.time = Math.min(Math.max(time, 0), this.episode.duration);
     this.waited = 0;
-    this.viewer.place(this.time);
+    this.#place();
     this.stale = true;
     this.#read();
   }
@@ -188,34 +169,19 @@ class Page {
     verdict.classList.toggle("told", over);
   }
 
-  #tick(now) {
-    const seconds = Math.min((now - this.before) / 1000, 0.1);
-    this.before = now;
-    this.usual += 0.1 * (seconds - this.usual);
-    if (this.usual > SLOW && this.share > COARSEST) Object.assign(this, { usual: 0, share: 0.8 * this.share });
-    if (this.episode && this.episode === this.hand) this.#hold(seconds);
-    else if (this.episode && this.playing) {
+  advance(seconds) {
+    if (this.episode === this.hand) this.#hold(seconds);
+    else if (this.playing) {
       if (this.time < this.episode.duration) this.seek(this.time + seconds);
       else if ((this.waited += seconds) > PAUSE_AT_END) this.seek(0);
     }
-    if (this.episode && !this.held && Math.hypot(...this.orbit.speed) > 1e-3) {
-      this.orbit.coast(seconds);
-      this.stale = true;
-    }
-    if (this.episode && this.stale) this.draw();
-    requestAnimationFrame((then) => this.#tick(then));
   }
 
-  draw() {
-    const stage = $("#stage"), moves = this.playing || this.held;
-    const scale = (moves ? this.share : 1) * Math.min(devicePixelRatio || 1, 2);
-    const [width, height] = [Math.round(stage.clientWidth * scale), Math.round(stage.clientHeight * scale)];
-    if (stage.width !== width || stage.height !== height) Object.assign(stage, { width, height });
-    // the panel covers the lower part, and on a phone the heading the upper one
+  // The panel covers the lower part, and on a phone the heading the upper one.
+  free() {
     const below = 1 - $("#panel").getBoundingClientRect().top / innerHeight;
     const above = innerWidth < 640 ? $("header > p").getBoundingClientRect().bottom / innerHeight : 0.02;
-    this.viewer.draw(this.orbit.camera, this.slopes, [Math.min(below, 0.5), 1 - Math.min(above, 0.3)]);
-    this.stale = false;
+    return [Math.min(below, 0.5), 1 - Math.min(above, 0.3)];
   }
 
   #key(event) {
@@ -228,67 +194,6 @@ class Page {
     } else return;
     event.preventDefault();
   }
-
-  #pointers(stage) {
-    const fingers = new Map(); // by id, where each is
-    const size = () => [stage.clientWidth, stage.clientHeight];
-    const place = (event) => [(2 * event.clientX) / stage.clientWidth - 1, 1 - (2 * event.clientY) / stage.clientHeight];
-    const isLive = () => this.episode && this.episode === this.hand;
-    let holder = null; // the finger that holds the sheet
-    const spread = () => {
-      const [a, b] = [...fingers.values()];
-      return Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
-    };
-    stage.onpointerdown = (event) => {
-      stage.setPointerCapture(event.pointerId);
-      if (isLive() && holder === null && fingers.size === 0 && this.hand.grab(this.viewer, place(event), size())) {
-        holder = event.pointerId;
-        return;
-      }
-      fingers.set(event.pointerId, [event.clientX, event.clientY, event.timeStamp]);
-      this.orbit.speed = [0, 0];
-      this.held = true;
-    };
-    stage.onpointermove = (event) => {
-      if (event.pointerId === holder && this.hand.held) return this.hand.drag(this.viewer, place(event));
-      const before = fingers.get(event.pointerId);
-      if (!before) return;
-      const apart = fingers.size > 1 ? spread() : 0;
-      fingers.set(event.pointerId, [event.clientX, event.clientY, event.timeStamp]);
-      if (apart) this.orbit.zoom(apart / spread());
-      else {
-        const turned = [event.clientX - before[0], event.clientY - before[1]].map((pixels) => (4 * pixels) / Math.min(innerWidth, innerHeight));
-        const passed = Math.max(event.timeStamp - before[2], 1) / 1000;
-        this.orbit.move(...turned);
-        this.orbit.speed = turned.map((angle) => Math.min(Math.max(angle / passed, -4), 4));
-      }
-      this.stale = true;
-    };
-    stage.onpointerup = stage.onpointercancel = (event) => {
-      if (event.pointerId === holder) {
-        holder = null;
-        if (this.hand.held) this.hand.letGo(this.hand.pinning !== this.hand.held.pinned);
-        return;
-      }
-      const before = fingers.get(event.pointerId);
-      fingers.delete(event.pointerId);
-      this.held = fingers.size > 0;
-      this.stale = true;
-      // a finger that rested before it was lifted throws nothing
-      if (before && event.timeStamp - before[2] > 60) this.orbit.speed = [0, 0];
-    };
-    stage.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.orbit.zoom(Math.exp(0.001 * event.deltaY));
-      this.stale = true;
-    }, { passive: false });
-  }
-}
-
-function trouble(error) {
-  $("#trouble").textContent = error.message;
-  $("#trouble").style.display = "grid";
-  console.error(error);
 }
 
 let page;

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 import clothgym
 from clothgym.mesh import ClothMesh
+from clothgym.playground.show import solid_of
 from clothgym.registration import ENVIRONMENTS
 from clothgym.render import Drawn
 from clothgym.render.solids import drawn
@@ -178,18 +179,8 @@ def tracks(things: list[list[tuple[Drawn, bool]]]) -> tuple[list[dict[str, Any]]
         centers[:, k] = there[np.clip(np.searchsorted(frames, np.arange(len(things)), "right") - 1, 0, None)]
         ends = np.flatnonzero(np.diff(frames) > 1)
         first, last = frames[np.r_[0, ends + 1]], frames[np.r_[ends, len(frames) - 1]]
-        axes, half, radius = thing.rounded_box()
-        solids.append(
-            {
-                "kind": thing.kind,
-                "holds": holds,
-                "axes": np.round(axes, 6).ravel().tolist(),
-                "half": np.round(half, 5).tolist(),
-                "radius": round(radius, 5),
-                "color": thing.color,
-                "shown": np.stack([first, last + 1], axis=1).ravel().tolist(),
-            }
-        )
+        shown = np.stack([first, last + 1], axis=1).ravel().tolist()
+        solids.append(solid_of(thing) | {"holds": holds, "shown": shown})
     return solids, centers
 
 

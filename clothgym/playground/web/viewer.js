@@ -1,10 +1,11 @@
 "use strict";
-// A small WebGL 2 viewer: one sheet, solids, a floor, a lamp.
+// A small WebGL 2 viewer: sheets, solids, a floor, a lamp.
 
 const SHADOW_SIZE = 2048, TOPS_SIZE = 512;
 const SEEN_FROM = { nearest: 0.05, farthest: 60 };
+const PIN_RADIUS = 0.009; // of a ball that stands for a held point [m]
 const COLORS = {
-  front: [206, 64, 50], back: [54, 68, 132], cream: [247, 228, 206],
+  front: [206, 64, 50], back: [54, 68, 132], cream: [247, 228, 206], pin: [43, 45, 66],
   FLOOR: [226, 222, 214], LINE: [205, 200, 191], HORIZON: [240, 238, 234], ZENITH: [222, 227, 232],
 };
 // magma by van der Walt and Smith (2015, CC0), from light to dark without its ends
@@ -12,14 +13,16 @@ const HEAT = [
   [252, 240, 178], [254, 211, 149], [254, 182, 124], [253, 152, 105], [249, 121, 93], [239, 93, 94], [220, 72, 105],
   [196, 60, 117], [170, 51, 125], [144, 42, 129], [118, 33, 129], [93, 23, 127], [68, 15, 118],
 ];
+// of threads that light up in the fabric's own colors
+const FIRE = [[255, 206, 92], [255, 122, 40], [232, 20, 56]];
 
 const linear = (color) => color.map((c) => (c / 255 <= 0.04045 ? c / 255 / 12.92 : ((c / 255 + 0.055) / 1.055) ** 2.4));
 
 class Viewer {
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
-    if (!gl) throw new Error("This browser has no WebGL 2, which the demo draws with.");
-    Object.assign(this, { canvas, gl, solids: [], strained: false });
+    if (!gl) throw new Error("This browser has no WebGL 2, which this page draws with.");
+    Object.assign(this, { canvas, gl, sheets: [], solids: [], held: [], strained: false });
     this.shadowing = program(gl, SHADOW_VERTEX, SHADOW_FRAGMENT);
     this.studio = program(gl, STUDIO_VERTEX, STUDIO_FRAGMENT);
     this.surface = program(gl, SURFACE_VERTEX, SURFACE_FRAGMENT);
@@ -32,69 +35,46 @@ class Viewer {
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
     ]) gl.samplerParameteri(this.comparing, name, value);
     this.corners = buffers(gl, [[new Float32Array([-1, -1, 3, -1, -1, 3]), 2]]);
-    this.sheetParts = null;
+    this.pin = this.#made(solidMesh({ kind: "sphere", axes: [1, 0, 0, 0, 1, 0, 0, 0, 1], half: [0, 0, 0], radius: PIN_RADIUS }, 5));
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
   }
 
-  // Take up an episode; what is drawn follows with place().
-  show(episode) {
+  #made({ positions, normals, triangles }) {
+    return buffers(this.gl, [[positions, 3], [normals, 3]], triangles);
+  }
+
+  // Take up a scene: how many sheets, their mesh (see Sheet), the camera [m], the middle and half the width of what can move [m], and
+  // the strain at which the colors of heat end.  What is drawn follows with place().
+  show(scene) {
     const gl = this.gl;
-    this.solids.forEach(({ parts }) => discard(gl, parts));
-    if (this.sheetParts) discard(gl, this.sheetParts);
-    this.episode = episode;
-    this.sheet = new Sheet(episode);
-    const { positions, normals, uv, strain, triangles } = this.sheet;
-    this.sheetParts = buffers(gl, [[positions, 3], [normals, 3], [uv, 2], [strain, 1]], triangles);
-    this.solids = episode.solids.map((solid) => {
-      const mesh = solidMesh(solid, solid.radius > 0 && solid.radius < 0.03 ? 6 : 12);
-      return { solid, parts: buffers(gl, [[mesh.positions, 3], [mesh.normals, 3]], mesh.triangles), center: [0, 0, 0], there: false };
+    for (const { parts } of [...this.sheets, ...this.solids]) discard(gl, parts);
+    this.scene = scene;
+    this.sheets = Array.from({ length: scene.sheets ?? 1 }, () => {
+      const sheet = new Sheet(scene), { positions, normals, uv, strain, triangles } = sheet;
+      return { sheet, parts: buffers(gl, [[positions, 3], [normals, 3], [uv, 2], [strain, 1]], triangles) };
     });
-    this.moment = new Float32Array(3 * episode.points);
+    this.solids = [];
+    scene.solids.forEach((solid) => this.add(solid));
+    this.wear(scene.look ?? {});
     this.#light();
   }
 
-  // What happens: every place of the sheet and of what holds it, called with a point [m] and how far it reaches along each axis.
-  #everywhere(look, markers) {
-    const { positions, points, solids, shape } = this.episode, particles = shape[0] * shape[1], still = [0, 0, 0];
-    const reaches = solids.map(({ axes, half, radius }) => still.map((_, c) => radius + half.reduce((sum, h, a) => sum + h * Math.abs(axes[3 * a + c]), 0)));
-    for (let k = 0; k < positions.length; k += 3) {
-      const solid = (k / 3) % points - particles;
-      if (solid >= 0 && !markers && !solids[solid].holds) continue;
-      look([positions[k], positions[k + 1], positions[k + 2]], solid < 0 ? still : reaches[solid]);
-    }
+  // One more solid: a box swept by a ball (axes, a row each, half sides and radius [m]), or a mesh of its own; see solidMesh().
+  add(solid) {
+    const mesh = solid.positions ? flatMesh(solid) : solidMesh(solid, solid.radius > 0 && solid.radius < 0.03 ? 6 : 12);
+    this.solids.push({ solid, parts: this.#made(mesh), center: [0, 0, 0], there: false });
   }
 
-  #bounds(markers) {
-    const low = [1e9, 1e9, 0], high = [-1e9, -1e9, 0];
-    this.#everywhere((point, reach) => {
-      for (let c = 0; c < 3; c++) {
-        low[c] = Math.min(low[c], point[c] - reach[c]);
-        high[c] = Math.max(high[c], point[c] + reach[c]);
-      }
-    }, markers);
-    return { middle: low.map((value, c) => (value + high[c]) / 2), reach: 0.5 * Math.hypot(...minus(high, low)) };
+  // Colors of both sides of the fabric, and the width of a stripe of its gingham [m].
+  wear({ front = COLORS.front, back = COLORS.back, check = Math.max(...this.scene.size) / 12 }) {
+    this.look = { front: linear(front), back: linear(back), check };
   }
 
-  // Half the width and half the height of what happens, as seen by a camera, as shares of its distance.
-  slopes({ eye, target }) {
-    const view = lookAt(eye, target, [0, 0, 1]), most = [0, 0];
-    this.#everywhere((point, reach) => {
-      for (let corner = 0; corner < 8; corner++) {
-        const at = point.map((value, c) => value + ((corner >> c) & 1 ? reach[c] : -reach[c]));
-        const seen = [0, 1, 2].map((c) => view[c] * at[0] + view[4 + c] * at[1] + view[8 + c] * at[2] + view[12 + c]);
-        for (const c of [0, 1]) most[c] = Math.max(most[c], Math.abs(seen[c] / seen[2]));
-        if (reach[0] === 0) break;
-      }
-    }, false);
-    return most.map((slope) => 1.1 * slope);
-  }
-
-  // The lamp is high behind the left shoulder of the episode's own camera, and shines on all that ever moves.
+  // The lamp is high behind the left shoulder of the scene's own camera, and shines on all that ever moves.
   #light() {
-    const { camera } = this.episode;
-    this.stage = this.#bounds(false).middle;
-    Object.assign(this, this.#bounds(true));
+    const { camera, middle, reach } = this.scene;
+    Object.assign(this, { middle, reach });
     const forward = unit(minus(camera.target, camera.eye)), right = unit(cross(forward, [0, 0, 1])), away = cross(right, [0, 0, 1]);
     const backward = dot(away, forward) > 0 ? away.map((value) => -value) : away;
     this.lamp = unit([0, 1, 2].map((c) => 0.3 * backward[c] - 0.62 * right[c] + (c === 2 ? 1 : 0)));
@@ -104,22 +84,28 @@ class Viewer {
     this.fromSky = box([0, 0, 1], [0, 1, 0]);
   }
 
-  // Put everything where it is at a time [s].
-  place(time) {
-    const { episode, sheet, gl, moment } = this, particles = episode.shape[0] * episode.shape[1];
-    positionsAt(episode, time, moment);
-    this.solids.forEach((thing, k) => {
-      thing.center = Array.from(moment.subarray(3 * (particles + k), 3 * (particles + k) + 3));
-      thing.there = isShown(thing.solid, frameAt(episode, time));
+  // Put everything where it is [m]: the particles of all sheets, and after them the centers of the solids, not a number for one that
+  // is not there; held: points of the sheets.
+  place(x, held = []) {
+    const { gl, sheets } = this;
+    let k = 3 * sheets.reduce((sum, { sheet }) => sum + sheet.particles, 0);
+    for (const thing of this.solids) {
+      thing.there = x[k] === x[k];
+      if (thing.there) thing.center = Array.from(x.subarray(k, k + 3));
+      k += 3;
+    }
+    const resting = this.solids.filter(({ solid, there }) => solid.holds && there);
+    sheets.forEach(({ sheet, parts }, number) => {
+      sheet.place(x.subarray(3 * sheet.particles * number, 3 * sheet.particles * (number + 1)), resting);
+      [sheet.positions, sheet.normals, null, sheet.strain].forEach((numbers, k) => {
+        if (!numbers) return;
+        gl.bindBuffer(gl.ARRAY_BUFFER, parts.made[k]);
+        gl.bufferSubData(gl.ARRAY_BUFFER, 0, numbers);
+      });
     });
-    sheet.place(moment, this.solids.filter(({ solid, there }) => solid.holds && there));
+    this.held = held;
     this.lampBox = this.#box(this.fromLamp);
     this.skyBox = this.#box(this.fromSky);
-    [sheet.positions, sheet.normals, null, sheet.strain].forEach((numbers, k) => {
-      if (!numbers) return;
-      gl.bindBuffer(gl.ARRAY_BUFFER, this.sheetParts.made[k]);
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, numbers);
-    });
   }
 
   // What a map shows, from its lowest to its highest corner, in shares of its width.
@@ -132,16 +118,17 @@ class Viewer {
         box[2 + c] = Math.max(box[2 + c], place + wide);
       }
     };
-    const x = this.sheet.positions;
-    for (let v = 0; v < x.length; v += 3) take(x[v], x[v + 1], x[v + 2], 0);
+    for (const { sheet: { positions: x } } of this.sheets) {
+      for (let v = 0; v < x.length; v += 3) take(x[v], x[v + 1], x[v + 2], 0);
+    }
     for (const { solid, center, there } of this.solids) {
-      if (there) take(...center, (Math.hypot(...solid.half) + solid.radius) / (2 * this.reach));
+      if (there) take(...center, (Math.hypot(...solid.half) + (solid.radius ?? 0)) / (2 * this.reach));
     }
     return box;
   }
 
-  // camera: eye and target [m]; slopes: what has to be in sight, see slopes(); free: where, from the lower to the upper edge of the
-  // part of the picture that nothing covers, as shares of its height.
+  // camera: eye and target [m]; slopes: half the width and height of what has to be in sight, as shares of its distance; free: where,
+  // the lower, upper, left and right edge of the part of the picture that nothing covers, as shares of its height and width.
   draw(camera, slopes, free) {
     const { gl, canvas } = this, { toScreen, toWorld } = Object.assign(this, this.#seen(camera, slopes, free));
     gl.enable(gl.POLYGON_OFFSET_FILL);
@@ -161,25 +148,29 @@ class Viewer {
       shadow: 0, blockers: 1, tops: 2, fromLamp: this.fromLamp, fromSky: this.fromSky, lamp: this.lamp, reach: this.reach, lampBox: this.lampBox,
       skyBox: this.skyBox, eye: camera.eye,
     };
-    const { front, back, cream, FLOOR, LINE, HORIZON, ZENITH } = Object.fromEntries(
-      Object.entries(COLORS).map(([name, color]) => [name, linear(color)]));
+    const { cream, FLOOR, LINE, HORIZON, ZENITH } = Object.fromEntries(Object.entries(COLORS).map(([name, color]) => [name, linear(color)]));
     gl.depthMask(false);
     use(gl, this.studio, { ...common, toWorld, middle: this.middle, FLOOR, LINE, HORIZON, ZENITH });
     render(gl, this.corners);
     gl.depthMask(true);
-    const shown = this.strained ? this.episode.strain_shown : 0, zero = [0, 0, 0];
+    const zero = [0, 0, 0];
     use(gl, this.surface, {
-      ...common, toScreen, offset: zero, fabric: 1, front, back, cream, base: zero, side: this.episode.side, shown, heat: HEAT.flatMap(linear),
+      ...common, ...this.look, toScreen, offset: zero, fabric: 1, cream, base: zero, size: this.scene.size, shown: this.scene.strain_shown,
+      heated: this.strained, heat: HEAT.flatMap(linear), fire: FIRE.flatMap(linear),
     });
     // cloth that lies on something is drawn above it
     gl.enable(gl.POLYGON_OFFSET_FILL);
     gl.polygonOffset(-1, -2);
-    render(gl, this.sheetParts);
+    for (const { parts } of this.sheets) render(gl, parts);
     gl.disable(gl.POLYGON_OFFSET_FILL);
     for (const { solid, parts, center, there } of this.solids) {
       if (!there) continue;
       use(gl, this.surface, { offset: center, fabric: 0, base: linear(solid.color) });
       render(gl, parts);
+    }
+    for (const point of this.held) {
+      use(gl, this.surface, { offset: point, fabric: 0, base: linear(COLORS.pin) });
+      render(gl, this.pin);
     }
   }
 
@@ -189,7 +180,7 @@ class Viewer {
     gl.viewport(0, 0, map.size, map.size);
     gl.clear(gl.DEPTH_BUFFER_BIT);
     use(gl, this.shadowing, { fromLamp, offset: [0, 0, 0] });
-    render(gl, this.sheetParts);
+    for (const { parts } of this.sheets) render(gl, parts);
     for (const { parts, center, there } of this.solids) {
       if (!there) continue;
       use(gl, this.shadowing, { offset: center });
@@ -206,12 +197,11 @@ class Viewer {
     return through(this.toWorld, place);
   }
 
-  #seen({ eye, target }, [wide, high], [bottom, top]) {
-    const aspect = this.canvas.width / this.canvas.height, tall = top - bottom;
-    const slope = Math.max(high / tall, wide / aspect);
-    const shift = bottom + top - 1; // of the middle
+  #seen({ eye, target }, [wide, high], [bottom, top, left = 0, right = 1]) {
+    const aspect = this.canvas.width / this.canvas.height, slope = Math.max(high / (top - bottom), wide / (aspect * (right - left)));
+    const [aside, shift] = [left + right - 1, bottom + top - 1]; // of the middle
     const { nearest: n, farthest: f } = SEEN_FROM;
-    const lens = [1 / (slope * aspect), 0, 0, 0, 0, 1 / slope, 0, 0, 0, -shift, -(f + n) / (f - n), -1, 0, 0, (-2 * f * n) / (f - n), 0];
+    const lens = [1 / (slope * aspect), 0, 0, 0, 0, 1 / slope, 0, 0, -aside, -shift, -(f + n) / (f - n), -1, 0, 0, (-2 * f * n) / (f - n), 0];
     const toScreen = multiply(lens, lookAt(eye, target, [0, 0, 1]));
     return { toScreen, toWorld: inverse(toScreen) };
   }
@@ -246,6 +236,7 @@ function use(gl, { made, uniforms }, values) {
     if (uniform.type === gl.FLOAT_MAT4) gl.uniformMatrix4fv(uniform.place, false, value);
     else if (uniform.type === gl.FLOAT_VEC4) gl.uniform4fv(uniform.place, value);
     else if (uniform.type === gl.FLOAT_VEC3) gl.uniform3fv(uniform.place, value);
+    else if (uniform.type === gl.FLOAT_VEC2) gl.uniform2fv(uniform.place, value);
     else if (uniform.type === gl.FLOAT) gl.uniform1f(uniform.place, value);
     else gl.uniform1i(uniform.place, value);
   }

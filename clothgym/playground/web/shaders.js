@@ -137,16 +137,18 @@ void main() {
 
 const SURFACE_FRAGMENT = LIGHT + `
 uniform vec3 eye, base, front, back, cream;
-uniform float side, shown;     // of the sheet [m]; strain at which the colors end, 0 for those of the fabric
-uniform vec3 heat[13];
-uniform bool fabric;
+uniform vec2 size;            // of the sheet [m]
+uniform float check, shown;   // width of a stripe [m]; strain at which the colors end
+uniform vec3 heat[13], fire[3];
+uniform bool fabric, heated;  // whether strain is all that is colored
 in vec3 point, turned;
 in vec2 cloth;
 in float stretched;
 
-const float YARNS = 20.0;
+const float TORN = 1.5; // strain of cloth that is not there any more
+const float YARNS = 20.0, COARSEST = 0.0024;  // yarns in a stripe, and width of one at most [m]
 
-vec3 heated(float share) {
+vec3 hot(float share) {
   float place = 12.0 * clamp(share, 0.0, 1.0);
   int k = min(int(place), 11);
   return mix(heat[k], heat[k + 1], place - float(k));
@@ -154,12 +156,12 @@ vec3 heated(float share) {
 
 // Gingham as it is woven: stripes of warp cross stripes of weft, and close up yarns lie over and under each other.
 vec3 woven(vec3 dye, out float over) {
-  float check = side / 12.0, width = max(max(fwidth(cloth.x), fwidth(cloth.y)) / check, 1e-5), fine = YARNS * width;
-  vec2 q = cloth / check;
+  float seen = max(fwidth(cloth.x), fwidth(cloth.y)), width = max(seen / check, 1e-5), thread = min(check / YARNS, COARSEST), fine = seen / thread;
+  vec2 q = cloth / check, fibers = cloth / thread;
   float warp = stripes(q.x, width), weft = stripes(q.y, width);
   over = 0.5;
   if (fine < 2.0) {
-    over += (1.0 - smoothstep(1.0, 2.0, fine)) * 1.4 * (stripes(q.x * YARNS, fine) - 0.5) * (stripes(q.y * YARNS, fine) - 0.5);
+    over += (1.0 - smoothstep(1.0, 2.0, fine)) * 1.4 * (stripes(fibers.x, max(fine, 1e-4)) - 0.5) * (stripes(fibers.y, max(fine, 1e-4)) - 0.5);
   }
   vec3 yarn = mix(dye, mix(dye, cream, 0.6), mix(weft, warp, over));
   return yarn * (1.0 + 0.16 * (over - 0.5));
@@ -167,16 +169,23 @@ vec3 woven(vec3 dye, out float over) {
 
 // The hem: cloth turned over and sewn with a line of stitches.
 vec3 hemmed(vec3 yarn, float border) {
-  float wide = max(fwidth(border), 1e-5), hem = 0.018 * side, thread = 0.0022 * side;
+  float side = max(size.x, size.y), wide = max(fwidth(border), 1e-5), hem = 0.018 * side, thread = 0.0022 * side;
   float folded = smoothstep(hem + wide, hem - wide, border), seam = smoothstep(thread + wide, 0.0, abs(border - hem));
   yarn *= 1.0 - 0.10 * folded - 0.18 * seam;
-  float along = abs(cloth.x - 0.5 * side) > abs(cloth.y - 0.5 * side) ? cloth.y : cloth.x;
+  float along = min(cloth.x, size.x - cloth.x) < min(cloth.y, size.y - cloth.y) ? cloth.y : cloth.x;
   float stitch = smoothstep(0.30, 0.36, abs(fract(along / (0.02 * side)) - 0.5));
   float sewn = smoothstep(thread + wide, 0.4 * thread, abs(border - 0.72 * hem)) * (1.0 - stitch);
   return mix(yarn, cream, 0.55 * sewn * clamp(1.5 * thread / wide, 0.0, 1.0));
 }
 
+// Threads from a quarter of the scale on light up, those that cross only as far as they are seen.
+vec3 alight(vec3 own, float share, float over) {
+  vec3 glow = share < 0.5 ? mix(fire[0], fire[1], clamp(4.0 * share - 1.0, 0.0, 1.0)) : mix(fire[1], fire[2], clamp(2.0 * share - 1.0, 0.0, 1.0));
+  return mix(own, glow, smoothstep(0.2, 0.6, share) * (0.72 + 0.36 * (over - 0.5)));
+}
+
 void main() {
+  if (fabric ? stretched > TORN : point.z < 0.0) discard;  // what is under the floor is not seen
   vec3 toEye = normalize(eye - point), normal = normalize(turned);
   if (!gl_FrontFacing) normal = -normal;
   float facing = clamp(dot(normal, toEye), 0.0, 1.0), toLamp = dot(normal, lamp);
@@ -186,9 +195,9 @@ void main() {
   float sky = 0.5 + 0.5 * normal.z, taken = roofed(point + 0.006 * normal, 0.14), gloss = 0.0;
   vec3 own = base, rim = vec3(0.35 * pow(1.0 - facing, 3.0));
   if (fabric) {
-    float over = 0.5, border = min(min(cloth.x, side - cloth.x), min(cloth.y, side - cloth.y));
+    float over = 0.5, border = min(min(cloth.x, size.x - cloth.x), min(cloth.y, size.y - cloth.y));
     own = hemmed(woven(gl_FrontFacing ? front : back, over), border);
-    if (shown > 0.0) own = heated(stretched / shown) * (0.97 + 0.06 * over);
+    own = heated ? hot(stretched / shown) * (0.97 + 0.06 * over) : alight(own, stretched / shown, over);
     direct += 0.30 * max(-toLamp, 0.0) * glow;
   } else {
     vec3 halfway = normalize(lamp + toEye);

@@ -4,41 +4,55 @@
 const REFINED = 4, COARSELY = 2, FINE_SHEET = 25; // drawn cells along the side of a cell, and of one of a sheet with more particles a side
 const LIFT = 0.004, DEEPEST = 0.03; // cloth that deep in a solid is drawn above it, at that height [m]
 
-// A grid of particles, drawn as a bicubic surface; its corners go on straight beyond the border.
+// A sheet of a scene.  A grid (shape: rows and columns, size [m], holes: cells without cloth) is drawn as a bicubic surface through its
+// particles, whose corners go on straight beyond the border; any other mesh (triangles, uv [m]) by its own triangles.
 class Sheet {
-  constructor(episode) {
-    const [rows, cols] = episode.shape, refined = rows > FINE_SHEET ? COARSELY : REFINED;
-    Object.assign(this, { episode, rows, cols, refined, fineRows: (rows - 1) * refined + 1, fineCols: (cols - 1) * refined + 1 });
+  constructor({ shape, size, holes = [], triangles, uv }) {
+    const [rows, cols] = shape ?? [uv.length / 2, 1], refined = !shape ? 1 : rows > FINE_SHEET ? COARSELY : REFINED;
+    Object.assign(this, { grid: Boolean(shape), rows, cols, refined, particles: rows * cols });
+    Object.assign(this, { fineRows: (rows - 1) * refined + 1, fineCols: (cols - 1) * refined + 1, holes: new Set(holes) });
     const count = this.fineRows * this.fineCols;
     this.positions = new Float32Array(3 * count);
     this.normals = new Float32Array(3 * count);
     this.strain = new Float32Array(count);
+    this.own = new Float32Array(rows * cols);
+    if (!shape) {
+      Object.assign(this, { uv: new Float32Array(uv), triangles: new Uint32Array(triangles), springs: this.#edges(triangles, uv), cells: triangles });
+      return;
+    }
     this.uv = new Float32Array(2 * count); // from the corner [m]
     this.between = new Float32Array(4 * rows * this.fineCols);
-    this.own = new Float32Array(rows * cols);
-    const spacing = [episode.side / (cols - 1), episode.side / (rows - 1)];
+    const spacing = [size[0] / (cols - 1), size[1] / (rows - 1)];
     for (let row = 0, v = 0; row < this.fineRows; row++) {
       for (let col = 0; col < this.fineCols; col++, v++) {
         this.uv[2 * v] = (col / refined) * spacing[0];
         this.uv[2 * v + 1] = (row / refined) * spacing[1];
       }
     }
-    this.holes = new Set(episode.holes);
-    this.triangles = this.#triangles();
+    this.triangles = this.#triangles(refined);
+    this.cells = this.#triangles(1); // between particles
     this.springs = this.#springs(spacing);
     this.weights = Array.from({ length: refined }, (_, k) => catmullRom(k / refined));
   }
 
-  #triangles() {
-    const triangles = [];
-    for (let row = 0; row < this.fineRows - 1; row++) {
-      for (let col = 0; col < this.fineCols - 1; col++) {
-        if (this.holes.has(Math.floor(row / this.refined) * (this.cols - 1) + Math.floor(col / this.refined))) continue;
-        const a = row * this.fineCols + col, c = a + this.fineCols;
+  #triangles(refined) {
+    const triangles = [], wide = (this.cols - 1) * refined + 1;
+    for (let row = 0; row < (this.rows - 1) * refined; row++) {
+      for (let col = 0; col < wide - 1; col++) {
+        if (this.holes.has(Math.floor(row / refined) * (this.cols - 1) + Math.floor(col / refined))) continue;
+        const a = row * wide + col, c = a + wide;
         triangles.push(a, a + 1, c + 1, a, c + 1, c);
       }
     }
     return new Uint32Array(triangles);
+  }
+
+  // Edges of triangles, and their length at rest [m].
+  #edges(triangles, uv) {
+    return triangles.map((i, k) => {
+      const j = triangles[k % 3 < 2 ? k + 1 : k - 2];
+      return [i, j, Math.hypot(uv[2 * i] - uv[2 * j], uv[2 * i + 1] - uv[2 * j + 1])];
+    });
   }
 
   // Yarns: neighbors in a row or a column, but for those inside a hole, and their length at rest [m].
@@ -56,10 +70,21 @@ class Sheet {
     return springs;
   }
 
-  // x: positions of all points of the episode [m]; solids: those that the cloth rests on, with their centers.
+  // x: positions of the particles [m]; solids: those that the cloth rests on, with their centers.
   place(x, solids) {
-    const { rows, cols, refined, fineRows, fineCols } = this;
     this.#measure(x);
+    if (this.grid) this.#refine(x);
+    else {
+      this.positions.set(x);
+      this.strain.set(this.own);
+    }
+    for (const { solid, center } of solids) this.#pushOut(solid, center);
+    if (this.grid) this.#turn();
+    else turnTriangles(this.positions, this.triangles, this.normals);
+  }
+
+  #refine(x) {
+    const { rows, cols, refined, fineRows, fineCols } = this;
     // along the rows, then along the columns; the fourth number is the strain
     const coarse = (row, col, c) => (c < 3 ? x[3 * (row * cols + col) + c] : this.own[row * cols + col]);
     const beyond = (k, n, at) => (k < 0 ? 2 * at(0) - at(1) : k >= n ? 2 * at(n - 1) - at(n - 2) : at(k));
@@ -87,8 +112,6 @@ class Sheet {
         }
       }
     }
-    for (const { solid, center } of solids) this.#pushOut(solid, center);
-    this.#turn();
   }
 
   // The largest strain of the yarns that meet at each particle.
@@ -144,6 +167,33 @@ class Sheet {
       }
     }
   }
+}
+
+// Normals of vertices, as the triangles around each add up.
+function turnTriangles(x, triangles, normals) {
+  normals.fill(0);
+  for (let t = 0; t < triangles.length; t += 3) {
+    const [i, j, k] = [3 * triangles[t], 3 * triangles[t + 1], 3 * triangles[t + 2]];
+    const ux = x[j] - x[i], uy = x[j + 1] - x[i + 1], uz = x[j + 2] - x[i + 2];
+    const vx = x[k] - x[i], vy = x[k + 1] - x[i + 1], vz = x[k + 2] - x[i + 2];
+    const nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx;
+    for (const v of [i, j, k]) {
+      normals[v] += nx;
+      normals[v + 1] += ny;
+      normals[v + 2] += nz;
+    }
+  }
+}
+
+// A solid that comes as a mesh.
+function flatMesh({ positions, normals, triangles }) {
+  return { positions: new Float32Array(positions), normals: new Float32Array(normals), triangles: new Uint32Array(triangles) };
+}
+
+// Weights of four points in a row for a place between the middle two, 0 to 1 (Catmull and Rom 1974).
+function catmullRom(t) {
+  const t2 = t * t, t3 = t2 * t;
+  return [(-t + 2 * t2 - t3) / 2, (2 - 5 * t2 + 3 * t3) / 2, (t + 4 * t2 - 3 * t3) / 2, (t3 - t2) / 2];
 }
 
 const EDGE = 0.008; // radius to which edges of a box are rounded [m]
