@@ -36,12 +36,12 @@ HELD_OUT = 1_000_000  # the first seed that no policy has seen
 QUANTUM = 5e-5  # of a position [m]; int16 reaches 1.6 m to each side of the middle
 LARGEST, LARGEST_TOGETHER = 300_000, 3_000_000  # bytes of a file, and of all
 LEARNERS = {
-    "bc": "clone of the expert",
-    "bc_ppo": "clone of the expert, then PPO",
+    "bc": "behavior cloning",
+    "bc_ppo": "behavior cloning, then PPO",
     "ppo": "PPO",
     "ppo_lagrange": "PPO, Lagrange multiplier",
     "sac": "SAC, started with expert episodes",
-    "sac_scratch": "SAC",
+    "sac_scratch": "SAC, from scratch",
 }
 
 
