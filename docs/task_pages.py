@@ -24,9 +24,9 @@ from clothgym.registration import ENVIRONMENTS
 
 HERE = Path(__file__).parent
 FILMS = {
-    "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif", "ClothHang-v0": "hang.png",
-    "ClothHang-Hard-v0": "hang.gif", "ClothFling-v0": "fling.gif", "ClothFling-Hard-v0": "fling.png",
-    "ClothHook-v0": "hook.png", "ClothHook-Hard-v0": "hook.gif",
+    "ClothFlatten-v0": "flatten.gif", "ClothFlatten-Hard-v0": "flatten.png", "ClothFold-v0": "fold.gif",
+    "ClothFoldShirt-v0": "fold_shirt.gif", "ClothHang-v0": "hang.png", "ClothHang-Hard-v0": "hang.gif",
+    "ClothFling-v0": "fling.gif", "ClothFling-Hard-v0": "fling.png", "ClothHook-v0": "hook.png", "ClothHook-Hard-v0": "hook.gif",
 }  # fmt: skip
 ROOT, PAGES = HERE.parent, HERE / "tasks"
 RESULTS = ROOT / "benchmarks" / "results" / "suite.json"

@@ -100,7 +100,7 @@ class FoldShirtTask(FoldingTask):
         fast={"air_density": 0.0},
     )  # fmt: skip
     kernels = FoldingTask.kernels._replace(evaluate=_evaluate)
-    acting_steps = 80
+    acting_steps = 70
     settling_steps = 40
     picks = 2
     enough = 0.1
@@ -162,8 +162,8 @@ class ClothFoldShirtEnv(ClothEnv):
     At the end there are also measures of three-dimensional distance from the ideal, whose four layers are as far apart as the
     cloth's thickness: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and shift
     along the floor, over the root of the area, as of ``clothgym.envs.garment_scores``.  ``info["peer/foldnet"]`` is the measure of
-    FoldNet: the mean squared error of a coordinate after the best rotation about z and shift, in m^2.  A fold succeeds there with at
-    most 0.001.
+    FoldNet: the mean squared error of a coordinate after the best rotation about z and shift, in m^2; at most 0.001 is a success
+    there.
 
     ## Starting State
     The shirt's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
