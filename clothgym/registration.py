@@ -62,6 +62,10 @@ ENVIRONMENTS = {
         "ClothFoldGoalHard",
         "Bring the corners of a large silk sheet to the goals of a random fold, with goal observations for HER.",
     ),
+    "ClothFoldShirt-v0": (
+        "ClothFoldShirt",
+        "Fold a T-shirt on the floor in half, left over right, with two grippers.",
+    ),
     "ClothFlatten-v0": (
         "ClothFlatten",
         "Spread a crumpled sheet on the floor with two grippers and release it.",
@@ -83,7 +87,7 @@ ENVIRONMENTS = {
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
     "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
-    "ClothFoldGoal-Hard-v0": 150, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
+    "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
     "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
     "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip

@@ -40,8 +40,8 @@ class Clip(NamedTuple):
     policy: who acts: "expert", or "learned", the committed policy.  speed: seconds of the episode in a second of the film.
     loop: where the motion has no end, frames over which the sheet passes from the last moments into the first.  at_least: the clip
     is the piece, at least so long [s], that begins and ends most alike; None for all.  look: of the fabric, see ``LOOKS``, or
-    "gingham".  color: "fabric" or "strain".  goals: whether spheres that mark goals stay in sight, too.  settings: of a scene, see
-    ``Settings``.  kwargs: of an environment.
+    "gingham".  color: "fabric" or "strain".  keeps: what stays in sight: "cloth", "goals", the spheres that mark
+    them, too, or "solids", too.  settings: of a scene, see ``Settings``.  kwargs: of an environment.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Clip(NamedTuple):
     at_least: float | None = None
     look: str = "gingham"
     color: str = "fabric"
-    goals: bool = False
+    keeps: str = "cloth"
     settings: dict[str, Any] = {}  # noqa: RUF012 - never written to
     kwargs: dict[str, Any] = {}  # noqa: RUF012
 
@@ -65,16 +65,20 @@ CLIPS = {
     "sphere": Clip("sphere", 2.4, seed=0),
     "box": Clip("box", 2.4, seed=0, look="cotton_broad"),
     "pawn": Clip("pawn", 2.6, seed=0, look="denim"),
-    "cape": Clip("cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille"),  # a figure of eight
+    "cape": Clip(
+        "cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille", keeps="solids"
+    ),  # a figure of eight
     "fold": Clip("fold", 5.5, seed=0, look="wool_tropical"),
-    "ClothReach-v0": Clip("ClothReach-v0", look="knit", goals=True),
+    "ClothReach-v0": Clip("ClothReach-v0", look="knit", keeps="goals"),
     "ClothDrape-v0": Clip("ClothDrape-v0"),
     "ClothDrapeGripper-v0": Clip("ClothDrapeGripper-v0", look="cotton_broad"),
     "ClothHang-v0": Clip("ClothHang-v0", look="polyester_tropical"),
+    "ClothHang-Hard-v0": Clip("ClothHang-Hard-v0", look="silk", policy="expert"),
     "ClothHook-v0": Clip("ClothHook-v0", look="denim"),
     "ClothStrain-v0": Clip("ClothStrain-v0", color="strain"),
     "ClothFold-v0": Clip("ClothFold-v0", look="wool_tropical"),
     "ClothFold-Hard-v0": Clip("ClothFold-Hard-v0", look="silk", policy="expert"),
+    "ClothFoldShirt-v0": Clip("ClothFoldShirt-v0", look="polyester_tropical"),
     "ClothFoldGoal-v0": Clip("ClothFoldGoal-v0", look="polyester"),
     "ClothFlatten-v0": Clip("ClothFlatten-v0", look="polyester_faille", speed=2),
     "ClothFling-v0": Clip("ClothFling-v0"),
@@ -182,9 +186,12 @@ def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDA
     # cloth of one color lies in the middle of a stripe, and of a yarn
     uv = mesh.rest_positions[:, :2] + (0.525 * PLAIN if colors.get("check") == PLAIN else 0)
     points = [shot.positions.reshape(-1, 3) for shot in take.shots]
-    if clip.goals:
-        balls = [[ball for ball in shot.markers if ball.kind == "sphere"] for shot in take.shots]
-        points = [np.concatenate([seen, corners(found)]) for seen, found in zip(points, balls)]
+    if clip.keeps != "cloth":
+        kept = [
+            shot.solids if clip.keeps == "solids" else [ball for ball in shot.markers if ball.kind == "sphere"]
+            for shot in take.shots
+        ]
+        points = [np.concatenate([seen, corners(found)]) for seen, found in zip(points, kept)]
     cameras = followed(take.camera, points, width / height, take.step, clip.loop > 0)
     frames, shares, last = [], [], None
     for number, (shot, camera) in enumerate(zip(take.shots, cameras)):

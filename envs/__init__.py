@@ -11,6 +11,7 @@ from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv
 from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldHardEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv
+from clothgym.envs.fold_shirt import ClothFoldShirtEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv
 from clothgym.envs.hook import ClothHookEnv, ClothHookHardEnv
@@ -32,6 +33,7 @@ ClothFlingVectorEnv = batched(ClothFlingEnv)
 ClothFoldGoalHardVectorEnv = batched(ClothFoldGoalHardEnv)
 ClothFoldGoalVectorEnv = batched(ClothFoldGoalEnv)
 ClothFoldHardVectorEnv = batched(ClothFoldHardEnv)
+ClothFoldShirtVectorEnv = batched(ClothFoldShirtEnv)
 ClothFoldVectorEnv = batched(ClothFoldEnv)
 ClothHangHardVectorEnv = batched(ClothHangHardEnv)
 ClothHangVectorEnv = batched(ClothHangEnv)
@@ -43,8 +45,9 @@ __all__ = [
     "ClothDrapeEnv", "ClothDrapeGripperEnv", "ClothDrapeGripperVectorEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothFlattenEnv",
     "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv",
     "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv", "ClothFoldGoalEnv", "ClothFoldGoalHardEnv",
-    "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv", "ClothFoldHardVectorEnv", "ClothFoldVectorEnv",
-    "ClothHangEnv", "ClothHangHardEnv", "ClothHangHardVectorEnv", "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv",
-    "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv", "ClothReachVectorEnv", "ClothStrainEnv",
-    "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation", "Physics", "Task", "TaskState",
+    "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv", "ClothFoldHardVectorEnv", "ClothFoldShirtEnv",
+    "ClothFoldShirtVectorEnv", "ClothFoldVectorEnv", "ClothHangEnv", "ClothHangHardEnv", "ClothHangHardVectorEnv",
+    "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv", "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv",
+    "ClothReachVectorEnv", "ClothStrainEnv", "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation",
+    "Physics", "Task", "TaskState",
 ]  # fmt: skip

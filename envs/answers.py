@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 ENDS = ("terminated", "truncated", "failure")  # fields of ``Task.outcome``: whether and how an episode has ended
 COST = "cost"  # of a step, where a constraint is the task
+PEER = "peer_"
 # entries of ``info_of_physics`` in addition to the record of info
 PHYSICAL = (("self_contacts", np.int64), ("clamped_moves", np.int64), ("attachment_lag", np.float64))
 
@@ -75,9 +76,14 @@ def _of_a_step(task: Task) -> list[NDArray]:
     return [task.outcome["reward"], *(task.terms[name] for name in names_of(task.terms)), *costs]
 
 
+def key_of(name: str) -> str:
+    """The key in info of a field: ``peer/NAME`` for ``peer_NAME``, the measures of other benchmarks."""
+    return name.replace(PEER, "peer/", 1) if name.startswith(PEER) else name
+
+
 def of_batch(task: Task) -> dict[str, Any]:
     """Info of the last step of each environment, or of the reset since then: arrays over the batch, fresh copies."""
-    info: dict[str, Any] = {name: task.info[name].copy() for name in names_of(task.info)}
+    info: dict[str, Any] = {key_of(name): task.info[name].copy() for name in names_of(task.info)}
     if task.simulation.self_collision is not None:
         info |= {name: task.physical[name].copy() for name, _ in PHYSICAL}
     info["failure"] = task.outcome["failure"].copy()
@@ -86,7 +92,7 @@ def of_batch(task: Task) -> dict[str, Any]:
 
 def of_one(task: Task, env: int) -> dict[str, Any]:
     """The same of one environment, as plain Python values."""
-    info = dict(zip(names_of(task.info), task.info[env].item()))
+    info = dict(zip(map(key_of, names_of(task.info)), task.info[env].item()))
     if task.simulation.self_collision is not None:
         info |= dict(zip(names_of(task.physical), task.physical[env].item()))
     info["failure"] = task.outcome["failure"][env].item()

@@ -156,7 +156,7 @@ def _potential(own, rules, sheet):
 
 
 @inlined
-def _evaluate(own, rules, sheet, info):
+def evaluate_fold(own, rules, sheet, info):
     """Write the error of the fold, its overlap with the ideal and its speed; returns the normalized performance."""
     info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, FINE_CELL)
     info.fold_error_mm = 1000 * own.error * rules.side
@@ -196,47 +196,37 @@ def along_arc(way: NDArray, height: NDArray, whole: NDArray, low: float) -> tupl
     return step, left
 
 
-class FoldTask(ManipulationTask):
-    """The task of ``ClothFold-v0``, see ``ClothFoldEnv``.
+class FoldingTask(ManipulationTask):
+    """Base of the tasks that end with a folded sheet on the floor.
 
-    Args:
-        fold: one of ``FOLDS``.
+    Attributes:
+        stages: for each consecutive fold, the particle that each gripper takes, and the particle that it moves it to.
+        below: the particles above which the grippers begin.
+        enough: largest distance of a point of the sheet from its place, in sides.
+        expert_low: lowest height of the expert's arc in each fold [m].
     """
 
-    kernels = Kernels(_potential, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
+    kernels = Kernels(_potential, evaluate_fold, _observe, measure=_measure, account=_account, fingers=close_or_open)
     settling_steps = 60
     observations = (
         *ManipulationTask.observations,
         Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0),
     )
     points_relative_to = "the initial center of the sheet"
-    evaluation = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
+    evaluation: ClassVar[Fields] = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (
         ("fold_error", float), ("fold_error_max", float), ("height", float), *ManipulationTask.accounts,
     )  # fmt: skip
-    arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
     away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
     turned: ClassVar[float] = np.pi / 4  # largest yaw of the sheet [rad]
-    acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
+    stages: list[list[tuple[int, int]]]
+    below: list[int]
+    enough: float
+    expert_low: ClassVar[tuple[float, ...]] = EXPERT_LOW
 
-    def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:
-        one_of("fold", fold, *FOLDS)
-        self.fold, self.acting_steps = fold, self.acting[fold]  # type: ignore[misc]
-        super().__init__(num_envs, **kwargs)
-
-    @property
-    def stages(self) -> list[list[tuple[int, int]]]:
-        """For each consecutive fold, the particle that each gripper takes, and the particle that it moves it to."""
-        lower_left, lower_right, left, right = self.physics.mesh.corners
-        if self.fold == "diagonal":
-            return [[(right, lower_left)]]
-        first = [(left, lower_left), (right, lower_right)]
-        if self.fold == "half":
-            return [first]
-        # the ends of the crease and of the joined edges
-        rows, columns = self.physics.mesh.grid_shape
-        middle = (rows // 2) * columns
-        return [first, [(middle, middle + columns - 1), (lower_left, lower_right)]]
+    def ideals(self, points: NDArray) -> NDArray[np.float64]:
+        """Positions in the ideal folds [m], (ways, points, 2), of points of the flat sheet about its center [m], (points, 2)."""
+        raise NotImplementedError
 
     def remembers(self) -> Fields:
         # the initial turn of the sheet, and the present errors
@@ -245,19 +235,18 @@ class FoldTask(ManipulationTask):
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
         flat = mesh.rest_positions[:, :2] - mesh.rest_positions[:, :2].mean(axis=0)
-        folds, share = ideals(self.fold, flat), (mesh.area / mesh.area.sum()).astype(np.float32)
+        folds, share = self.ideals(flat), (mesh.area / mesh.area.sum()).astype(np.float32)
         x = np.ascontiguousarray(np.concatenate([flat, np.zeros((len(flat), 1))], axis=1).T)
         unfolded, _ = nearest_fold(x, share, folds, np.empty_like(x))
         places = np.array([taken for taken, _ in self.stages[0]])
-        return {"folds": folds, "unfolded": unfolded / self.physics.side, "places": places, "enough": ENOUGH_FOLDED[self.fold]}
+        return {"folds": folds, "unfolded": unfolded / self.physics.side, "places": places, "enough": self.enough}
 
     # --- reset ----------------------------------------------------------------------------------------------------------
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         x, center, turn = self.lie_flat(rng, self.away, self.turned)
         self.episode["origin"][env], self.episode["turn"][env] = (*center, 0), turn
-        # both grippers above the edge that they grasp first
-        self.hover(env, rng, x[list(self.physics.mesh.corners[2:])])
+        self.hover(env, rng, x[self.below])
         return self.uneven(x, rng)
 
     def _began(self) -> NDArray:
@@ -282,7 +271,7 @@ class FoldTask(ManipulationTask):
         move, closed = np.tile([0.0, 0.0, 0.1], (self.num_envs, 2, 1)), np.zeros((self.num_envs, 2), bool)
         # a finished and released fold is not grasped again
         found = (self.episode["best"] > EXPERT_DONE) & ~np.logical_or.reduce(holder >= 0, axis=1)
-        for low, stage in zip(EXPERT_LOW, self.stages):
+        for low, stage in zip(self.expert_low, self.stages):
             taken, goals = (np.array(part) for part in zip(*stage))
             count, whole = len(stage), length(rest[taken] - rest[goals])
             place, tip = x[:, taken], tips[:, :count]
@@ -321,8 +310,44 @@ class FoldTask(ManipulationTask):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        far = self.physics.side / FoldTask.physics.side
+        far = self.physics.side / ManipulationTask.physics.side
         return Camera(eye=(0.9 * far, -1.35 * far, 1.05 * far), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
+
+
+class FoldTask(FoldingTask):
+    """The task of ``ClothFold-v0``, see ``ClothFoldEnv``.
+
+    Args:
+        fold: one of ``FOLDS``.
+    """
+
+    arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
+    acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
+
+    def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:
+        one_of("fold", fold, *FOLDS)
+        self.fold, self.acting_steps, self.enough = fold, self.acting[fold], ENOUGH_FOLDED[fold]  # type: ignore[misc]
+        super().__init__(num_envs, **kwargs)
+
+    @property
+    def stages(self) -> list[list[tuple[int, int]]]:  # type: ignore[override]
+        lower_left, lower_right, left, right = self.physics.mesh.corners
+        if self.fold == "diagonal":
+            return [[(right, lower_left)]]
+        first = [(left, lower_left), (right, lower_right)]
+        if self.fold == "half":
+            return [first]
+        # the ends of the crease and of the joined edges
+        rows, columns = self.physics.mesh.grid_shape
+        middle = (rows // 2) * columns
+        return [first, [(middle, middle + columns - 1), (lower_left, lower_right)]]
+
+    @property
+    def below(self) -> list[int]:  # type: ignore[override]
+        return list(self.physics.mesh.corners[2:])
+
+    def ideals(self, points: NDArray) -> NDArray[np.float64]:
+        return ideals(self.fold, points)
 
 
 class FoldHardTask(FoldTask):

@@ -12,7 +12,7 @@ from clothgym._jit import inlined
 from clothgym.checks import one_of
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, PICKING, FoldTask, along_arc
+from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, PICKING, FoldingTask, along_arc
 from clothgym.envs.gripper_task import (
     CORNERS,
     LARGE_SILK,
@@ -209,7 +209,7 @@ class FoldGoalTask(ManipulationTask):
         return as_actions(self, move, np.where(closed, -1.0, 1.0))
 
     def camera(self) -> Any:
-        return FoldTask.camera(self)  # type: ignore[arg-type]
+        return FoldingTask.camera(self)  # type: ignore[arg-type]
 
 
 class FoldGoalHardTask(FoldGoalTask):

@@ -248,7 +248,7 @@ class ManipulationTask(GripperTask):
         flat = self.physics.mesh.rest_positions - self.physics.mesh.rest_positions.mean(axis=0)
         c, s = np.cos(yaw), np.sin(yaw)
         x, y = c * flat[:, 0] - s * flat[:, 1] + center[0], s * flat[:, 0] + c * flat[:, 1] + center[1]
-        return np.stack([x, y, flat[:, 2] + ON_FLOOR], axis=1), center, np.array([c, s])
+        return np.stack([x, y, flat[:, 2] - flat[:, 2].min() + ON_FLOOR], axis=1), center, np.array([c, s])
 
     def uneven(self, x: NDArray, rng: np.random.Generator) -> NDArray:
         """A start [m], (particles, 3), with its particles raised by tenths of a millimeter."""

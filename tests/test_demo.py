@@ -160,7 +160,8 @@ def test_files_are_small_and_complete():
     assert max(paths.values()) < 300_000 and sum(paths.values()) < 3_000_000
     listed = json.loads(record.INDEX.read_text().removeprefix("const EPISODES = ").removesuffix(";\n"))
     assert [one["name"] for one in listed] == list(record.EPISODES)
-    assert {chosen.env_id for chosen in record.EPISODES.values()} == set(clothgym.policies.available())
+    # the page draws parts of grids alone
+    assert {chosen.env_id for chosen in record.EPISODES.values()} == set(clothgym.policies.available()) - {"ClothFoldShirt-v0"}
 
 
 @pytest.mark.parametrize("name", record.EPISODES)

@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 import clothgym
 from clothgym.envs import ClothEnv, ClothVectorEnv, Task
+from clothgym.envs.answers import key_of
 from clothgym.envs.episode import DIVERGED, OUT_OF_BOUNDS
 from clothgym.registration import ENVIRONMENTS
 
@@ -135,7 +136,7 @@ def test_observations_lie_in_their_space_and_are_fresh(env_id, obs_mode):
 def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
     env = make(env_id)
     env.reset(seed=0)
-    of_evaluation = {"normalized_performance", "is_success", *(name for name, *_ in env.unwrapped.task.evaluation)}
+    of_evaluation = {"normalized_performance", "is_success", *(key_of(name) for name, *_ in env.unwrapped.task.evaluation)}
     steps, terminated, actions = 0, False, drawn(env)
     while not terminated:
         action = next(actions) if policy == "random" else env.unwrapped.expert_action()

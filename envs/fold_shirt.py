@@ -1,0 +1,173 @@
+"""ClothFoldShirt-v0: fold a T-shirt, shorts or trousers on the floor in half, left over right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import apart, inlined
+from clothgym.checks import one_of
+from clothgym.envs.episode import Fields
+from clothgym.envs.fold import FoldingTask, evaluate_fold
+from clothgym.envs.gripper_task import PHYSICS, ManipulationTask
+from clothgym.envs.physics import MEDIAN, chosen_fabric
+from clothgym.envs.single import ClothEnv
+from clothgym.garments import USUAL_THICKNESS, Garment, make
+from clothgym.mesh import ClothMesh
+
+SPACING = 0.04  # of the particles [m]
+# of each garment: sizes that are not the middles of their ranges, and the key points that grippers take, without their sides
+SIZES: dict[str, dict[str, float]] = {"tshirt": {"chest_width": 0.42, "length": 0.64}, "shorts": {}, "trousers": {}}
+TAKEN = {"tshirt": ("sleeve_top", "waist"), "shorts": ("waist", "pipe_outer"), "trousers": ("waist", "pipe_outer")}
+
+
+@cache
+def garment_named(name: str) -> Garment:
+    """The garment of that name in ``SIZES``."""
+    return make(name, SPACING, sizes=SIZES[name])
+
+
+# --- the ideal folds, and the measures of others ------------------------------------------------------------------------------
+
+
+def folded(garment: Garment) -> NDArray[np.float64]:
+    """Positions of a garment folded in half, left over right and right over left, in four thin layers [m], (2, particles, 3)."""
+    u, v, z = garment.mesh.rest_positions.T
+    thickness = USUAL_THICKNESS * SPACING
+    layer = thickness * (z - z.min()) / (z.max() - z.min())
+    ways = [(np.maximum(u, -u), u < 0), (np.minimum(u, -u), u > 0)]
+    return np.array([np.stack([across, v, np.where(over, 3 * thickness - layer, layer)], axis=1) for across, over in ways])
+
+
+@apart
+def compared(x, goals):
+    """Least mean distance [m] and least mean squared coordinate error [m^2] of a sheet's particles from folded positions.
+
+    Both after the best rotation about z and shift along the floor, for which the sum of squares is least; the second also after the
+    best shift along z.  x: [m], (3, particles).  goals: (ways, particles, 3).
+    """
+    count = x.shape[1]
+    nearest, least = np.inf, np.inf
+    for way in range(goals.shape[0]):
+        goal = goals[way]
+        one, two = np.zeros(3), np.zeros(3)
+        for p in range(count):
+            for c in range(3):
+                one[c] += x[c, p] / count
+                two[c] += goal[p, c] / count
+        along, across = 0.0, 0.0
+        for p in range(count):
+            a, b = x[0, p] - one[0], x[1, p] - one[1]
+            u, v = goal[p, 0] - two[0], goal[p, 1] - two[1]
+            along += u * a + v * b
+            across += u * b - v * a
+        size = max(np.sqrt(along * along + across * across), 1e-30)
+        c, s = along / size, across / size
+        total, squares = 0.0, 0.0
+        for p in range(count):
+            u, v = goal[p, 0] - two[0], goal[p, 1] - two[1]
+            dx = x[0, p] - one[0] - (c * u - s * v)
+            dy = x[1, p] - one[1] - (s * u + c * v)
+            dz = x[2, p] - goal[p, 2]
+            shifted = dz - (one[2] - two[2])
+            total += np.sqrt(dx * dx + dy * dy + dz * dz)
+            squares += dx * dx + dy * dy + shifted * shifted
+        nearest, least = min(nearest, total / count), min(least, squares / (3 * count))
+    return nearest, least
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write what ``fold`` measures, and the distances from the folded garment; returns the normalized performance."""
+    distance, info.peer_foldnet = compared(sheet.x, rules.goals)
+    info.vertex_distance = distance / rules.root_area
+    return evaluate_fold(own, rules, sheet, info)
+
+
+class FoldShirtTask(FoldingTask):
+    """The task of ``ClothFoldShirt-v0``, see ``ClothFoldShirtEnv``.
+
+    Args:
+        garment: one of ``SIZES``.
+    """
+
+    physics = replace(
+        PHYSICS, mesh=garment_named("tshirt").mesh, material=chosen_fabric("polyester", MEDIAN), substeps="auto",
+        fast={"air_density": 0.0},
+    )  # fmt: skip
+    kernels = FoldingTask.kernels._replace(evaluate=_evaluate)
+    acting_steps = 70
+    settling_steps = 40
+    picks = 2
+    enough = 0.1
+    expert_low = (0.03,)
+    key_points = "key points of the garment, of ``clothgym.garments``"
+    evaluation: ClassVar[Fields] = (*FoldingTask.evaluation, ("vertex_distance", float), ("peer_foldnet", float))
+    arguments: ClassVar = {**ManipulationTask.arguments, "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``'}
+
+    def __init__(self, num_envs: int, garment: str = "tshirt", **kwargs: Any) -> None:
+        one_of("garment", garment, *SIZES)
+        self.garment = garment_named(garment)
+        self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
+        points = self.garment.key_points
+        self.stages = [[(points[f"{name}_left"], points[f"{name}_right"]) for name in TAKEN[garment]]]
+        self.below = [taken for taken, _ in self.stages[0]]
+        super().__init__(num_envs, **kwargs)
+
+    @classmethod
+    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+        """The garment's key points."""
+        return np.array(next(list(one.key_points.values()) for one in map(garment_named, SIZES) if one.mesh is mesh))
+
+    def ideals(self, points: NDArray) -> NDArray[np.float64]:
+        return folded(self.garment)[..., :2]
+
+    def constants(self) -> dict[str, Any]:
+        # one layer covers half of the cloth
+        root_area = np.sqrt(self.physics.mesh.area.sum() / 2)
+        return {**super().constants(), "goals": folded(self.garment), "root_area": root_area}
+
+
+class ClothFoldShirtEnv(ClothEnv):
+    """Fold a T-shirt on the floor in half, left over right, with two grippers.
+
+    ## Description
+    A T-shirt of two layers lies flat on the floor, front up, turned and off center.  Two grippers hover above its left sleeve and
+    the left end of its hem.  Its left half is to be laid over its right one.  When the time is up the fingers open, and the shirt
+    settles, in steps whose actions are ignored; then it is evaluated.  ``garment`` selects shorts or trousers in its place, which
+    are taken by the left ends of waist and leg.
+
+    The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
+    sides, and open at neck, hem and cuffs.  All environments have the same sizes; ``randomize`` draws fabrics.
+
+    $physics
+
+    ## Observation Space
+    $observations
+
+    ## Rewards
+    $rewards
+
+    During the episode the potential is that of ``ClothFold-v0``.
+
+    ## Evaluation
+    Fold error, height, overlap, success, and the normalized performance are those of ``ClothFold-v0``'s half fold, with
+    ``fold_error_max`` at most 0.1.  The ideal is the garment folded along its middle, left over right or right over left, whichever
+    is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m.
+
+    At the end there are also measures of three-dimensional distance from the ideal, whose four layers are as far apart as the
+    cloth's thickness: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and shift
+    along the floor, over the root of the area, as of ``clothgym.envs.garment_scores``.  ``info["peer/foldnet"]`` is the measure of
+    FoldNet: the mean squared error of a coordinate after the best rotation about z and shift, in m^2; at most 0.001 is a success
+    there.
+
+    ## Starting State
+    The shirt's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,
+    displaced from the points that they take by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.
+    """
+
+    task_class = FoldShirtTask
