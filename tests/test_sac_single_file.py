@@ -154,7 +154,7 @@ def test_costs_have_a_price_that_grows_and_a_loss_weighs_no_more_than_the_least_
     run.collect(at_random=True)
     assert run.replay.rows["cost"][:2].tolist() == [150, 0] and run.replay.rows["goes_on"][:2].tolist() == [0, 0]
     reward, cost = torch.tensor([3.0, 3.0]), torch.tensor([20.0, 200.0])
-    for run.done, want in ((0, [3, 3]), (250, [2, -5]), (500, [1, -5]), (750, [1, -5])):
+    for run.done, want in ((0, [3, 3]), (250, [2.5, -2]), (500, [1, -5]), (750, [1, -5])):
         assert run.charged(reward, cost).tolist() == pytest.approx(want)
 
 

@@ -67,7 +67,7 @@ class Options:
     first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
     least_reward: float = -1e6  # of a decision: what is lost by a release, or at an episode's end, weighs no more than this
-    cost_price: float = 0.0  # of a cost, in rewards, in the second half of the run; it grows from nothing in the first
+    cost_price: float = 0.0  # of a cost, in rewards, in the second half of the run; in the first it grows from 0, as time squared
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -376,7 +376,7 @@ class Run:
 
     def charged(self, reward: Any, cost: Any) -> Any:
         """Rewards, which have their scale, less costs at the present price, and none below the least."""
-        scale, grown = self.options.reward_scale, min(2 * self.done / self.config["timesteps"], 1.0)
+        scale, grown = self.options.reward_scale, min(2 * self.done / self.config["timesteps"], 1.0) ** 2
         return (reward - scale * self.options.cost_price * grown * cost).clamp(min=scale * self.options.least_reward)
 
     def collect(self, at_random: bool) -> None:
