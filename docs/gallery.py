@@ -66,11 +66,7 @@ CLIPS = {
     "box": Clip("box", 2.4, seed=0, look="cotton_broad"),
     "pawn": Clip("pawn", 2.6, seed=0, look="denim"),
     # a figure of eight
-    "cape": Clip(
-        "cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille", keeps="solids"
-    ),
-        "cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille", keeps="solids"
-    ),  # a figure of eight
+    "cape": Clip("cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille", keeps="solids"),
     "fold": Clip("fold", 5.5, seed=0, look="wool_tropical"),
     "ClothReach-v0": Clip("ClothReach-v0", look="knit", keeps="goals"),
     "ClothDrape-v0": Clip("ClothDrape-v0"),
