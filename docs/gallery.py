@@ -67,11 +67,11 @@ CLIPS = {
     "pawn": Clip("pawn", 2.6, seed=0, look="denim"),
     # a figure of eight
     "cape": Clip("cape", 2 * np.pi / 0.9 + 16 / FPS, start=3.0, loop=16, seed=0, look="polyester_faille", keeps="solids"),
-    "fold": Clip("fold", 5.5, seed=0, look="wool_tropical"),
+    "fold": Clip("fold", 5.5, seed=0, look="denim"),
     "ClothReach-v0": Clip("ClothReach-v0", look="knit", keeps="goals"),
     "ClothDrape-v0": Clip("ClothDrape-v0"),
     "ClothDrapeGripper-v0": Clip("ClothDrapeGripper-v0", look="cotton_broad"),
-    "ClothHang-v0": Clip("ClothHang-v0", look="polyester_tropical"),
+    "ClothHang-v0": Clip("ClothHang-v0", look="silk"),
     "ClothHang-Hard-v0": Clip("ClothHang-Hard-v0", look="silk", policy="expert"),
     "ClothHook-v0": Clip("ClothHook-v0", look="denim"),
     "ClothStrain-v0": Clip("ClothStrain-v0", color="strain"),
@@ -84,7 +84,7 @@ CLIPS = {
     "ClothFling-Hard-v0": Clip("ClothFling-Hard-v0", look="silk", policy="expert"),
 }
 HERO = ("ClothFling-v0", "ClothFold-v0", "ClothDrape-v0")  # side by side, each begins again when it is over
-HERO_SIZE, HERO_FPS, HERO_SECONDS = (320, 240), 20, 9.0
+HERO_SIZE, HERO_FPS, HERO_SECONDS = (320, 240), 20, 7.0
 
 
 @dataclass(frozen=True)
