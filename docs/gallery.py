@@ -16,20 +16,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pictures import FILLED, corners, framed, played, side_by_side, slopes  # a script in this folder
+from pictures import FILLED, Moment, corners, framed, played, side_by_side, slopes  # a script in this folder
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 import clothgym
+from clothgym.evaluation import FIRST_HELD_OUT
 from clothgym.forces import structural_strain
 from clothgym.mesh import ClothMesh
 from clothgym.playground.exporting import moments, stage_named
-from clothgym.render import Camera, Drawn, Renderer, write_video
+from clothgym.render import Camera, Renderer, write_video
 from clothgym.render.heat import largest_at_particles
 from clothgym.render.looks import LOOKS, PLAIN
 
 HERE = Path(__file__).parent / "gallery"
 WIDTH, HEIGHT, FPS = 480, 360, 30
-HELD_OUT = 1_000_000  # the first seed of held-out episodes
 STEADY = 0.4  # how slowly the camera follows [s]
 RESTS, HOLD = 0.15, 0.6  # a film ends where no particle moves faster than this until the end [m/s], and stands for so long [s]
 
@@ -41,13 +41,13 @@ class Clip(NamedTuple):
     loop: where the motion has no end, frames over which the sheet passes from the last moments into the first.  at_least: the clip
     is the piece, at least so long [s], that begins and ends most alike; None for all.  look: of the fabric, see ``LOOKS``, or
     "gingham".  color: "fabric" or "strain".  keeps: what stays in sight: "cloth", "goals", the spheres that mark
-    them, too, or "solids", too.  settings: of a scene, see ``Settings``.  kwargs: of an environment.
+    them, too, or "solids", too.  settings: of a scene, see ``Settings``.
     """
 
     name: str
     seconds: float | None = None
     start: float = 0.0
-    seed: int = HELD_OUT
+    seed: int = FIRST_HELD_OUT
     policy: str = "learned"
     speed: int = 1
     loop: int = 0
@@ -56,7 +56,6 @@ class Clip(NamedTuple):
     color: str = "fabric"
     keeps: str = "cloth"
     settings: dict[str, Any] = {}  # noqa: RUF012 - never written to
-    kwargs: dict[str, Any] = {}  # noqa: RUF012
 
 
 CLIPS = {
@@ -88,15 +87,6 @@ HERO_SIZE, HERO_FPS, HERO_SECONDS = (320, 240), 20, 7.0
 
 
 @dataclass(frozen=True)
-class Shot:
-    """One moment.  positions: of each sheet [m], (sheets, particles, 3); solids and markers as ``Renderer`` takes them."""
-
-    positions: NDArray[np.float32]
-    solids: Sequence[Drawn]
-    markers: Sequence[Drawn] = ()
-
-
-@dataclass(frozen=True)
 class Take:
     """Moments of a sheet, ``step`` apart [s]; camera: where they are seen from; strained: the strain at which its colors end."""
 
@@ -104,7 +94,7 @@ class Take:
     step: float
     camera: Camera
     strained: float
-    shots: list[Shot]
+    shots: list[Moment]
 
 
 # --- what happens ---------------------------------------------------------------------------------------------------------
@@ -116,7 +106,7 @@ def taken(clip: Clip) -> Take:
         stage = stage_named(clip.name, clip.seed, settings=clip.settings)
         for _ in range(round(clip.start / stage.recording.time_step)):
             stage.advance()
-        shots = [Shot(frame.positions, frame.solids) for frame in moments(stage, clip.seconds, FPS)]
+        shots = [Moment(frame.time, frame.positions[0], list(frame.solids), []) for frame in moments(stage, clip.seconds, FPS)]
         if clip.loop:
             shots = looped(shots, clip.loop, None if clip.at_least is None else round(clip.at_least * FPS))
         recording = stage.recording
@@ -124,17 +114,16 @@ def taken(clip: Clip) -> Take:
     if clip.policy == "learned":
         policy = clothgym.policies.load(clip.name)
         # the sheet settles in steps, so that it can be seen
-        kwargs = policy.about["env_kwargs"] | {"settling": "steps"} | clip.kwargs
+        kwargs = policy.about["env_kwargs"] | {"settling": "steps"}
         episode = played(clip.name, clip.seed, lambda env, seen: policy(seen), **kwargs)
     else:
-        episode = played(clip.name, clip.seed, **clip.kwargs)
+        episode = played(clip.name, clip.seed)
     task = episode.task
-    shots = [Shot(moment.positions[None], moment.solids, moment.markers) for moment in episode.moments[:: clip.speed]]
     step = task.physics.time_step
-    return Take(task.physics.mesh, step, task.camera(), task.strain_shown, until_rest(shots, step))
+    return Take(task.physics.mesh, step, task.camera(), task.strain_shown, until_rest(episode.moments[:: clip.speed], step))
 
 
-def until_rest(shots: list[Shot], step: float) -> list[Shot]:
+def until_rest(shots: list[Moment], step: float) -> list[Moment]:
     """The shots up to where the sheet lies still, which stands for a while; step: between them [s]."""
     last = len(shots) - 1
     while last > 1 and np.abs(shots[last].positions - shots[last - 1].positions).max() < RESTS * step:
@@ -142,7 +131,7 @@ def until_rest(shots: list[Shot], step: float) -> list[Shot]:
     return shots[: last + 1] + [shots[last]] * round(HOLD / step)
 
 
-def looped(shots: Sequence[Shot], over: int, at_least: int | None) -> list[Shot]:
+def looped(shots: Sequence[Moment], over: int, at_least: int | None) -> list[Moment]:
     """A piece of a motion whose last moments are moved towards what comes before its first: it is the sheet that is mixed, not its
     picture, so that nothing is seen twice.  at_least: moments of the piece, or None for all."""
     x = np.stack([shot.positions for shot in shots])
@@ -155,7 +144,7 @@ def looped(shots: Sequence[Shot], over: int, at_least: int | None) -> list[Shot]
     shares = (np.arange(over) + 1) / (over + 1)
     eased = shares * shares * (3 - 2 * shares)
     mixed = [
-        replace(shot, positions=((1 - share) * shot.positions + share * before.positions).astype(np.float32))
+        shot._replace(positions=((1 - share) * shot.positions + share * before.positions).astype(np.float32))
         for share, shot, before in zip(eased, shots[last - over : last], shots[first - over : first])
     ]
     return [*shots[first : last - over], *mixed]
@@ -184,7 +173,7 @@ def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDA
     mesh, colors = take.mesh, {} if clip.look == "gingham" else LOOKS[clip.look]._asdict()
     # cloth of one color lies in the middle of a stripe, and of a yarn
     uv = mesh.rest_positions[:, :2] + (0.525 * PLAIN if colors.get("check") == PLAIN else 0)
-    points = [shot.positions.reshape(-1, 3) for shot in take.shots]
+    points: list[NDArray] = [shot.positions for shot in take.shots]
     if clip.keeps != "cloth":
         kept = [
             shot.solids if clip.keeps == "solids" else [ball for ball in shot.markers if ball.kind == "sphere"]
@@ -196,7 +185,11 @@ def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDA
     for number, (shot, camera) in enumerate(zip(take.shots, cameras)):
         if shot is not last:
             renderer = Renderer(mesh.triangles, uv, camera, width, height, 2, 1, grid_shape=mesh.shape, **colors)
-            frames.append(drawn(renderer, take, shot, clip.color))
+            values = None
+            if clip.color == "strain":
+                strain = structural_strain(mesh, shot.positions[None])
+                values = largest_at_particles(mesh, strain)[0] / np.float32(take.strained)
+            frames.append(renderer.rgb(shot.positions, shot.solids, shot.markers, values))
             if number % 10 == 0:
                 shares.append(share_of_cloth(renderer, shot))
         else:
@@ -205,22 +198,9 @@ def film(clip: Clip, width: int = WIDTH, height: int = HEIGHT) -> tuple[list[NDA
     return frames, take.step, float(np.mean(shares))
 
 
-def drawn(renderer: Renderer, take: Take, shot: Shot, color: str) -> NDArray[np.uint8]:
-    """A picture of all sheets of a moment, of which the nearest is seen."""
-    pictures, depths = [], []
-    for x in shot.positions:
-        values = None
-        if color == "strain":
-            values = largest_at_particles(take.mesh, structural_strain(take.mesh, x[None]))[0] / np.float32(take.strained)
-        pictures.append(renderer.rgb(x, shot.solids, shot.markers, values))
-        depths.append(renderer.depth(x, shot.solids, shot.markers))
-    nearest = np.argmin(depths, axis=0)[None, :, :, None]
-    return np.take_along_axis(np.stack(pictures), nearest, axis=0)[0]
-
-
-def share_of_cloth(renderer: Renderer, shot: Shot) -> float:
-    """Share of the pixels in which a moment's first sheet is seen."""
-    x = shot.positions[0]
+def share_of_cloth(renderer: Renderer, shot: Moment) -> float:
+    """Share of the pixels in which a moment's sheet is seen."""
+    x = shot.positions
     return float((renderer.depth(x, shot.solids) != renderer.depth(x - (0, 0, 100), shot.solids)).mean())
 
 

@@ -39,8 +39,6 @@ def write_picture(path: str | Path, image: NDArray[np.uint8]) -> None:
 def write_video(path: str | Path, frames: Iterable[NDArray[np.uint8]], fps: float = 30.0) -> None:
     """Write frames, (height, width, 3) uint8 each, as a looped ``.webp`` or ``.gif``, or as an ``.mp4``.
 
-    A ``.webp`` has all colors, and a third of the size of a ``.gif``.
-
     Frames may come from a generator, and are written to an ``.mp4`` one by one.  If it raises, the frames so far are kept next to
     ``path``, as ``NAME.part.mp4``, and the error says so.
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import clothgym
+from clothgym.evaluation import FIRST_HELD_OUT
 from clothgym.mesh import ClothMesh
 from clothgym.playground.show import solid_of
 from clothgym.registration import ENVIRONMENTS
@@ -32,7 +33,6 @@ from clothgym.render.solids import drawn
 
 FOLDER = Path(__file__).parent / "episodes"
 INDEX = FOLDER / "index.js"
-HELD_OUT = 1_000_000  # the first seed that no policy has seen
 QUANTUM = 5e-5  # of a position [m]; int16 reaches 1.6 m to each side of the middle
 LARGEST, LARGEST_TOGETHER = 300_000, 3_000_000  # bytes of a file, and of all
 LEARNERS = {
@@ -102,7 +102,7 @@ def record(name: str) -> Recorded:
 
     # a picking action is many control steps
     moved, task.move = task.move, move
-    observation, info = env.reset(seed=HELD_OUT, options=options or None)
+    observation, info = env.reset(seed=FIRST_HELD_OUT, options=options or None)
     look()
     over = False
     while not over:
@@ -121,7 +121,7 @@ def record(name: str) -> Recorded:
         "learner": LEARNERS[about["learner"]],
         "success_rate": about["success_rate"],
         "episodes": about["episodes"],
-        "seed": HELD_OUT,
+        "seed": FIRST_HELD_OUT,
         "options": options,
         "digest": about["digest"],
         "time_step": stride * task.physics.time_step,
