@@ -54,11 +54,13 @@ def compared(x, goals):
     nearest, least = np.inf, np.inf
     for way in range(goals.shape[0]):
         goal = goals[way]
+        # both centers
         one, two = np.zeros(3), np.zeros(3)
         for p in range(count):
             for c in range(3):
                 one[c] += x[c, p] / count
                 two[c] += goal[p, c] / count
+        # the rotation, in closed form as in ``fold.aligned``: sums of dot and cross products
         along, across = 0.0, 0.0
         for p in range(count):
             a, b = x[0, p] - one[0], x[1, p] - one[1]
@@ -67,6 +69,7 @@ def compared(x, goals):
             across += u * b - v * a
         size = max(np.sqrt(along * along + across * across), 1e-30)
         c, s = along / size, across / size
+        # the distances after it, and the squares also after the shift along z
         total, squares = 0.0, 0.0
         for p in range(count):
             u, v = goal[p, 0] - two[0], goal[p, 1] - two[1]
