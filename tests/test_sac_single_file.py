@@ -26,6 +26,12 @@ def options(single, **kwargs):
     return single.Options(**{"net_arch": (16, 16), "updates": 2, "batch_size": 32, "buffer_size": 1000, **kwargs})
 
 
+def collect(run):
+    """A decision at random of each environment, into the replay buffer."""
+    action = run.choose(at_random=True)
+    run.keep(action, *run.step(action))
+
+
 def transitions(count, seed=0):
     rng = np.random.default_rng(seed)
     shapes = {"observation": (58,), "action": (3,), "reward": (), "following": (58,), "goes_on": (), "cost": ()}
@@ -130,7 +136,7 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
         made = gym.make_vec("clothgym:ClothReach-v0", num_envs=4, autoreset_mode="Disabled", action_repeat=40)
         begun = np.random.SeedSequence([0, 0]).generate_state(2)[0] % (single.HELD_OUT - 4)
         first, _ = made.reset(seed=int(begun))
-        run.collect(at_random=True)
+        collect(run)
         rows = {name: part[:4] for name, part in run.replay.rows.items()}
         last, reward, terminated, *_ = made.step(rows["action"])
         assert np.array_equal(rows["observation"], first) and np.array_equal(rows["following"], last) and terminated.all()
@@ -138,24 +144,56 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
         assert not np.array_equal(run.observation, last) and len(run.episodes) == 4
     kwargs = {"action_repeat": 4, "max_episode_steps": 1}
     run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
-    run.collect(at_random=True)
+    collect(run)
     assert run.replay.rows["goes_on"][:4].tolist() == [1] * 4 and len(run.episodes) == 4
     assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
 
 
-def test_costs_have_a_price_that_grows_and_a_loss_weighs_no_more_than_the_least_reward(single):
-    """The sheet is torn: corners move apart at full speed, and each remaining step costs 1."""
+def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than_the_least_reward(single):
+    """The sheet is torn: corners move apart at full speed, and each remaining step costs 1, of 150."""
+    config = {"env": "ClothStrain-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}}
+    # the discounted sum of 30 a decision: 30 / (1 - gamma)
+    for gamma, most in ((0.9, 150), (0.7, 100)):
+        own = {"n_envs": 2, "cost_limit": 0.3, "least_reward": -0.02, "gamma": gamma}
+        hyperparameters = single.asdict(options(single, **own))
+        run = single.Run(config | {"env_kwargs": {"action_repeat": 30}, "hyperparameters": hyperparameters}, None)
+        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float))
+        collect(run)
+        assert run.replay.rows["cost"][:2].tolist() == pytest.approx([most, 0]) and run.replay.rows["goes_on"][:2].tolist() == [0, 1]
+        assert run.replay.rows["reward"][0] == pytest.approx(-0.2) and run.replay.rows["reward"][1] > -0.2
+
+
+def test_a_policy_pays_the_price_of_its_costs(single):
+    """Of an action a the reward is a, and the cost a^2: best is a = 1 / (2 multiplier)."""
     import torch
 
-    config = {"env": "ClothStrain-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}}
-    kwargs, own = {"action_repeat": 150}, {"n_envs": 2, "cost_price": 0.01, "least_reward": -0.5}
-    run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **own))}, None)
-    run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float))
-    run.collect(at_random=True)
-    assert run.replay.rows["cost"][:2].tolist() == [150, 0] and run.replay.rows["goes_on"][:2].tolist() == [0, 0]
-    reward, cost = torch.tensor([3.0, 3.0]), torch.tensor([20.0, 200.0])
-    for run.done, want in ((0, [3, 3]), (250, [2.5, -2]), (500, [1, -5]), (750, [1, -5])):
-        assert run.charged(reward, cost).tolist() == pytest.approx(want)
+    for multiplier, want in ((0.0, 1.0), (1.0, 0.5), (2.0, 0.25)):
+        torch.manual_seed(0)
+        agent = single.Agent(1, 1, options(single, cost_limit=0.1, first_alpha=1e-4, target_entropy=-3.0, learning_rate=0.01))
+        agent.multiplier = multiplier
+        for _ in range(400):
+            action = 2 * torch.rand(64, 1) - 1
+            seen, goes_on = torch.zeros(64, 1), torch.zeros(64)
+            batch = {"observation": seen, "following": seen, "action": action, "reward": action[:, 0], "cost": action[:, 0] ** 2}
+            agent.update(batch | {"goes_on": goes_on}, with_policy=True)
+        found = torch.tanh(agent.policy(torch.zeros(1, 1))[0, 0]).item()
+        assert found == pytest.approx(want, abs=0.06), multiplier
+        reward, cost = agent.values(agent.critics, torch.zeros(1, 1), torch.tensor([[0.5]])).flatten().tolist()
+        assert (reward, cost) == pytest.approx((0.5, 0.25), abs=0.05)
+
+
+def test_the_price_follows_the_costs_of_the_last_episodes(single):
+    config = {"env": "ClothStrain-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}, "env_kwargs": {}}
+    own = {"n_envs": 1, "cost_limit": 1.0, "multiplier_rate": 0.01}
+    run = single.Run(config | {"hyperparameters": single.asdict(options(single, **own))}, None)
+    run.set_multiplier()
+    assert run.agent.multiplier == 0
+    # over the limit by 2, then by more than counts, then under it by 1
+    for costs, want in (([2, 4], 0.02), ([40, 40], 0.12), ([0], 0.11), ([0], 0.10)):
+        run.episodes.clear()
+        run.episodes.extend((1.0, 1.0, cost) for cost in costs)
+        run.set_multiplier()
+        assert run.agent.multiplier == pytest.approx(want)
 
 
 def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
@@ -167,7 +205,7 @@ def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
         # it is never let go: the episode takes all of its 60 control steps, and settles for 85
         run.rng = SimpleNamespace(uniform=lambda low, high, size: np.full(size, -0.1))
         for _ in range(steps):
-            run.collect(at_random=True)
+            collect(run)
         found[settling] = {name: part[: run.replay.added] for name, part in run.replay.rows.items()}
         assert len(run.episodes) == 1 and run.replay.added == 15
     for name, part in found["at_once"].items():
@@ -218,7 +256,7 @@ def test_a_run_leaves_its_story_and_the_same_bits_again(single, tmp_path, monkey
     updates = trained(single, monkeypatch, tmp_path / "one")
     trained(single, monkeypatch, tmp_path / "other")
     # 50 decisions of each environment, the first 8 of them at random
-    assert updates == 2 * (50 - 8 + 1)
+    assert updates == 2 * (50 - 8)
     one, other = (policies.read(tmp_path / name / "policy.npz") for name in ("one", "other"))
     for (weight, bias), (again, too) in zip(one.layers, other.layers):
         assert np.array_equal(weight, again) and np.array_equal(bias, too)
@@ -241,9 +279,9 @@ def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatc
     trained(single, monkeypatch, folder, stop_at=50)
     state = load_last(folder)
     # 25 decisions of each environment were done at the evaluation
-    assert state["num_timesteps"] == 800 and state["num_updates"] == 36 and int(state["variables"]["added"]) == 200
+    assert state["num_timesteps"] == 800 and state["num_updates"] == 34 and int(state["variables"]["added"]) == 200
     run = single.Run(single.policies.read_config(folder), state)
-    assert run.replay.filled == 200 and run.done == 800 and run.updates == 36
+    assert run.replay.filled == 200 and run.done == 800 and run.updates == 34
     again = run.state(state["times"])
     for part in ("policy", "variables"):
         assert all(value.equal(state[part][name]) for name, value in again[part].items())

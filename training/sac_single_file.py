@@ -4,9 +4,13 @@
     python training/sac_single_file.py --resume runs/ClothReach-v0_sac_scratch_0
 
 Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), with the temperature of its section 5.  Three changes make
-it learn on 32 and more environments at once: several updates follow each step of the batch, critics have layer normalization (Ba et
-al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
-Rates depend on counts of steps, not on time, so the same command again gives the same policy.
+it learn on 32 and more environments at once: several updates go with each step of the batch, critics have layer normalization (Ba
+et al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
+Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
+Walk in the Real World with Minimal Human Effort", 2020).
+
+The environments step in a thread of their own while the nets are updated from the transitions before, so a run takes two cores.
+Rates depend on counts of steps, not on time, so the same command again gives the same policy, on any number of cores.
 
 The folder holds what ``train.py`` leaves: config.json, checkpoint.pt, one a minute, with the replay buffer, progress.jsonl,
 policy.npz, evaluation.json, learning_curve.png and policy.gif.  A run that goes on begins new episodes.
@@ -18,6 +22,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -42,11 +47,14 @@ LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviatio
 FIRST_LOG_STD = -1.5
 NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
+EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
+MOST_EXCESS = 10.0  # of a mean cost over its limit: an untrained policy's must not stop it before it has learned to move
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
     "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
     "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1), "tau": (0, 1), "first_alpha": (1e-6, 10),
-    "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "cost_price": (0, 1e6), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
+    "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "cost_limit": (0, 1e6),
+    "multiplier_rate": (0, 1), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
     "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
 }  # fmt: skip
 
@@ -65,9 +73,11 @@ class Options:
     gamma: float = 0.95  # discount of a decision, that is, of action_repeat control steps
     tau: float = 0.01  # share of the critics that their targets take over in an update
     first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
+    target_entropy: float = -1.0  # of each number of an action; less means less noise
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
     least_reward: float = -1e6  # of a decision: what is lost by a release, or at an episode's end, weighs no more than this
-    cost_price: float = 0.0  # of a cost, in rewards, in the second half of the run; in the first it grows from 0, as time squared
+    cost_limit: float | None = None  # the mean cost of an episode that is allowed
+    multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -131,7 +141,7 @@ class Args:
 def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
     for name, value in numbers.items():
         least, most = LIMITS[name]
-        for one in np.atleast_1d(value):
+        for one in () if value is None else np.atleast_1d(value):
             if not least <= one <= most:  # NaN is not, either
                 raise ValueError(f"{prefix}{name.replace('_', '-')} {value}: must be from {least} to {most}")
 
@@ -140,7 +150,10 @@ def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
 
 
 class Agent:
-    """A policy, two critics and their slow copies, the targets; and the temperature, which a policy of less entropy lowers."""
+    """A policy, its critics and their slow copies, the targets; and the temperature, which a policy of less entropy lowers.
+
+    critics: two of the reward; where costs are limited, two of the cost follow.  multiplier: price of a cost, in scaled rewards.
+    """
 
     def __init__(self, observations: int, actions: int, options: Options) -> None:
         import torch  # imported in functions: it takes seconds, after all checks of arguments
@@ -152,17 +165,18 @@ class Agent:
                 layers += [nn.Linear(size, following), *([nn.LayerNorm(following)] if normalized else []), nn.ReLU()]
             return nn.Sequential(*layers, nn.Linear(sizes[-1], outputs))
 
-        self.options, self.target_entropy = options, -float(actions)
+        self.options, self.target_entropy, self.multiplier = options, options.target_entropy * actions, 0.0
         # the policy's outputs: means, then logarithms of standard deviations
         self.policy = net(observations, 2 * actions, normalized=False)
         nn.init.constant_(self.policy[-1].bias[actions:], FIRST_LOG_STD)
         self.critics, self.targets = (
-            nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(2)) for _ in range(2)
+            nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(2 if options.cost_limit is None else 4))
+            for _ in range(2)
         )
         self.targets.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.tensor(math.log(options.first_alpha), requires_grad=True)
         parts = {"policy": self.policy.parameters(), "critics": self.critics.parameters(), "alpha": [self.log_alpha]}
-        self.optimizers = {name: torch.optim.Adam(part, options.learning_rate) for name, part in parts.items()}
+        self.optimizers = {name: torch.optim.Adam(part, options.learning_rate, fused=True) for name, part in parts.items()}
 
     def act(self, observation: Any) -> tuple[Any, Any]:
         """Actions drawn from the policy, (batch, numbers), and the logarithms of their probability densities, (batch,).
@@ -180,14 +194,21 @@ class Agent:
         return torch.tanh(u), density.sum(-1)
 
     def values(self, critics: Any, observation: Any, action: Any) -> Any:
-        """What each critic says, (2, batch)."""
+        """What both critics say of the reward to come, at least, and of the cost to come, at most, (1 or 2, batch)."""
+        import torch
+
+        said = self.all_values(critics, observation, action)
+        return torch.stack([said[:2].amin(0), *([said[2:].amax(0)] if len(said) > 2 else [])])
+
+    def all_values(self, critics: Any, observation: Any, action: Any) -> Any:
+        """What each critic says, (2 or 4, batch)."""
         import torch
 
         pair = torch.cat([observation, action], dim=-1)
         return torch.stack([critic(pair).squeeze(-1) for critic in critics])
 
     def update(self, batch: dict[str, Any], with_policy: bool) -> None:
-        """Learn from a minibatch: observation, action, reward, following observation, and 0 where an episode has terminated."""
+        """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end."""
         import torch
 
         alpha = self.log_alpha.detach().exp()
@@ -196,16 +217,20 @@ class Agent:
             # the temperature falls while the entropy is above its target, and rises below it
             loss = -(self.log_alpha * (log_density.detach() + self.target_entropy)).mean()
             self._step("alpha", loss, [self.log_alpha])
-        # both critics: towards the reward and the lower of the targets' values, with the entropy's worth, of what follows
+        # critics: towards what was earned, or what it cost, and the targets' values of what follows; to the reward's the entropy's
+        # worth is added
         with torch.no_grad():
             following, density = self.act(batch["following"])
-            value = self.values(self.targets, batch["following"], following).amin(0) - alpha * density
-            wanted = batch["reward"] + self.options.gamma * batch["goes_on"] * value
-        error = self.values(self.critics, batch["observation"], batch["action"]) - wanted
+            values = self.values(self.targets, batch["following"], following)
+            values[0] -= alpha * density
+            now = torch.stack([batch["reward"], batch["cost"]][: len(values)])
+            wanted = (now + self.options.gamma * batch["goes_on"] * values).repeat_interleave(2, dim=0)
+        error = self.all_values(self.critics, batch["observation"], batch["action"]) - wanted
         self._step("critics", 0.5 * error.square().mean(1).sum(), list(self.critics.parameters()))
-        # the policy: towards actions that both critics value, and towards entropy
+        # the policy: towards actions that the critics value, at the price of their costs, and towards entropy
         if with_policy:
-            value = self.values(self.critics, batch["observation"], action).amin(0)
+            values = self.values(self.critics, batch["observation"], action)
+            value = values[0] if len(values) == 1 else (values[0] - self.multiplier * values[1]) / (1 + self.multiplier)
             self._step("policy", (alpha * log_density - value).mean(), list(self.policy.parameters()))
         with torch.no_grad():
             for target, one in zip(self.targets.parameters(), self.critics.parameters()):
@@ -311,8 +336,8 @@ class Run:
         done: control steps so far.  updates: of the critics so far.
         easy: whether the environments are those of the curriculum.
         last: each environment's last decision; settling: whether its sheet settles since then.
-        collecting: seconds in which environments stepped, and the policy acted.
-        episodes: success and performance of the last training episodes, which have noise.
+        collecting: seconds in which environments stepped.
+        episodes: success, performance and cost of the last training episodes, which have noise.
     """
 
     def __init__(self, config: dict[str, Any], state: dict[str, Any] | None) -> None:
@@ -330,7 +355,8 @@ class Run:
         self.agent, self.normalizer = Agent(*sizes, self.options), Normalizer(sizes[0], self.options.normalize)
         self.replay = Replay(self.options.buffer_size, *sizes)
         self.last = Replay(self.options.n_envs, *sizes).rows
-        self.episodes: deque[tuple[float, float]] = deque(maxlen=200)
+        self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
+        self.thread = ThreadPoolExecutor(1)
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
             self.restore(state)
@@ -360,58 +386,71 @@ class Run:
         """A step of the batch and its updates, again and again, until the control steps are done; yields how many were done."""
         options, least = self.options, LEARNED_FROM
         while self.done < self.config["timesteps"]:
-            begun = time.perf_counter()
-            self.collect(at_random=self.replay.added < least)
-            self.collecting += time.perf_counter() - begun
-            self.done += options.n_envs * self.env.task.control_steps
-            if self.replay.added >= least:
+            learns = self.replay.added >= least
+            action = self.choose(at_random=not learns)
+            stepping = self.thread.submit(self.step, action)
+            if learns:
                 self.agent.set_rate(options.learning_rate * max(1 - self.done / self.config["timesteps"], LEAST_RATE))
                 for batch in self.replay.minibatches(options.updates, options.batch_size, self.rng, self.normalizer):
                     self.updates += 1
-                    batch["reward"] = self.charged(batch["reward"], batch["cost"])
                     self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
+            self.keep(action, *stepping.result())
+            self.set_multiplier()
+            self.done += options.n_envs * self.env.task.control_steps
             yield options.n_envs * self.env.task.control_steps
             if self.easy and self.done >= self.config["curriculum"]["n_timesteps"]:
                 self.enter()
 
-    def charged(self, reward: Any, cost: Any) -> Any:
-        """Rewards, which have their scale, less costs at the present price, and none below the least."""
-        scale, grown = self.options.reward_scale, min(2 * self.done / self.config["timesteps"], 1.0) ** 2
-        return (reward - scale * self.options.cost_price * grown * cost).clamp(min=scale * self.options.least_reward)
+    def set_multiplier(self) -> None:
+        """Dual ascent: the price of costs grows while the mean cost of the last training episodes is above its limit."""
+        if self.options.cost_limit is not None and self.episodes:
+            excess = min(float(np.mean([cost for *_, cost in self.episodes])) - self.options.cost_limit, MOST_EXCESS)
+            self.agent.multiplier = max(self.agent.multiplier + self.options.multiplier_rate * excess, 0.0)
 
-    def collect(self, at_random: bool) -> None:
-        """One decision of each environment, into the replay buffer.
-
-        While a sheet settles actions have no effect: what it earns then is of the last decision before, as with
-        ``settling="at_once"``, which not every sheet takes.
-        """
+    def choose(self, at_random: bool) -> NDArray:
+        """A decision of each environment."""
         import torch
 
-        before, last, acting = self.observation, self.last, ~self.settling
-        self.normalizer.see(before[acting])
+        self.normalizer.see(self.observation[~self.settling])
         if at_random:
-            action = self.rng.uniform(-1, 1, (len(before), *self.env.single_action_space.shape)).astype(np.float32)
-        else:
-            with torch.no_grad():
-                action = self.agent.act(self.normalizer(before))[0].numpy()
-        observation, reward, terminated, truncated, info = self.env.step(action)
+            return self.rng.uniform(-1, 1, (len(self.observation), *self.env.single_action_space.shape)).astype(np.float32)
+        with torch.no_grad():
+            return self.agent.act(self.normalizer(self.observation))[0].numpy()
+
+    def step(self, action: NDArray) -> tuple[Any, ...]:
+        """What the environments give for their decisions."""
+        begun = time.perf_counter()
+        given = self.env.step(action)
+        self.collecting += time.perf_counter() - begun
+        return given
+
+    def keep(self, action: NDArray, observation: Any, reward: NDArray, terminated: NDArray, truncated: NDArray, info: Any) -> None:
+        """Decisions and what followed, into the replay buffer.
+
+        While a sheet settles actions have no effect: what it earns then is of the last decision before, as with
+        ``settling="at_once"``, which not every sheet takes.  A torn sheet costs, as discounted here, what one would that costs in
+        all steps to come.
+        """
+        options, before, last, acting = self.options, self.observation, self.last, ~self.settling
         following = self.observation = self.flat(observation)
         cost = info.get("cost", np.zeros(len(reward))).copy()
         # in same-step mode an environment that has ended shows the next episode's first observation already
         if (ended := np.flatnonzero(terminated | truncated)).size:
-            following = following.copy()
+            following, final = following.copy(), info["final_info"]
             for i in ended:
                 following[i] = self.flat(info["final_obs"][i])
-            final = info["final_info"]
             cost[ended] = final.get("cost", cost)[ended]
-            self.episodes.extend(zip(final["is_success"][ended].tolist(), final["normalized_performance"][ended].tolist()))
+            scores = (final["is_success"], final["normalized_performance"], final.get("episode_cost", np.zeros(len(reward))))
+            self.episodes.extend(zip(*(score[ended].tolist() for score in scores)))
+        cost = np.minimum(cost, self.env.task.control_steps / (1 - min(options.gamma, 0.999)))
         last["observation"][acting], last["action"][acting] = before[acting], action[acting]
-        for name, earned in (("reward", self.options.reward_scale * reward), ("cost", cost)):
+        for name, earned in (("reward", options.reward_scale * reward), ("cost", cost)):
             last[name][acting] = 0
             last[name] += earned
         last["following"], last["goes_on"] = following, ~terminated
         self.settling = info["settling"]
-        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
+        kept = {name: part[~self.settling] for name, part in last.items()}
+        self.replay.add(**kept | {"reward": np.maximum(kept["reward"], options.reward_scale * options.least_reward)})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it."""
@@ -438,7 +477,8 @@ class Run:
             "policy": agent.policy.state_dict(),
             "optimizer": {name: one.state_dict() for name, one in agent.optimizers.items()}
             | {"of critics": agent.critics.state_dict(), "of targets": agent.targets.state_dict()},
-            "variables": parts, "constraint": {}, "num_timesteps": self.done, "num_updates": self.updates, "times": times,
+            "variables": parts, "constraint": {"multiplier": agent.multiplier},
+            "num_timesteps": self.done, "num_updates": self.updates, "times": times,
         }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -454,7 +494,7 @@ class Run:
             agent.targets.load_state_dict(optimizers.pop("of targets"))
             for name, one in agent.optimizers.items():
                 one.load_state_dict(optimizers[name])
-            agent.log_alpha.data = parts["log_alpha"]
+            agent.log_alpha.data, agent.multiplier = parts["log_alpha"], state["constraint"]["multiplier"]
             for name in ("mean", "variance"):
                 setattr(self.normalizer, name, parts[name].numpy())
             self.normalizer.count, self.replay.added = float(parts["count"]), int(parts["added"])
@@ -486,7 +526,8 @@ def train(args: Args) -> None:
         for count in run.steps():
             bar.update(count)
             if run.episodes:
-                bar.set_postfix_str("success {:.2f}, performance {:.2f}".format(*np.mean(run.episodes, axis=0)), refresh=False)
+                shown = "success {:.2f}, performance {:.2f}, cost {:.2f}".format(*np.mean(run.episodes, axis=0))
+                bar.set_postfix_str(shown, refresh=False)
             is_last = run.done >= config["timesteps"]
             evaluated = is_last or run.done // every > (run.done - count) // every
             if evaluated or record.is_due():
