@@ -98,9 +98,9 @@ class Args:
     """Keyword arguments of the environment, as JSON: '{"action_repeat": 2}'; over those of the hyperparameter file."""
     options: str = "{}"
     """Hyperparameters, as JSON: '{"timesteps": 100000, "gamma": 0.9}'; over those of the hyperparameter file."""
-    evaluations: int = 5
+    evaluations: int = 10
     """Evaluations on the way."""
-    eval_episodes: int = 100
+    eval_episodes: int = 50
     """Held-out episodes of each of them."""
     final_episodes: int = 500
     """Held-out episodes of the final evaluation, by the mean action; the first 200 of them also with noise."""
