@@ -141,12 +141,12 @@ def test_an_episode_s_end_is_followed_by_its_own_last_observation(single, monkey
         last, reward, terminated, *_ = made.step(rows["action"])
         assert np.array_equal(rows["observation"], first) and np.array_equal(rows["following"], last) and terminated.all()
         assert rows["reward"] == pytest.approx(10 * reward) and rows["goes_on"].tolist() == [goes_on] * 4
-        assert not np.array_equal(run.observation, last) and len(run.episodes) == 4
+        assert not np.array_equal(run.now["observation"], last) and len(run.episodes) == 4
     kwargs = {"action_repeat": 4, "max_episode_steps": 1}
     run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, **more))}, None)
     collect(run)
     assert run.replay.rows["goes_on"][:4].tolist() == [1] * 4 and len(run.episodes) == 4
-    assert not np.array_equal(run.observation, run.replay.rows["following"][:4])
+    assert not np.array_equal(run.now["observation"], run.replay.rows["following"][:4])
 
 
 def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than_the_least_reward(single):
@@ -159,7 +159,10 @@ def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than
         run = single.Run(config | {"env_kwargs": {"action_repeat": 30}, "hyperparameters": hyperparameters}, None)
         run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float))
         collect(run)
-        assert run.replay.rows["cost"][:2].tolist() == pytest.approx([most, 0]) and run.replay.rows["goes_on"][:2].tolist() == [0, 1]
+        assert run.replay.rows["cost"][:2].tolist() == pytest.approx([most, 0]) and run.replay.rows["goes_on"][:2].tolist() == [
+            0,
+            1,
+        ]
         assert run.replay.rows["reward"][0] == pytest.approx(-0.2) and run.replay.rows["reward"][1] > -0.2
 
 
@@ -188,8 +191,8 @@ def test_the_price_follows_the_costs_of_the_last_episodes(single):
     run = single.Run(config | {"hyperparameters": single.asdict(options(single, **own))}, None)
     run.set_multiplier()
     assert run.agent.multiplier == 0
-    # over the limit by 2, then by more than counts, then under it by 1
-    for costs, want in (([2, 4], 0.02), ([40, 40], 0.12), ([0], 0.11), ([0], 0.10)):
+    # over the limit by a half, then by more than counts, then twice under it by 1
+    for costs, want in (([1.2, 1.8], 0.005), ([40, 40], 0.015), ([0], 0.005), ([0], 0.0)):
         run.episodes.clear()
         run.episodes.extend((1.0, 1.0, cost) for cost in costs)
         run.set_multiplier()
@@ -210,6 +213,34 @@ def test_decisions_that_a_settling_sheet_ignores_are_left_out(single):
         assert len(run.episodes) == 1 and run.replay.added == 15
     for name, part in found["at_once"].items():
         assert part == pytest.approx(found["steps"][name], abs=1e-5), name
+
+
+def test_of_pictures_the_policy_sees_nothing_else_and_critics_see_the_state(single):
+    import torch
+
+    config = {"env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}}
+    kwargs = {"physics": "fast", "obs_mode": "depth", "privileged": True, "image_size": 16}
+    run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, n_envs=3))}, None)
+    made = gym.make_vec("clothgym:ClothReach-v0", num_envs=3, autoreset_mode="Disabled", **kwargs)
+    first = made.reset(seed=int(np.random.SeedSequence([0, 0]).generate_state(2)[0] % (single.HELD_OUT - 3)))[0]
+    seen = torch.as_tensor(first["observation"][..., 0][:, None]).half()
+    torch.manual_seed(0)
+    want = run.agent.act(seen)[0].detach().numpy()
+    torch.manual_seed(0)
+    action = run.choose(at_random=False)
+    assert np.array_equal(action, want) and np.ptp(want, axis=0).min() > 0
+    run.keep(action, *run.step(action))
+    rows, second = run.replay.rows, made.step(action)[0]
+    for name, observation in (("", first), ("following_", second)):
+        assert np.array_equal(rows[f"{name}picture"][:3], np.moveaxis(observation["observation"], -1, 1).astype(np.float16))
+        assert np.array_equal(rows["following" if name else "observation"][:3], observation["state"])
+    # an update moves the encoder, too
+    encoder = run.agent.policy[0]
+    before = encoder.linear[0].weight.clone()
+    (batch,) = run.replay.minibatches(1, 8, run.rng, run.normalizer)
+    run.agent.update(batch, with_policy=True)
+    assert not encoder.linear[0].weight.equal(before)
+    assert np.array_equal(run.acts(made, first), torch.tanh(run.agent.policy(seen))[:, :3].detach().numpy())
 
 
 SHORT = {

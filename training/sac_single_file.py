@@ -7,7 +7,8 @@ Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), with th
 it learn on 32 and more environments at once: several updates go with each step of the batch, critics have layer normalization (Ba
 et al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
 Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
-Walk in the Real World with Minimal Human Effort", 2020).
+Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
+alone, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", 2018).
 
 The environments step in a thread of their own while the nets are updated from the transitions before, so a run takes two cores.
 Rates depend on counts of steps, not on time, so the same command again gives the same policy, on any number of cores.
@@ -45,10 +46,11 @@ ALGO = "sac_scratch"
 LEARNED_FROM = 3_000  # decisions at random, before the first update
 LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviation, before the tanh
 FIRST_LOG_STD = -1.5
+FOLLOWING = {"observation": "following", "picture": "following_picture"}  # names in the replay buffer
 NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
-MOST_EXCESS = 10.0  # of a mean cost over its limit: an untrained policy's must not stop it before it has learned to move
+MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sheets, and is not to learn from it to stand still
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
     "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
@@ -155,7 +157,8 @@ class Agent:
     critics: two of the reward; where costs are limited, two of the cost follow.  multiplier: price of a cost, in scaled rewards.
     """
 
-    def __init__(self, observations: int, actions: int, options: Options) -> None:
+    def __init__(self, observations: int, actions: int, options: Options, pictures: Any = None) -> None:
+        """pictures: the space of an observation with a picture; None where the policy sees what critics see."""
         import torch  # imported in functions: it takes seconds, after all checks of arguments
         from torch import nn
 
@@ -167,7 +170,13 @@ class Agent:
 
         self.options, self.target_entropy, self.multiplier = options, options.target_entropy * actions, 0.0
         # the policy's outputs: means, then logarithms of standard deviations
-        self.policy = net(observations, 2 * actions, normalized=False)
+        if pictures is None:
+            self.policy = net(observations, 2 * actions, normalized=False)
+        else:
+            from clothgym.adapters.pixels import DepthEncoder
+
+            encoder = DepthEncoder(pictures)
+            self.policy = nn.Sequential(encoder, *net(encoder.features_dim, 2 * actions, normalized=False))
         nn.init.constant_(self.policy[-1].bias[actions:], FIRST_LOG_STD)
         self.critics, self.targets = (
             nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(2 if options.cost_limit is None else 4))
@@ -178,7 +187,7 @@ class Agent:
         parts = {"policy": self.policy.parameters(), "critics": self.critics.parameters(), "alpha": [self.log_alpha]}
         self.optimizers = {name: torch.optim.Adam(part, options.learning_rate, fused=True) for name, part in parts.items()}
 
-    def act(self, observation: Any) -> tuple[Any, Any]:
+    def act(self, seen: Any) -> tuple[Any, Any]:
         """Actions drawn from the policy, (batch, numbers), and the logarithms of their probability densities, (batch,).
 
         ``a = tanh(u)`` with u from a normal distribution; ``log(1 - tanh(u)^2) = 2 (log 2 - u - softplus(-2u))``.
@@ -186,7 +195,7 @@ class Agent:
         import torch
         from torch.nn.functional import softplus
 
-        mean, log_std = self.policy(observation).chunk(2, dim=-1)
+        mean, log_std = self.policy(seen).chunk(2, dim=-1)
         log_std = log_std.clamp(*LOG_STD)
         noise = torch.randn_like(mean)
         u = mean + log_std.exp() * noise
@@ -208,19 +217,22 @@ class Agent:
         return torch.stack([critic(pair).squeeze(-1) for critic in critics])
 
     def update(self, batch: dict[str, Any], with_policy: bool) -> None:
-        """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end."""
+        """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end.
+
+        It may have the pictures of both observations, which the policy sees instead.
+        """
         import torch
 
         alpha = self.log_alpha.detach().exp()
         if with_policy:
-            action, log_density = self.act(batch["observation"])
+            action, log_density = self.act(batch.get("picture", batch["observation"]))
             # the temperature falls while the entropy is above its target, and rises below it
             loss = -(self.log_alpha * (log_density.detach() + self.target_entropy)).mean()
             self._step("alpha", loss, [self.log_alpha])
         # critics: towards what was earned, or what it cost, and the targets' values of what follows; to the reward's the entropy's
         # worth is added
         with torch.no_grad():
-            following, density = self.act(batch["following"])
+            following, density = self.act(batch.get(FOLLOWING["picture"], batch["following"]))
             values = self.values(self.targets, batch["following"], following)
             values[0] -= alpha * density
             now = torch.stack([batch["reward"], batch["cost"]][: len(values)])
@@ -293,12 +305,14 @@ class Normalizer:
 
 
 class Replay:
-    """The last transitions, row after row: arrays (buffer_size, ...)."""
+    """The last transitions, row after row: arrays (buffer_size, ...); pictures, of a shape, in half precision."""
 
-    def __init__(self, size: int, observations: int, actions: int) -> None:
+    def __init__(self, size: int, observations: int, actions: int, picture: tuple[int, ...] | None = None) -> None:
         shapes: dict[str, tuple[int, ...]] = {"observation": (observations,), "action": (actions,), "following": (observations,)}
         shapes |= dict.fromkeys(("reward", "cost", "goes_on"), ())
         self.rows = {name: np.zeros((size, *shape), np.float32) for name, shape in shapes.items()}
+        if picture is not None:
+            self.rows |= {name: np.zeros((size, *picture), np.float16) for name in ("picture", FOLLOWING["picture"])}
         self.size, self.added = size, 0
 
     @property
@@ -351,10 +365,11 @@ class Run:
         torch.manual_seed(self.seeds()[1])
         self.rng = np.random.default_rng([config["seed"], self.done])
         self.enter()
-        sizes = self.observation.shape[1], *self.env.single_action_space.shape
-        self.agent, self.normalizer = Agent(*sizes, self.options), Normalizer(sizes[0], self.options.normalize)
-        self.replay = Replay(self.options.buffer_size, *sizes)
-        self.last = Replay(self.options.n_envs, *sizes).rows
+        numbers, actions = self.now["observation"].shape[1], self.env.single_action_space.shape[0]
+        space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
+        self.agent, self.normalizer = Agent(numbers, actions, self.options, space), Normalizer(numbers, self.options.normalize)
+        self.replay = Replay(self.options.buffer_size, numbers, actions, picture)
+        self.last = Replay(self.options.n_envs, numbers, actions, picture).rows
         self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
         self.thread = ThreadPoolExecutor(1)
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
@@ -374,13 +389,23 @@ class Run:
         self.env: Any = made.unwrapped
         space = self.env.single_observation_space
         self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
+        self.pictured = "state" in self.keys
         # environment i begins with seed + i, below all held-out seeds
-        self.observation = self.flat(self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))[0])
+        self.now = self.parts(self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))[0])
         self.settling = np.zeros(self.options.n_envs, bool)
 
-    def flat(self, observation: Any) -> NDArray[np.float32]:
-        """An observation as one array, of goals as well."""
-        return np.concatenate([observation[key] for key in self.keys], axis=-1) if self.keys else observation
+    def parts(self, observation: Any) -> dict[str, NDArray]:
+        """An observation as one array, of goals as well; where there is a picture, the state, and the picture in half precision."""
+        if self.pictured:
+            picture = np.moveaxis(observation["observation"], -1, -3)
+            return {"observation": observation["state"], "picture": picture.astype(np.float16)}
+        return {"observation": np.concatenate([observation[key] for key in self.keys], axis=-1) if self.keys else observation}
+
+    def seen(self, parts: dict[str, NDArray]) -> Any:
+        """What the policy sees of an observation, as a tensor."""
+        import torch
+
+        return torch.as_tensor(parts["picture"]) if self.pictured else self.normalizer(parts["observation"])
 
     def steps(self) -> Iterator[int]:
         """A step of the batch and its updates, again and again, until the control steps are done; yields how many were done."""
@@ -411,11 +436,12 @@ class Run:
         """A decision of each environment."""
         import torch
 
-        self.normalizer.see(self.observation[~self.settling])
+        observation = self.now["observation"]
+        self.normalizer.see(observation[~self.settling])
         if at_random:
-            return self.rng.uniform(-1, 1, (len(self.observation), *self.env.single_action_space.shape)).astype(np.float32)
+            return self.rng.uniform(-1, 1, (len(observation), *self.env.single_action_space.shape)).astype(np.float32)
         with torch.no_grad():
-            return self.agent.act(self.normalizer(self.observation))[0].numpy()
+            return self.agent.act(self.seen(self.now))[0].numpy()
 
     def step(self, action: NDArray) -> tuple[Any, ...]:
         """What the environments give for their decisions."""
@@ -431,39 +457,51 @@ class Run:
         ``settling="at_once"``, which not every sheet takes.  A torn sheet costs, as discounted here, what one would that costs in
         all steps to come.
         """
-        options, before, last, acting = self.options, self.observation, self.last, ~self.settling
-        following = self.observation = self.flat(observation)
+        options, before, last, acting = self.options, self.now, self.last, ~self.settling
+        self.now = self.parts(observation)
+        following = {name: part.copy() for name, part in self.now.items()}
         cost = info.get("cost", np.zeros(len(reward))).copy()
         # in same-step mode an environment that has ended shows the next episode's first observation already
         if (ended := np.flatnonzero(terminated | truncated)).size:
-            following, final = following.copy(), info["final_info"]
+            final = info["final_info"]
             for i in ended:
-                following[i] = self.flat(info["final_obs"][i])
+                for name, part in self.parts(info["final_obs"][i]).items():
+                    following[name][i] = part
             cost[ended] = final.get("cost", cost)[ended]
             scores = (final["is_success"], final["normalized_performance"], final.get("episode_cost", np.zeros(len(reward))))
             self.episodes.extend(zip(*(score[ended].tolist() for score in scores)))
         cost = np.minimum(cost, self.env.task.control_steps / (1 - min(options.gamma, 0.999)))
-        last["observation"][acting], last["action"][acting] = before[acting], action[acting]
+        for name, part in before.items():
+            last[name][acting], last[FOLLOWING[name]] = part[acting], following[name]
+        last["action"][acting], last["goes_on"] = action[acting], ~terminated
         for name, earned in (("reward", options.reward_scale * reward), ("cost", cost)):
             last[name][acting] = 0
             last[name] += earned
-        last["following"], last["goes_on"] = following, ~terminated
         self.settling = info["settling"]
         kept = {name: part[~self.settling] for name, part in last.items()}
         self.replay.add(**kept | {"reward": np.maximum(kept["reward"], options.reward_scale * options.least_reward)})
 
     def policy(self, about: dict[str, Any]) -> Any:
-        """The mean action as it is now, as a file holds it."""
+        """The mean action as it is now, as a file holds it; None of a policy that sees pictures."""
         config = self.config
+        if self.pictured:
+            return None
         own = {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": ALGO, "seed": config["seed"]}
         return self.agent.exported(own | about, self.keys, self.normalizer)
+
+    def acts(self, env: Any, observations: Any) -> NDArray:
+        """The mean action."""
+        import torch
+
+        with torch.no_grad():
+            return torch.tanh(self.agent.policy(self.seen(self.parts(observations))).chunk(2, dim=-1)[0]).numpy()
 
     def noisy(self, env: Any, observations: Any) -> NDArray:
         """Actions with the noise of the policy."""
         import torch
 
         with torch.no_grad():
-            return self.agent.act(self.normalizer(self.flat(observations)))[0].numpy()
+            return self.agent.act(self.seen(self.parts(observations)))[0].numpy()
 
     def state(self, times: dict[str, float]) -> dict[str, Any]:
         """All that a run needs to go on, but for the episodes."""
@@ -502,9 +540,9 @@ class Run:
                 rows[: self.replay.filled] = parts[name].numpy()
 
 
-def acting(policy: Any) -> policies.Policy:
-    """An exported policy as evaluations take it."""
-    return lambda env, observations: policy(observations)
+def acting(run: Run, policy: Any) -> policies.Policy:
+    """The mean action as evaluations take it: by the exported policy, if there is one."""
+    return run.acts if policy is None else lambda env, observations: policy(observations)
 
 
 def train(args: Args) -> None:
@@ -534,7 +572,7 @@ def train(args: Args) -> None:
                 record.clock.stop()
                 record.collecting = run.collecting
                 if evaluated:
-                    line = record.note(acting(run.policy({})), run.done, args.eval_episodes)
+                    line = record.note(acting(run, run.policy({})), run.done, args.eval_episodes)
                     tqdm.write(f"{run.done:,} steps: success {line['success_rate']:.3f}, {line['normalized_performance']:.3f}")
                 save_tensors(folder / policies.CHECKPOINT, run.state(record.times()))
                 record.saved = time.perf_counter()
@@ -544,8 +582,10 @@ def train(args: Args) -> None:
     noisy = score(run_episodes(config["env"], run.noisy, seeds, **config["env_kwargs"]))
     said = {name: noisy[name] for name in ("episodes", "success_rate", "success_rate_ci95", "normalized_performance")}
     print(f"with noise: success {said['success_rate']:.3f}, performance {said['normalized_performance']:.3f}")
-    policy.about |= learning.conclude(record, acting(policy), args.final_episodes, {"with_noise": said})
-    policy.save(folder / learning.POLICY)
+    about = learning.conclude(record, acting(run, policy), args.final_episodes, {"with_noise": said})
+    if policy is not None:
+        policy.about |= about
+        policy.save(folder / learning.POLICY)
 
 
 if __name__ == "__main__":

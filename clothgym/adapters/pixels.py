@@ -30,9 +30,10 @@ class DepthEncoder(BaseFeaturesExtractor):
         )
         self.linear = nn.Sequential(nn.Linear(3 * CHANNELS, FEATURES), nn.Tanh())
 
-    def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
+    def forward(self, observations: dict[str, torch.Tensor] | torch.Tensor) -> torch.Tensor:
+        pictures = observations["observation"] if isinstance(observations, dict) else observations
         # heights above the target, of the size of 1
-        height = 4 - 4 * observations["observation"].float() / self.middle
+        height = 4 - 4 * pictures.float() / self.middle
         seen = self.convolutions(torch.cat([height, _coordinates(height).expand(len(height), -1, -1, -1)], dim=1))
         places = torch.softmax(seen.flatten(2), dim=2) @ _coordinates(seen).flatten(2)[0].T
         return self.linear(torch.cat([places.flatten(1), seen.mean(dim=(2, 3))], dim=1))
