@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from clothgym.envs import randomization
 from clothgym.envs.episode import LAST, names_of
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ def of_batch(task: Task) -> dict[str, Any]:
     if task.simulation.self_collision is not None:
         info |= {name: task.physical[name].copy() for name, _ in PHYSICAL}
     info["failure"] = task.outcome["failure"].copy()
+    info |= randomization.told(task)
     return info | {f"reward/{name}": task.terms[name].copy() for name in names_of(task.terms)}
 
 
@@ -96,6 +98,7 @@ def of_one(task: Task, env: int) -> dict[str, Any]:
     if task.simulation.self_collision is not None:
         info |= dict(zip(names_of(task.physical), task.physical[env].item()))
     info["failure"] = task.outcome["failure"][env].item()
+    info |= {name: values[env].item() for name, values in randomization.told(task).items()}
     return info | {f"reward/{name}": value for name, value in zip(names_of(task.terms), task.terms[env].item())}
 
 

@@ -107,7 +107,11 @@ COMMON: dict[str, tuple[str, str]] = {
         "1", "or a learner's discount: a step that does not end the episode gives ``gamma Phi' - Phi`` of the potential, a neutral "
         "shaping (Ng et al. 1999)",
     ),
-    "randomize": ("``{}``", 'ranges of material properties drawn at reset, ``{"density": [0.1, 0.2]}``'),
+    "randomize": (
+        "``{}``",
+        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, and ``action_delay`` (control '
+        "steps), ``action_noise`` and ``observation_noise`` (standard deviations); info has what was drawn",
+    ),
     "wind": (
         "``None``", 'the arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle',
     ),

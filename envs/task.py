@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from clothgym import _jit, integrators
 from clothgym.checks import count, not_negative, number, numbers, one_of, shown
 from clothgym.collisions import Collider, Plane
-from clothgym.envs import answers, hooks
+from clothgym.envs import answers, hooks, randomization
 from clothgym.envs.episode import Fields, TaskState, check_state, checked_seeds, generator_of, names_of, record_of, records
 from clothgym.envs.generators import Generators
 from clothgym.envs.measures import centers_of_area, key_particles
@@ -30,7 +30,6 @@ from clothgym.envs.physics import (
     Physics,
     check_ranges,
     checked_material_option,
-    checked_ranges,
     checked_wind,
     chosen_fabric,
     most_demanding,
@@ -91,7 +90,8 @@ class Task:
             that ends within them ends there.
         gamma: discount of the agent's steps to which the shaping is adapted: a step that does not end the episode gives
             ``gamma Phi' - Phi`` as the potential goes from Phi to Phi', so that no policy gains by it (Ng et al. 1999).
-        randomize: ranges of material properties drawn at each reset, ``{"density": [0.1, 0.2]}``.
+        randomize: ranges from which each episode draws material properties, and the delay and noise of actions and observations,
+            ``{"density": [0.1, 0.2], "action_delay": [0, 2]}``, see ``randomization``; what was drawn is in info.
         settling: "steps", or "at_once": the agent's last step continues until its sheet has settled and is evaluated.
         wind: arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
         threads: threads to use; all cores by default for a batch.
@@ -121,6 +121,7 @@ class Task:
         episode: records of the episodes' variables, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
         observation_slices: slice of each observation in ``observation[env]``, the state vector, by its name.
+        disturbances: delay and noise that ``randomize`` asks for.
         observed: the observations that ``reset`` and ``step`` return.
         rules: one record of numbers that all environments share.
         outcome, info, physical, terms: records of the results of the last step or reset, (num_envs,), see ``answers``.
@@ -190,7 +191,7 @@ class Task:
         own, self.physics_name = self.physics.chosen(physics), physics
         sized, self.sheet = own.with_sheet(rows, side), (rows, side)
         fixed = self.physics = replace(sized, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
-        self.randomize = checked_ranges({} if randomize is None else randomize)
+        self.randomize, self.disturbances = randomization.checked({} if randomize is None else randomize)
         self.wind = fixed.wind if wind is None else checked_wind(wind)
         if air_density is None:
             air_density = fixed.air_density if wind is None else AIR_DENSITY
@@ -227,7 +228,7 @@ class Task:
         self.generators = Generators(num_envs)
         self._begun = np.zeros(num_envs, bool)
         self.turn = CallGuard("environment", error=gym.error.ResetNeeded)
-        self.state_space = gym.spaces.Box(-self._bound, self._bound, dtype=np.float32)
+        self.state_space = gym.spaces.Box(-self.state_bound, self.state_bound, dtype=np.float32)
         self.observed = Observer(self, obs_mode, image_size, camera, num_points, privileged)
 
     def _prepare_records(self) -> None:
@@ -235,7 +236,7 @@ class Task:
         physics, count = self.physics, self.num_envs
         points = "particles" if self.obs_mode == "particles" else "keypoints"
         vector = StateVector(self, points)
-        self.particles, self.observation_slices, self._bound = vector.particles, vector.slices, vector.bound
+        self.particles, self.observation_slices, self.state_bound = vector.particles, vector.slices, vector.bound
         self.observation = np.zeros((count, len(vector.bound)), np.float32)
         # what the task declares, as records for its kernels and as the numbers in them
         self.seen = records(count, [(one.name, np.float32, one.shape) for one in self.observations])
@@ -244,6 +245,7 @@ class Task:
         memory: list[tuple[Any, ...]] = [("step", np.int64), ("settling_since", np.int64), ("over", bool)]
         memory += [("targets", float, attachment), ("potential", float)]
         memory += [("origin", np.float32, 3), ("material", float, len(PROPERTIES))]
+        memory += self.disturbances.remembers(self.single_action_space.shape[0])
         if self._in_numpy:
             memory += [("performance", float), ("success", bool), ("done", bool)]
         memory += hooks.fields(self, "remembers()", self.remembers(), [name for name, *_ in memory])
@@ -252,10 +254,10 @@ class Task:
         steps = self.acting_steps + self.settling_steps if self.wind is not None else 0
         self.air = np.zeros((count, steps, 3))
         # valid ranges of the state, and its identity
-        share, bound = (-ROUNDING, 1 + ROUNDING), self._bound
+        share, bound = (-ROUNDING, 1 + ROUNDING), self.state_bound
         self._ranges: dict[str, Any] = {
             "step": (0, self.acting_steps + self.settling_steps), "settling_since": (-1, self.acting_steps), "potential": share,
-            "performance": share, "observation": (-bound, bound), **self.ranges,
+            "performance": share, "observation": (-bound, bound), **self.disturbances.ranges, **self.ranges,
         }  # fmt: skip
         # what all environments share
         self.rules = record_of(
@@ -473,6 +475,8 @@ class Task:
             if self.wind is not None:
                 self.air[env] = self.wind.series(generator, self.air.shape[1], self.physics.time_step)
             starts[k] = hooks.start(self, env, generator, options)
+            # last, so that the start is what it is without them
+            self.disturbances.draw(self.episode[env], generator)
         return starts
 
     def _begin(self, envs: NDArray, warn: bool) -> None:
@@ -491,6 +495,7 @@ class Task:
         for brought in (self.outcome, self.info, self.physical, self.terms):
             brought[envs] = np.zeros((), brought.dtype)
         self._score_and_observe(envs, begins=True)
+        self.disturbances.observed(self, envs)
         answers.note_physics(self, envs)
         self.observed.begun(envs)
 
@@ -578,6 +583,8 @@ class Task:
         actions: velocities of the attachments and further numbers, (num_envs, numbers), float64.
         """
         simulation, chosen = self.simulation, self._everyone if envs is None else envs
+        running = chosen[~self.episode["over"][chosen]]
+        actions = self.disturbances.applied(self, actions, running)
         self.turn.unfinished = range(self.num_envs)
         wrong = self._apply_actions(
             chosen, actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders
@@ -593,6 +600,7 @@ class Task:
                 self.info[chosen] = np.zeros((), self.info.dtype)
                 self.after_step()
             self._score_and_observe(chosen, begins=False)
+            self.disturbances.observed(self, running)
             # anchors that an action has opened let go after the step in which it did
             if self.outcome["free"].any():
                 simulation.release(*np.nonzero(self.outcome["free"]))
@@ -633,7 +641,7 @@ class Task:
             self._finish_step(
                 first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.attachments, view.openings, view.blocked,
                 pulls, mesh, self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more,
-                self._bound, self.observation,
+                self.state_bound, self.observation,
             )  # fmt: skip
 
         _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))

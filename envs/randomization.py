@@ -1,0 +1,103 @@
+"""``randomize=``: each episode draws its fabric, and how late and how noisy actions and observations are.
+
+Policies meet delay and noise outside of a simulation (Peng et al. 2018, "Sim-to-real transfer of robotic control with dynamics
+randomization").  They are drawn from the environment's own generator, so an episode is the same in any batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import finite, shown
+from clothgym.envs.episode import Fields
+from clothgym.envs.physics import checked_ranges
+from clothgym.parameters import PROPERTIES
+
+if TYPE_CHECKING:
+    from clothgym.envs.task import Task
+
+# the greatest end of each range; the least is 0
+LIMITS = {"action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
+PREFIX = "randomization/"  # of the keys in info
+
+
+class Disturbances:
+    """Delay and noise of the actions, and noise of the observations, of a batch.
+
+    Attributes:
+        ranges: of those of ``LIMITS`` that are drawn: ``action_delay``, in control steps, and standard deviations of normal noise,
+            ``action_noise``, in each number of an action and control step, and ``observation_noise``, in each number of the
+            state vector, in its unit.
+        longest: the longest delay.
+    """
+
+    def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
+        self.ranges: dict[str, tuple[float, float]] = {}
+        for name, bounds in ranges.items():
+            pair = finite(f"randomize: {name}", bounds)
+            if pair.shape != (2,) or not 0 <= pair[0] <= pair[1] <= LIMITS[name]:
+                raise ValueError(f"randomize: {name}={shown(bounds)} must be a range [low, high] from 0 to {LIMITS[name]}")
+            if name == "action_delay" and (pair != np.rint(pair)).any():
+                raise ValueError(f"randomize: {name}={shown(bounds)} must be a range of whole control steps")
+            self.ranges[name] = pair[0].item(), pair[1].item()
+        self.longest = int(self.ranges.get("action_delay", (0, 0))[1])
+
+    def remembers(self, actions: int) -> Fields:
+        """Fields of an episode: what it has drawn, and the last actions, those of control step t in row ``t mod (longest + 1)``."""
+        drawn: Fields = [(name, float) for name in self.ranges]
+        return [*drawn, ("last_actions", float, (self.longest + 1, actions))] if self.longest else drawn
+
+    def draw(self, own: Any, generator: np.random.Generator) -> None:
+        """Draw an episode's, into its record."""
+        for name, (low, high) in self.ranges.items():
+            own[name] = generator.integers(int(low), int(high) + 1) if name == "action_delay" else generator.uniform(low, high)
+
+    def applied(self, task: Task, actions: NDArray, envs: NDArray) -> NDArray:
+        """What reaches the attachments in a control step: noisy actions of some steps ago, zeros in the first steps.
+
+        actions: (num_envs, numbers), float64; returned as they are where they are not finite, to be refused.
+        """
+        if not self.ranges.keys() & {"action_delay", "action_noise"} or not np.isfinite(actions).all():
+            return actions
+        applied = actions.copy()
+        for env in envs.tolist():
+            own = task.episode[env]
+            if "action_noise" in self.ranges:
+                applied[env] += own["action_noise"] * task.generators[env].normal(size=actions.shape[1])
+            if self.longest:
+                step, delay, rows = int(own["step"]), int(own["action_delay"]), self.longest + 1
+                own["last_actions"][step % rows] = applied[env]
+                applied[env] = own["last_actions"][(step - delay) % rows] if step >= delay else 0
+        return applied
+
+    def observed(self, task: Task, envs: NDArray) -> None:
+        """Add noise to the observations of environments, within the observation's bounds."""
+        if "observation_noise" in self.ranges:
+            for env in envs.tolist():
+                noise = task.episode["observation_noise"][env] * task.generators[env].normal(size=task.observation.shape[1])
+                task.observation[env] = np.clip(task.observation[env] + noise, -task.state_bound, task.state_bound)
+
+
+def checked(ranges: Any) -> tuple[dict[str, tuple[float, float]], Disturbances]:
+    """Ranges of the fabric's properties, and the rest.
+
+    Raises:
+        ValueError: an unknown name, or a range that it cannot have.
+    """
+    if not isinstance(ranges, Mapping):
+        raise ValueError(f"randomize={shown(ranges)}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
+    for name in ranges:
+        if name not in (*PROPERTIES, *LIMITS):
+            raise ValueError(f"randomize: nothing is called {name!r} (there are: {', '.join((*PROPERTIES, *LIMITS))})")
+    fabric = {name: bounds for name, bounds in ranges.items() if name in PROPERTIES}
+    return checked_ranges(fabric), Disturbances({name: bounds for name, bounds in ranges.items() if name in LIMITS})
+
+
+def told(task: Task) -> dict[str, NDArray]:
+    """What the present episodes have drawn by ``randomize``, by its key in info, (num_envs,)."""
+    fabric = {PREFIX + name: task.episode["material"][:, PROPERTIES.index(name)].copy() for name in task.randomize}
+    return fabric | {PREFIX + name: task.episode[name].copy() for name in task.disturbances.ranges}

@@ -1,0 +1,104 @@
+"""What an episode draws by ``randomize``: delay and noise beside the same batch without them, and what info says."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import clothgym  # noqa: F401
+
+
+def batch(num_envs=3, env_id="ClothDrape-v0", **kwargs):
+    made = gym.make_vec(f"clothgym:{env_id}", num_envs=num_envs, autoreset_mode="Disabled", physics="fast", **kwargs)
+    return made.unwrapped
+
+
+def actions(steps, num_envs=3, size=8):
+    return np.random.default_rng(0).uniform(-1, 0, (steps, num_envs, size))
+
+
+def test_a_delayed_action_is_that_of_some_steps_before():
+    late, plain = batch(randomize={"action_delay": [3, 3]}), batch()
+    late.reset(seed=5), plain.reset(seed=5)
+    given = actions(12)
+    for step in range(12):
+        found, *_, info = late.step(given[step])
+        wanted, *_ = plain.step(given[step - 3] if step >= 3 else np.zeros_like(given[0]))
+        assert np.array_equal(found, wanted), step
+    assert info["randomization/action_delay"].tolist() == [3, 3, 3]
+    # each episode has its own
+    late = batch(40, randomize={"action_delay": [0, 2]})
+    _, info = late.reset(seed=5)
+    assert set(info["randomization/action_delay"]) == {0, 1, 2}
+
+
+def test_action_noise_is_of_the_velocities():
+    """Of anchors that are told to stand still: 0.1 of 1 m/s, 1/30 s long."""
+    env = batch(64, randomize={"action_noise": [0.1, 0.1]})
+    env.reset(seed=1)
+    where = [env.task.simulation.attachment_positions.copy()]
+    for _ in range(8):
+        env.step(np.zeros((64, 8)))
+        where.append(env.task.simulation.attachment_positions.copy())
+    moved = np.diff(where, axis=0).ravel() / (env.task.physics.attachment_speed * env.task.physics.time_step)
+    assert moved.size == 8 * 64 * 2 * 3
+    assert abs(moved.mean()) < 4 * 0.1 / np.sqrt(moved.size) and moved.std() == pytest.approx(0.1, rel=0.05)
+
+
+def test_observation_noise_changes_what_is_seen_and_nothing_else():
+    noisy, plain = batch(randomize={"observation_noise": [0.02, 0.02]}), batch()
+    seen, clear = [noisy.reset(seed=5)[0]], [plain.reset(seed=5)[0]]
+    for action in actions(30):
+        seen.append(noisy.step(action)[0])
+        clear.append(plain.step(action)[0])
+        assert np.array_equal(noisy.task.simulation.positions, plain.task.simulation.positions)
+    error = (np.array(seen) - np.array(clear)).ravel()
+    assert abs(error.mean()) < 4 * 0.02 / np.sqrt(error.size) and error.std() == pytest.approx(0.02, rel=0.03)
+
+
+def test_what_was_drawn_is_the_same_in_any_batch_and_within_its_ranges():
+    ranges = {"density": [0.12, 0.2], "action_delay": [0, 4], "action_noise": [0.0, 0.1], "observation_noise": [0.0, 0.05]}
+    many, one = batch(3, randomize=ranges), batch(1, randomize=ranges)
+    seen, info = many.reset(seed=7)
+    alone, own = one.reset(seed=9)
+    assert np.array_equal(seen[2:], alone)
+    for name, (low, high) in ranges.items():
+        drawn = info[f"randomization/{name}"]
+        assert drawn[2] == own[f"randomization/{name}"][0] and (low <= drawn).all() and (drawn <= high).all()
+        assert len(set(drawn)) > 1, name
+    given = actions(20)
+    for step in range(20):
+        if step == 10:
+            state = many.get_state()
+        seen = many.step(given[step])[0]
+        assert np.array_equal(seen[2:], one.step(given[step, 2:])[0])
+    # and again from a state
+    other = batch(3, randomize=ranges)
+    other.reset(seed=0)
+    other.set_state(state)
+    for step in range(10, 20):
+        again = other.step(given[step])[0]
+    assert np.array_equal(again, seen)
+    # a single environment has them as plain numbers, in the last info of its episode, too
+    single = gym.make("clothgym:ClothDrape-v0", physics="fast", randomize=ranges)
+    assert single.reset(seed=9)[1]["randomization/action_noise"] == own["randomization/action_noise"][0]
+
+
+@pytest.mark.parametrize(
+    "ranges, said",
+    [
+        ({"friction": [0, 1]}, "nothing is called 'friction'"),
+        ({"action_delay": [0, 1.5]}, "whole control steps"),
+        ({"action_delay": [0, 101]}, "from 0 to 100"),
+        ({"observation_noise": [0.2, 0.1]}, "must be a range"),
+        ({"action_noise": [0, float("nan")]}, "action_noise"),
+        ([0, 1], "must be a dict"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(ranges, said):
+    with pytest.raises(ValueError, match=said):
+        batch(randomize=ranges)
+
+
+def test_motions_of_picks_have_no_delay():
+    with pytest.raises(ValueError, match="no action_delay with action_mode='pick_place'"):
+        batch(env_id="ClothFold-v0", action_mode="pick_place", randomize={"action_delay": [1, 2]})
