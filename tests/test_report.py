@@ -108,7 +108,7 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
 def test_controls_are_rows_by_what_was_changed(report):
     def control(rate, repeat, normalize=True):
         made = result(rate, env_kwargs={"action_repeat": repeat}) | {"with_noise": {"success_rate": rate / 2}}
-        return made | {"hyperparameters": {"gamma": 0.9, "normalize": normalize, "updates": 8}}
+        return made | {"hyperparameters": {"gamma": 0.9, "normalize": normalize, "updates": 8, "n_envs": 32}}
 
     rows = [control(0.8, 4), control(0.6, 4), control(0.0, 1), control(0.1, 4, normalize=False)]
     table = report.controls_table(rows, {'ClothReach-v0 {"action_repeat": 4}': "now"})

@@ -217,12 +217,13 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
     found: dict[tuple[Any, ...], list[Result]] = {}
     for row in rows:
         options, kwargs = row["hyperparameters"], row["env_kwargs"]
-        changed = kwargs.get("action_repeat", 1), options["updates"], options["gamma"], kwargs.get("gamma", 1), options["normalize"]
+        changed = kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"]
+        changed += kwargs.get("gamma", 1), options["normalize"]
         found.setdefault((row["env"], row["timesteps"], *changed), []).append(row)
     return markdown([
         {
             "environment": f"`{env_id}`{_old(all(is_present(row, digests) for row in group))}",
-            "control steps": f"{steps / 1e6:.2f} M", "`action_repeat`": str(repeat), "updates": str(updates),
+            "control steps": f"{steps / 1e6:.2f} M", "`action_repeat`": str(repeat), "batch": str(batch), "updates": str(updates),
             "discount": f"{gamma:.3g}",
             "shaping's `gamma`": f"{shaping:g}", "normalized": "yes" if normalize else "no", "seeds": str(len(group)),
             "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
@@ -230,7 +231,7 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
             "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",
             "training": f"{_minutes(group):.1f} min{_collecting(group)}",
         }
-        for (env_id, steps, repeat, updates, gamma, shaping, normalize), group in sorted(found.items())
+        for (env_id, steps, repeat, batch, updates, gamma, shaping, normalize), group in sorted(found.items())
     ])  # fmt: skip
 
 
