@@ -44,22 +44,26 @@ def note_physics(task: Task, envs: NDArray) -> None:
 
 
 @contextmanager
-def standing(task: Task) -> Iterator[None]:
-    """Context of a control step: keeps the answers of environments whose episodes had ended, and notes those of the others."""
-    over = task.episode["over"].copy()
+def standing(task: Task, envs: NDArray) -> Iterator[None]:
+    """Context of a control step of these environments: keeps the answers of those whose episodes had ended, and notes the others'.
+
+    Environments that have no part in it, as others settle, keep what the step has brought them before.
+    """
+    over = task.episode["over"][envs]
     # the usual case, at once
     if not over.any():
         yield
-        note_physics(task, task._everyone)
+        note_physics(task, envs)
         return
-    kept_info, kept_ends = task.info[over], {name: task.outcome[name][over] for name in ENDS}
+    ended = envs[over]
+    kept_info, kept_ends = task.info[ended], {name: task.outcome[name][ended] for name in ENDS}
     yield
-    note_physics(task, np.flatnonzero(~over))
-    task.info[over] = kept_info
+    note_physics(task, envs[~over])
+    task.info[ended] = kept_info
     for name, values in kept_ends.items():
-        task.outcome[name][over] = values
+        task.outcome[name][ended] = values
     for array in _of_a_step(task):
-        array[over] = 0
+        array[ended] = 0
 
 
 @contextmanager

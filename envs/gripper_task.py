@@ -114,11 +114,12 @@ class GripperTask(Task):
                 raise ValueError(
                     f"{given}: must be 1 with action_mode='pick_place', an action of which is {pick_place.STEPS} control steps"
                 )
-            if late := {"action_delay", "action_noise"} & set(kwargs.get("randomize") or ()):
-                raise ValueError(f"randomize: no {late.pop()} with action_mode='pick_place', whose motions are closed loops")
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
         if action_mode == "pick_place":
+            for name in ("action_delay", "action_noise"):
+                if name in self.disturbances.ranges:
+                    raise ValueError(f"randomize: no {name} with action_mode='pick_place', whose motions are closed loops")
             self.control_steps = pick_place.STEPS
             size = pick_place.NUMBERS * self.num_attachments
             self.single_action_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)

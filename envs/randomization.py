@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import finite, shown
-from clothgym.envs.episode import Fields
+from clothgym.envs.episode import DIVERGED, Fields
 from clothgym.envs.physics import checked_ranges
 from clothgym.parameters import PROPERTIES
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 # the greatest end of each range; the least is 0
 LIMITS = {"action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
+VECTORS = ("keypoints", "particles")  # observation modes that have noise
 PREFIX = "randomization/"  # of the keys in info
 
 
@@ -46,6 +47,11 @@ class Disturbances:
             self.ranges[name] = pair[0].item(), pair[1].item()
         self.longest = int(self.ranges.get("action_delay", (0, 0))[1])
 
+    def check_observed(self, obs_mode: str) -> None:
+        """Refuse noise of observations that are not the state vector."""
+        if "observation_noise" in self.ranges and obs_mode not in VECTORS:
+            raise ValueError(f"randomize: no observation_noise with obs_mode={obs_mode!r}: it is for {' and '.join(VECTORS)}")
+
     def remembers(self, actions: int) -> Fields:
         """Fields of an episode: what it has drawn, and the last actions, those of control step t in row ``t mod (longest + 1)``."""
         drawn: Fields = [(name, float) for name in self.ranges]
@@ -67,7 +73,9 @@ class Disturbances:
         for env in envs.tolist():
             own = task.episode[env]
             if "action_noise" in self.ranges:
-                applied[env] += own["action_noise"] * task.generators[env].normal(size=actions.shape[1])
+                applied[env] = np.clip(applied[env], -1, 1) + own["action_noise"] * task.generators[env].normal(
+                    size=actions.shape[1]
+                )
             if self.longest:
                 step, delay, rows = int(own["step"]), int(own["action_delay"]), self.longest + 1
                 own["last_actions"][step % rows] = applied[env]
@@ -75,11 +83,19 @@ class Disturbances:
         return applied
 
     def observed(self, task: Task, envs: NDArray) -> None:
-        """Add noise to the observations of environments, within the observation's bounds."""
-        if "observation_noise" in self.ranges:
-            for env in envs.tolist():
-                noise = task.episode["observation_noise"][env] * task.generators[env].normal(size=task.observation.shape[1])
-                task.observation[env] = np.clip(task.observation[env] + noise, -task.state_bound, task.state_bound)
+        """Add noise to the observations of environments, within the observation's bounds.
+
+        Goals have none: rewards are computed from them.  Nor has the last observation of a sheet that has diverged.
+        """
+        if "observation_noise" not in self.ranges:
+            return
+        exact = [task.observation_slices[name] for name in task.goals]
+        for env in envs[task.outcome["failure"][envs] != DIVERGED].tolist():
+            seen = task.observation[env]
+            noise = task.episode["observation_noise"][env] * task.generators[env].normal(size=seen.size)
+            for part in exact:
+                noise[part] = 0
+            seen[:] = np.clip(seen + noise, -task.state_bound, task.state_bound)
 
 
 def checked(ranges: Any) -> tuple[dict[str, tuple[float, float]], Disturbances]:
@@ -92,9 +108,9 @@ def checked(ranges: Any) -> tuple[dict[str, tuple[float, float]], Disturbances]:
         raise ValueError(f"randomize={shown(ranges)}: must be a dict of ranges, for instance {{'density': [0.1, 0.2]}}")
     for name in ranges:
         if name not in (*PROPERTIES, *LIMITS):
-            raise ValueError(f"randomize: nothing is called {name!r} (there are: {', '.join((*PROPERTIES, *LIMITS))})")
+            raise ValueError(f"randomize: no parameter {name!r} (there are: {', '.join((*PROPERTIES, *LIMITS))})")
     fabric = {name: bounds for name, bounds in ranges.items() if name in PROPERTIES}
-    return checked_ranges(fabric), Disturbances({name: bounds for name, bounds in ranges.items() if name in LIMITS})
+    return checked_ranges(fabric), Disturbances({name: ranges[name] for name in LIMITS if name in ranges})
 
 
 def told(task: Task) -> dict[str, NDArray]:

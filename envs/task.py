@@ -121,6 +121,7 @@ class Task:
         episode: records of the episodes' variables, (num_envs,): ``episode["step"]``, and the others of ``remembers``; with
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
         observation_slices: slice of each observation in ``observation[env]``, the state vector, by its name.
+        state_bound: largest magnitude of each number in the state vector.
         disturbances: delay and noise that ``randomize`` asks for.
         observed: the observations that ``reset`` and ``step`` return.
         rules: one record of numbers that all environments share.
@@ -192,6 +193,7 @@ class Task:
         sized, self.sheet = own.with_sheet(rows, side), (rows, side)
         fixed = self.physics = replace(sized, material=chosen_fabric(fabric, own.material))  # type: ignore[misc]
         self.randomize, self.disturbances = randomization.checked({} if randomize is None else randomize)
+        self.disturbances.check_observed(obs_mode)
         self.wind = fixed.wind if wind is None else checked_wind(wind)
         if air_density is None:
             air_density = fixed.air_density if wind is None else AIR_DENSITY
@@ -350,7 +352,7 @@ class Task:
     def before_step(self, actions: NDArray) -> None:
         """Called before the physics of each step: apply actions other than motion; targets of attachments are already set.
 
-        actions: as given, (num_envs, numbers), finite.
+        actions: (num_envs, numbers), finite; late and noisy where ``randomize`` says so.
         """
 
     def after_step(self) -> None:
@@ -475,7 +477,7 @@ class Task:
             if self.wind is not None:
                 self.air[env] = self.wind.series(generator, self.air.shape[1], self.physics.time_step)
             starts[k] = hooks.start(self, env, generator, options)
-            # last, so that the start is what it is without them
+            # last, so that a seeded start is what it is without them
             self.disturbances.draw(self.episode[env], generator)
         return starts
 
@@ -583,9 +585,9 @@ class Task:
         actions: velocities of the attachments and further numbers, (num_envs, numbers), float64.
         """
         simulation, chosen = self.simulation, self._everyone if envs is None else envs
-        running = chosen[~self.episode["over"][chosen]]
-        actions = self.disturbances.applied(self, actions, running)
         self.turn.unfinished = range(self.num_envs)
+        running = chosen[~self.episode["over"][chosen]] if self.disturbances.ranges else chosen
+        actions = self.disturbances.applied(self, actions, running)
         wrong = self._apply_actions(
             chosen, actions, *self._place, self.rules, self.episode, self.air, self.outcome, *simulation.orders
         )
@@ -593,7 +595,7 @@ class Task:
             self.turn.unfinished = ()
             env, component = divmod(wrong, actions.shape[1])
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
-        with answers.standing(self):
+        with answers.standing(self, chosen):
             with restricted_to(self, envs):
                 self.before_step(actions)
                 simulation.step(envs=envs)

@@ -78,15 +78,45 @@ def test_what_was_drawn_is_the_same_in_any_batch_and_within_its_ranges():
     for step in range(10, 20):
         again = other.step(given[step])[0]
     assert np.array_equal(again, seen)
-    # a single environment has them as plain numbers, in the last info of its episode, too
+    # a single environment has them as plain numbers
     single = gym.make("clothgym:ClothDrape-v0", physics="fast", randomize=ranges)
     assert single.reset(seed=9)[1]["randomization/action_noise"] == own["randomization/action_noise"][0]
+
+
+def test_the_last_info_of_an_episode_has_its_own_draws():
+    name, ranges = "randomization/action_noise", {"action_noise": [0.0, 0.1]}
+    made = gym.make_vec("clothgym:ClothReach-v0", num_envs=2, autoreset_mode="SameStep", physics="fast", randomize=ranges)
+    _, info = made.reset(seed=3)
+    for _ in range(2):
+        drawn = info[name]
+        for _ in range(60):
+            *_, terminated, truncated, info = made.step(np.zeros((2, 3)))
+            if (terminated | truncated).all():
+                break
+        assert np.array_equal(info["final_info"][name], drawn) and not (info[name] == drawn).any()
+
+
+def test_noise_leaves_rewards_and_goals_as_they_are():
+    noisy, plain = (batch(2, "ClothFoldGoal-v0", randomize=ranges) for ranges in ({"observation_noise": [0.05, 0.05]}, {}))
+    seen, clear = noisy.reset(seed=2)[0], plain.reset(seed=2)[0]
+    for _ in range(5):
+        for name in ("achieved_goal", "desired_goal"):
+            assert np.array_equal(seen[name], clear[name]), name
+        assert not np.array_equal(seen["observation"], clear["observation"])
+        seen, reward, *_ = noisy.step(np.full((2, 8), 0.3))
+        clear, wanted, *_ = plain.step(np.full((2, 8), 0.3))
+        assert np.array_equal(reward, wanted)
+
+
+def test_pictures_have_no_noise():
+    with pytest.raises(ValueError, match="no observation_noise with obs_mode='depth'"):
+        batch(obs_mode="depth", randomize={"observation_noise": [0, 0.1]})
 
 
 @pytest.mark.parametrize(
     "ranges, said",
     [
-        ({"friction": [0, 1]}, "nothing is called 'friction'"),
+        ({"friction": [0, 1]}, "no parameter 'friction'"),
         ({"action_delay": [0, 1.5]}, "whole control steps"),
         ({"action_delay": [0, 101]}, "from 0 to 100"),
         ({"observation_noise": [0.2, 0.1]}, "must be a range"),

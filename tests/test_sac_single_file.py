@@ -311,9 +311,12 @@ def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatc
     state = load_last(folder)
     # 25 decisions of each environment were done at the evaluation
     assert state["num_timesteps"] == 800 and state["num_updates"] == 34 and int(state["variables"]["added"]) == 200
+    state["constraint"]["multiplier"] = 0.7
     run = single.Run(single.policies.read_config(folder), state)
-    assert run.replay.filled == 200 and run.done == 800 and run.updates == 34
+    assert run.replay.filled == 200 and run.done == 800 and run.updates == 34 and run.agent.multiplier == 0.7
     again = run.state(state["times"])
+    for part in ("of critics", "of targets"):
+        assert all(value.equal(state["optimizer"][part][name]) for name, value in again["optimizer"][part].items()), part
     for part in ("policy", "variables"):
         assert all(value.equal(state[part][name]) for name, value in again[part].items())
     for part in ("critics", "policy", "alpha"):

@@ -55,6 +55,28 @@ def test_those_that_act_stand_still_while_others_settle():
     assert env.task.episode["step"][0] == 1 + env.task.settling_steps
 
 
+def test_a_failure_keeps_its_reward_while_another_sheet_settles():
+    """In the step in which the agent of environment 0 lets go, the sheet of the last environment has diverged."""
+    rewards = {}
+    for count in (1, 2):
+        env = gym.make_vec(
+            "clothgym:ClothDrape-v0", num_envs=count, autoreset_mode="Disabled", physics="fast", settling="at_once"
+        ).unwrapped
+        env.reset(seed=[5, 6][2 - count :])
+        still = np.zeros((count, 8), np.float32)
+        still[:, [3, 7]] = -1
+        for _ in range(59):
+            env.step(still)
+        simulation = env.task.simulation
+        state = simulation.get_state()
+        state.velocities[-1] = 1e20
+        simulation.set_state(state)
+        _, reward, terminated, _, info = env.step(still)
+        assert terminated.all() and info["failure"][-1] > 0
+        rewards[count] = reward[-1], info["reward/failure"][-1]
+    assert rewards[1][1] < -0.1 and rewards[1] == rewards[2]
+
+
 def test_a_sheet_whose_environments_advance_together_is_refused():
     with pytest.raises(ValueError, match=r"settling='at_once': with xpbd on this sheet environments advance together"):
         gym.make("clothgym:ClothDrape-v0", integrator="xpbd", settling="at_once")

@@ -10,11 +10,12 @@ Where costs are limited, two more critics learn the cost to come, and a Lagrange
 Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
 alone, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", 2018).
 
-The environments step in a thread of their own while the nets are updated from the transitions before, so a run takes two cores.
+The environments step in a thread of their own while the nets are updated from the transitions before.
 Rates depend on counts of steps, not on time, so the same command again gives the same policy, on any number of cores.
 
 The folder holds what ``train.py`` leaves: config.json, checkpoint.pt, one a minute, with the replay buffer, progress.jsonl,
-policy.npz, evaluation.json, learning_curve.png and policy.gif.  A run that goes on begins new episodes.
+policy.npz (of states; a policy of pictures is in the checkpoint alone), evaluation.json, learning_curve.png and policy.gif.  A run
+that goes on begins new episodes.
 """
 
 from __future__ import annotations
@@ -129,7 +130,8 @@ class Args:
         if unknown := set(options) - set(Options.__dataclass_fields__):
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
-        _within_limits("--options: ", {name: value for name, value in chosen.items() if name != "normalize"})
+        limited = {name: value for name, value in chosen.items() if name != "normalize" and (name, value) != ("cost_limit", None)}
+        _within_limits("--options: ", limited)
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
             raise ValueError(f"{self.folder} holds a run already: go on with --resume {self.folder}, or choose another with --run")
@@ -143,8 +145,8 @@ class Args:
 def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
     for name, value in numbers.items():
         least, most = LIMITS[name]
-        for one in () if value is None else np.atleast_1d(value):
-            if not least <= one <= most:  # NaN is not, either
+        for one in value if isinstance(value, (list, tuple)) else [value]:
+            if not (isinstance(one, (int, float)) and least <= one <= most):  # NaN is not, either
                 raise ValueError(f"{prefix}{name.replace('_', '-')} {value}: must be from {least} to {most}")
 
 
@@ -239,7 +241,8 @@ class Agent:
             wanted = (now + self.options.gamma * batch["goes_on"] * values).repeat_interleave(2, dim=0)
         error = self.all_values(self.critics, batch["observation"], batch["action"]) - wanted
         self._step("critics", 0.5 * error.square().mean(1).sum(), list(self.critics.parameters()))
-        # the policy: towards actions that the critics value, at the price of their costs, and towards entropy
+        # the policy: towards actions that the critics value, at the price of their costs, and towards entropy; the division keeps
+        # the size of gradients
         if with_policy:
             values = self.values(self.critics, batch["observation"], action)
             value = values[0] if len(values) == 1 else (values[0] - self.multiplier * values[1]) / (1 + self.multiplier)
@@ -357,6 +360,8 @@ class Run:
     def __init__(self, config: dict[str, Any], state: dict[str, Any] | None) -> None:
         import torch
 
+        if unknown := set(config["hyperparameters"]) - set(Options.__dataclass_fields__):
+            raise ValueError(f"{', '.join(sorted(unknown))}: hyperparameters of another version of the script; train again")
         self.config, self.options = config, Options(**config["hyperparameters"])
         self.done = 0 if state is None else int(state["num_timesteps"])
         self.updates = 0 if state is None else int(state["num_updates"])
@@ -369,8 +374,11 @@ class Run:
         space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
         self.agent, self.normalizer = Agent(numbers, actions, self.options, space), Normalizer(numbers, self.options.normalize)
         self.replay = Replay(self.options.buffer_size, numbers, actions, picture)
+        if (size := sum(rows.nbytes for rows in self.replay.rows.values())) > files.LARGEST:
+            much = f"{size / 2**30:.1f} GiB, and a checkpoint holds {files.LARGEST / 2**30:.0f}"
+            advice = "choose a smaller one in --options, or a smaller image_size in --env-kwargs"
+            raise ValueError(f"buffer_size={self.options.buffer_size}: {much}: {advice}")
         self.last = Replay(self.options.n_envs, numbers, actions, picture).rows
-        self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
         self.thread = ThreadPoolExecutor(1)
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
@@ -390,9 +398,16 @@ class Run:
         space = self.env.single_observation_space
         self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
         self.pictured = "state" in self.keys
+        mode = self.env.task.obs_mode
+        if mode not in ("keypoints", "particles") and not (self.pictured and mode == "depth"):
+            raise ValueError(f"obs_mode={mode!r}: of pictures the script takes obs_mode='depth', with privileged=True")
         # environment i begins with seed + i, below all held-out seeds
-        self.now = self.parts(self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))[0])
+        observation, info = self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))
+        if self.options.cost_limit is not None and "cost" not in info:
+            raise ValueError(f"cost_limit={self.options.cost_limit}: {config['env']} has no costs")
+        self.now = self.parts(observation)
         self.settling = np.zeros(self.options.n_envs, bool)
+        self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
 
     def parts(self, observation: Any) -> dict[str, NDArray]:
         """An observation as one array, of goals as well; where there is a picture, the state, and the picture in half precision."""
@@ -423,12 +438,13 @@ class Run:
             self.set_multiplier()
             self.done += options.n_envs * self.env.task.control_steps
             yield options.n_envs * self.env.task.control_steps
-            if self.easy and self.done >= self.config["curriculum"]["n_timesteps"]:
+            if self.easy and self.config["curriculum"]["n_timesteps"] <= self.done < self.config["timesteps"]:
                 self.enter()
 
     def set_multiplier(self) -> None:
         """Dual ascent: the price of costs grows while the mean cost of the last training episodes is above its limit."""
-        if self.options.cost_limit is not None and self.episodes:
+        # the first episodes to end are the shortest ones
+        if self.options.cost_limit is not None and len(self.episodes) >= self.options.n_envs:
             excess = min(float(np.mean([cost for *_, cost in self.episodes])) - self.options.cost_limit, MOST_EXCESS)
             self.agent.multiplier = max(self.agent.multiplier + self.options.multiplier_rate * excess, 0.0)
 

@@ -176,7 +176,8 @@ def learned(folder: Path, env_id: str) -> Policy:
         return exported(folder / POLICY)
     if config["algo"] in OFF_POLICY:
         raise ValueError(
-            f"{str(folder)!r} is of {config['algo']} and not finished: go on with it, its policy is exported at the end"
+            f"{str(folder)!r} is of {config['algo']} and has no {POLICY}: go on with it if it is not finished, for its policy is "
+            "exported at the end; policies of pictures are not exported"
         )
     try:
         from stable_baselines3.common.policies import ActorCriticPolicy, MultiInputActorCriticPolicy
