@@ -311,7 +311,7 @@ class ClothHangEnv(ClothEnv):
 
     $physics
 
-    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.  Cloth rests 6 mm from the rail's
+    The fabric is the median of 618 measured fabrics; its linear drag comes from filmed cloth.  Cloth rests 6 mm from the rail's
     surface, about the height of the rail's arc over a side of a triangle, so that particles support it and it does not tremble.
 
     ## Action Space

@@ -205,7 +205,7 @@ class ClothReachEnv(ClothEnv):
 
     $physics
 
-    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.
+    The fabric is the median of 618 measured fabrics; its linear drag comes from filmed cloth.
 
     ## Action Space
     $actions the driven corner
