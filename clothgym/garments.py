@@ -73,7 +73,7 @@ class Garment:
     kind: str
     mesh: ClothMesh
     key_points: Mapping[str, int]
-    front: NDArray[np.bool_]
+    front: NDArray[np.bool]  # not np.bool_: reStructuredText takes that for a link
     mirror: NDArray[np.int32] | None
     sizes: Mapping[str, float]
 

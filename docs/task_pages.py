@@ -81,7 +81,7 @@ def _picture(env_id: str) -> str:
 def _sheet(task: Any) -> str:
     mesh = task.physics.mesh
     particles = " x ".join(map(str, mesh.shape)) if mesh.shape else str(mesh.num_particles)
-    return f"{task.physics.side:g} m, {particles} particles"
+    return f"{task.physics.side:.3g} m, {particles} particles"
 
 
 def _time(task: Any) -> str:
@@ -174,8 +174,8 @@ def index(scores: Suite) -> str:
         rows.append(f"| [`{env_id}`]({env_id}.md) | {goal} | {about} | {cells['score']} | {cells['success']} |")
         env.close()
     said = [
-        "The scripted expert's scores are from held-out seeds. Each page compares them with no action, random actions, and planned",
-        f"or learned policies (`{COMMAND}`).",
+        "The scripted expert's scores are from held-out seeds. Each page compares them with no action and random",
+        f"actions (`{COMMAND}`).",
         "`python docs/task_pages.py` generates the pages.",
     ]
     return "\n".join(["# Tasks", "", *tiles(), "", *rows, "", *said]) + "\n"

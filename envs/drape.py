@@ -77,7 +77,7 @@ class ClothDrapeEnv(ClothEnv):
 
     $physics
 
-    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.  The settling time is long because a
+    The fabric is the median of 618 measured fabrics; its linear drag comes from filmed cloth.  The settling time is long because a
     corner that hangs from a thin post swings for two seconds.
 
     ## Action Space
@@ -86,9 +86,9 @@ class ClothDrapeEnv(ClothEnv):
     ## Rewards
     $rewards
 
-    During the episode the potential is the mean of two terms: the nearness of the sheet to 32 points of the target's upper
-    surface, ``1/(1 + (d/0.15 L)^2)``, and the centering of its center of area, ``1/(1 + (e/0.2 L)^2)``.  The return is therefore
-    the score, less the start's potential and the small terms.
+    During the episode the potential is the mean of two terms: the nearness of the sheet to 32 points of the target's upper surface,
+    ``1/(1 + (d/0.15 L)^2)``, and the centering of its center of area, ``1/(1 + (e/0.2 L)^2)``.  The return is therefore the score
+    minus the potential at the start, plus the small terms.
 
     ## Evaluation
     The evaluation casts rays along the outward normals of 256 points, spread evenly over the part of the target's surface with a

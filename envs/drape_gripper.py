@@ -138,9 +138,9 @@ class ClothDrapeGripperEnv(ClothEnv):
     """Pick up a flat or rumpled sheet next to a target, drape it over the target, and release it.
 
     ## Description
-    The sheet, the targets and the evaluation are those of ``ClothDrape-v0``.  But the sheet lies on the floor, flat or
-    rumpled, and two grippers hover above the corners of its edge at the target.  The target stops their tips.  After 100 steps the
-    grippers open, and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  Holding the sheet in
+    The sheet, the targets and the evaluation are the same as in ``ClothDrape-v0``.  Here the sheet lies on the floor, flat or
+    rumpled, and two grippers hover above the corners of the edge next to the target.  The target stops their tips.  After 100 steps
+    the grippers open, and the sheet settles for 60 steps, in which actions are ignored; then it is evaluated.  Holding the sheet in
     place until then is as good as releasing it earlier.
 
     $physics

@@ -263,15 +263,16 @@ class ClothFlattenEnv(ClothEnv):
 
     ## Evaluation
     The coverage c is the area of the union of the sheet's triangles, projected to the floor, over that of the flat sheet, limited
-    to one.  It is measured on a grid of the world, of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.  The
-    normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99 or
-    more, else 0 if c0 is.  A success has a coverage of 0.95 or more, at rest (less than 0.02 m/s rms), and released.
+    to one.  It is measured on a fixed grid, with cells of 1 cm after each step, and of 2.5 mm at the start and at the evaluation.
+    The normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's c0, in [0, 1]; 1 if c is 0.99
+    or more, else 0 if c0 is.  In a success, the coverage is 0.95 or more, and the sheet is released and at rest (less than 0.02 m/s
+    rms).
 
     ``info`` has ``coverage`` and ``coverage_start`` in each step; ``best``, the best normalized improvement so far;
     ``first_success``, the first step with enough coverage, or -1; and ``success_held``, whether it has been enough ever since.  At
     the evaluation it has ``is_success``, ``normalized_performance``, ``rms_speed`` [m/s] and ``softgym_coverage``, SoftGym's
-    measure: the area of those of 100 x 100 cells of the particles' bounding box that are within a particle's spacing of a particle,
-    over the flat sheet's area.  This measure depends on the orientation of the sheet, and may exceed 1.
+    measure: it divides the particles' bounding box into 100 x 100 cells, and the area of the cells within one particle spacing of a
+    particle by the flat sheet's area.  This measure depends on the orientation of the sheet, and may exceed 1.
 
     ## Starting State
     One of 128 crumpled sheets that cover 0.18 to 0.47 of their area (``benchmarks/rumpled_sheets.py``): lifted high at a

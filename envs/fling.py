@@ -272,14 +272,14 @@ class ClothFlingEnv(ClothEnv):
     """Swing a crumpled sheet, held by two corners, and lay it flat on a table within three throws.
 
     ## Description
-    A square sheet, L = 0.6 m, lies crumpled on a table, the plane z = 0.  Two grippers are at two neighboring corners of it: in the
-    first four steps they stay there and close, for any action, and hold these corners.  They are those of
-    ``ClothDrapeGripper-v0``: when their fingers have closed they hold the particles within 3 cm of their tips, including other
+    A square sheet, L = 0.6 m, lies crumpled on a table, the plane z = 0.  Two grippers are at two neighboring corners: in the first
+    four steps they stay there and close, whatever the action, and then hold these corners.  They work as in
+    ``ClothDrapeGripper-v0``: when their fingers have closed, they hold the particles within 3 cm of their tips, including other
     layers.
 
-    The reach is limited: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L
-    high.  Along y, the direction of the throw, this is not enough to lay a sheet down: slow grippers, at 0.5 m/s, reach a
-    coverage of about 0.7.  A swinging sheet continues by its inertia, and the air supports it.
+    The reach is limited: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L high.
+    Along y, the direction of the throw, this reach is too short to lay a sheet down slowly: at 0.5 m/s, grippers reach a coverage
+    of about 0.7.  A thrown sheet flies on, and the air supports it.
 
     A throw begins when a gripper grasps the sheet, and ends when the sheet is released.  Each gripper grasps once in a throw: after
     its release it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps
@@ -290,12 +290,12 @@ class ClothFlingEnv(ClothEnv):
     ## Observation Space
     $observations
 
-    ``next`` is a choice that the environment makes.  Free grippers grasp an edge that spans 0.1 m along x or more, the
-    first gripper the end with the smaller x.  It is the nearest such edge, where each particle of other cloth in the grasp
-    adds a meter to the distance.  Only if no such edge is within reach they grasp the sides of one, where these come
-    within reach; n is 1000 then.  While one gripper holds a corner, the other grasps a neighboring corner; this is given even for a
-    gripper that may not close any more.  ``next`` is 0 for a gripper without a grasp point; for both after three throws;
-    and while a released sheet covers 0.905 or more.
+    ``next`` is a choice that the environment makes.  Free grippers grasp an edge that spans 0.1 m along x or more, the first
+    gripper the end with the smaller x.  It is the nearest such edge, where each particle of other cloth in the grasp adds a meter
+    to the distance.  If no such edge is within reach, they grasp the sides of one, where these come within reach; n is then 1000.
+    While one gripper holds a corner, the other grasps a neighboring corner; this is given even for a gripper that may not close any
+    more.  ``next`` is 0 for a gripper without a grasp point; for both after three throws; and while a released sheet covers 0.905
+    or more.
 
     ## Rewards
     $rewards
@@ -306,9 +306,9 @@ class ClothFlingEnv(ClothEnv):
     ## Evaluation
     The coverage c is the area of the union of the sheet's triangles, projected to the table, over that of the flat sheet, at most
     1, as in ``ClothFlatten-v0``.  The normalized performance is the normalized improvement ``(c - c0) / (1 - c0)`` over the start's
-    c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.  A success has a coverage of 0.9 or more, at rest (less than 0.02 m/s
-    rms), and released.  The threshold is lower than the 0.95 of ``ClothFlatten-v0``, as a throw cannot be corrected, and higher
-    than the 0.8 of FlingBot's report.
+    c0, in [0, 1]; 1 if c is 0.99 or more, else 0 if c0 is.  In a success, the coverage is 0.9 or more, and the sheet is released
+    and at rest (less than 0.02 m/s rms).  The threshold is lower than the 0.95 of ``ClothFlatten-v0``, as a throw cannot be
+    corrected, and higher than the 0.8 of FlingBot's report.
 
     ``info`` has ``coverage`` and ``coverage_start`` in each step; ``throws``, the number of finished throws; ``coverage_after_1``,
     ``coverage_after_2`` and ``coverage_after_3``, the last coverage after each throw before the next grasp, -1 for

@@ -248,9 +248,9 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
     """Bring the corners of a sheet on the floor to the goals of a random fold, with goal observations for HER.
 
     ## Description
-    The sheet and both grippers are those of ``ClothFold-v0``.  Each episode draws one fold, and defines it by goals for the four
-    corners: the corners of one edge are carried over the sheet, at least half the way to the opposite edge, and the others stay
-    in place.  When the time is up the fingers open, and the sheet settles in steps whose actions are ignored.
+    The sheet and both grippers are the same as in ``ClothFold-v0``.  Each episode draws one fold, and defines it by goals for the
+    four corners: the corners of one edge are carried over the sheet, at least half the way to the opposite edge, and the others
+    stay in place.  When the time is up the fingers open, and the sheet settles in steps whose actions are ignored.
 
     Observations and ``compute_reward`` follow Gymnasium-Robotics' goal environments, so that hindsight experience replay
     can relabel goals: SB3's ``HerReplayBuffer`` takes the single environment, and a
@@ -266,7 +266,7 @@ class ClothFoldGoalEnv(GoalReward, ClothEnv):
 
     ## Rewards
     ``reward_mode="goal"``: 0 after a step in which each corner is within 0.075 L of its goal, in the air or not, else -1: the value
-    of ``compute_reward(achieved_goal, desired_goal, info)``, for one goal, (12,), or for many, (..., 12).  A failure costs one more
+    of ``compute_reward(achieved_goal, desired_goal, info)``, for one goal, (12,), or for many, (..., 12).  A failure also costs 1
     for each remaining step, so that it is never better than continuing.  ``HerReplayBuffer`` includes this cost with
     ``copy_info_dict=True``.
     $rewards

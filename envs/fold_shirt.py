@@ -140,9 +140,9 @@ class ClothFoldShirtEnv(ClothEnv):
 
     ## Description
     A T-shirt of two layers lies flat on the floor, front up, turned and off center.  Two grippers hover above its left sleeve and
-    the left end of its hem.  Its left half is to be laid over its right one.  When the time is up the fingers open, and the shirt
-    settles, in steps whose actions are ignored; then it is evaluated.  ``garment`` selects shorts or trousers in its place, which
-    are taken by the left ends of waist and leg.
+    the left end of its hem.  The task is to lay its left half over its right half.  When the time is up the fingers open, and the
+    shirt settles, in steps whose actions are ignored; then it is evaluated.  ``garment`` selects shorts or trousers instead, which
+    the grippers take by the left ends of waist and leg.
 
     The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
     sides, and open at neck, hem and cuffs.  All environments have the same sizes; ``randomize`` draws fabrics.
@@ -158,15 +158,15 @@ class ClothFoldShirtEnv(ClothEnv):
     During the episode the potential is that of ``ClothFold-v0``.
 
     ## Evaluation
-    Fold error, height, overlap, success, and the normalized performance are those of ``ClothFold-v0``'s half fold, with
+    Fold error, height, overlap, success, and the normalized performance are defined as for the half fold of ``ClothFold-v0``, with
     ``fold_error_max`` at most 0.1.  The ideal is the garment folded along its middle, left over right or right over left, whichever
     is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m.
 
-    At the end there are also measures of three-dimensional distance from the ideal, whose four layers are as far apart as the
-    cloth's thickness: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and shift
-    along the floor, over the root of the area, as of ``clothgym.envs.garment_scores``.  ``info["peer/foldnet"]`` is the measure of
-    FoldNet: the mean squared error of a coordinate after the best rotation about z and shift, in m^2; at most 0.001 is a success
-    there.
+    At the end there are also measures of three-dimensional distance from the ideal, whose four layers are one cloth thickness
+    apart: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and translation along
+    the floor, divided by the square root of the area, as in ``clothgym.envs.garment_scores``.  ``info["peer/foldnet"]`` is the
+    measure of FoldNet: the mean squared error of a coordinate after the best rotation about z and translation, in m^2; FoldNet
+    counts at most 0.001 as a success.
 
     ## Starting State
     The shirt's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,

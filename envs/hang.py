@@ -311,7 +311,7 @@ class ClothHangEnv(ClothEnv):
 
     $physics
 
-    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.  Cloth rests 6 mm from the rail's
+    The fabric is the median of 618 measured fabrics; its linear drag comes from filmed cloth.  Cloth rests 6 mm from the rail's
     surface, about the height of the rail's arc over a side of a triangle, so that particles support it and it does not tremble.
 
     ## Action Space
@@ -351,11 +351,11 @@ class ClothHangHardEnv(ClothEnv):
     """Pick up a flat or rumpled silk sheet from the floor, hang it over a thin rail, and release it.
 
     ## Description
-    The rail and the evaluation are those of ``ClothHang-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles), of silk
-    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), the rail is thinner, 0.035 L, its friction is 0.3, and cloth rests
-    7 mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of its edge at the rail.
-    The rail stops their tips.  After 130 steps the grippers open, and the sheet settles for five seconds, 150 steps, in which
-    actions are ignored; then it is evaluated.
+    The task and the evaluation are the same as in ``ClothHang-v0``, with a larger sheet, L = 0.8 m (21 x 21 particles), of silk
+    (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), and a thinner rail, 0.035 L, with a friction of 0.3; cloth rests 7
+    mm from it.  The sheet lies on the floor, flat or rumpled, and two grippers hover above the corners of the edge next to the
+    rail.  The rail stops their tips.  After 130 steps the grippers open, and the sheet settles for five seconds, 150 steps, in
+    which actions are ignored; then it is evaluated.
 
     $physics
 
@@ -369,7 +369,7 @@ class ClothHangHardEnv(ClothEnv):
     As in ``ClothHang-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet lies in front of the rail, completely 0.1 to 0.2 L away, turned by up to 0.2 rad against it and up to 0.1 L to the
+    The whole sheet lies in front of the rail, 0.1 to 0.2 L away, turned by up to 0.2 rad relative to it and up to 0.1 L to the
     side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``).  The grippers are open,
     displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The rail is drawn as in
     ``ClothHang-v0``.

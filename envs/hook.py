@@ -424,7 +424,7 @@ class ClothHookEnv(ClothEnv):
     The arm is in the hole if its axis goes through it: triangles from the mean of the rim to the rim's edges span the hole, and the
     axis, from root to tip, meets them more often from one side than from the other.  F is the share of the sheet's area lower than
     3 cm.  The score after each step is 1 - F if the arm is in the hole, else 0.  A sheet that lies over the arm or the post
-    therefore scores nothing.
+    therefore scores 0.
 
     ``info["normalized_performance"]`` is this score over ``1 + (v / 0.1 m/s)^2``, with the rms speed v, after the five seconds.
     ``info["is_success"]``: the arm is in the hole, F <= 0.02 and v under 0.02 m/s.  ``info`` also has ``threaded``, whether the arm
@@ -433,9 +433,9 @@ class ClothHookEnv(ClothEnv):
     has hung ever since, ``strain_max``, ``strain_before_limiting``, ``settling``, ``failure`` and the ``reward/...`` terms.
 
     ## Starting State
-    The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad against
-    the hook, with a ripple of a millimeter.  The post is within 0.15 L of the origin in x and y; the hook is turned by up to 45
-    degrees.
+    The sheet hangs at rest, its lower edge 0.1 to 0.25 L above the floor, up to 0.15 L to the side, turned by up to 0.3 rad
+    relative to the hook, with a ripple of a millimeter.  The post is within 0.15 L of the origin in x and y; the hook is turned by
+    up to 45 degrees.
     """
 
     task_class = HookTask
@@ -445,8 +445,8 @@ class ClothHookHardEnv(ClothEnv):
     """Pick up a flat or rumpled silk sheet from the floor, hang it on a hook by its small hole, and release it.
 
     ## Description
-    The hook and the evaluation are those of ``ClothHook-v0``.  But the sheet is larger, L = 0.8 m (21 x 21 particles but one), of
-    silk (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), and its hole is a square of 0.1 L, 0.1 L below the upper
+    The hook and the evaluation are the same as in ``ClothHook-v0``, with a larger sheet, L = 0.8 m (21 x 21 particles except one),
+    of silk (``Material.preset("silk")``: 83 g/m^2, hardly any rigidity), whose hole is a square of 0.1 L, 0.1 L below the upper
     edge.  The arm passes through it with a clearance of 14 mm on either side.  The sheet lies on the floor, flat or rumpled, and
     two grippers hover above the corners of its upper edge.  After 160 steps they open, and the sheet settles for five seconds, 150
     steps, in which actions are ignored; then it is evaluated.
@@ -463,10 +463,10 @@ class ClothHookHardEnv(ClothEnv):
     As in ``ClothHook-v0``, with the same ``info``.
 
     ## Starting State
-    The sheet lies in front of the hook, completely 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad against it and up to
-    0.1 L to the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut
-    out.  The grippers are open, displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The hook is
-    drawn as in ``ClothHook-v0``.
+    The whole sheet lies in front of the hook, 0.1 to 0.2 L from the arm's tip, turned by up to 0.2 rad relative to it and up to 0.1
+    L to the side; in half of the episodes it is one of 64 rumpled sheets (``benchmarks/rumpled_sheets.py``), with the hole cut out.
+    The grippers are open, displaced from their corners by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.  The hook is drawn
+    as in ``ClothHook-v0``.
     """
 
     task_class = HookHardTask

@@ -261,7 +261,8 @@ def physics_of(task_class: type[Task]) -> list[str]:
     physics, fast = task_class.physics, task_class.physics.chosen("fast")
     solids = _unmade(task_class).colliders()
     floor = all(isinstance(one, Plane) for one in solids)
-    touched = f"the whole sheet collides with {'the floor' if floor else 'solids'} and, strictly, with itself" if solids else ""
+    others = "the floor" if floor else "solids"
+    touched = f"the whole sheet collides with {others} and, in strict mode, with itself" if solids else ""
     frictions = sorted({one.friction for one in solids})
     stopped = "the floor stops grippers and held cloth" if floor else "solids stop anchors, grippers and held cloth"
     own = [
@@ -283,7 +284,7 @@ def physics_of(task_class: type[Task]) -> list[str]:
     moves = f"moves through {'wind' if physics.wind else 'air'}"
     return [
         *_prose(
-            f"True physics: {touched or 'the sheet collides strictly with itself'}, bends with its rigidity, and {moves}.  "
+            f"True physics: {touched or 'the sheet collides with itself in strict mode'}, bends with its rigidity, and {moves}.  "
             f"The id's settings: {'; '.join(own)}."
         ),
         "",
@@ -354,8 +355,8 @@ def rewards_of(task_class: type[Task]) -> list[str]:
         *_prose(
             f'``reward_mode="delta"``: the change of a potential in [0, 1], less ``{EFFORT_PRICE:g} |a|^2`` for the motion and '
             f"{FAILURE_PENALTY:g} for a failure, plus {SUCCESS_BONUS:g} for a success.  At the end the potential is the normalized "
-            "performance, at a failure 0.  A return is therefore the final performance less the potential at the start, with these "
-            "terms: no action may return less than 0."
+            "performance, at a failure 0.  A return is therefore the final performance minus the potential at the start, plus "
+            "these terms: doing nothing may return less than 0."
         ),
         '``reward_mode="sparse"``: the normalized performance, at the evaluation.',
     ]
@@ -368,8 +369,8 @@ def episode_end_of(task_class: type[Task]) -> list[str]:
     """The end of an episode, and its failures."""
     names = ", ".join(f'"{name}" ({FAILED[name]})' for name in FAILURES[1:]).replace("$room", _room(*_unmade(task_class).arena()))
     return _prose(
-        f'Terminated when evaluated, {_time(task_class)}; or at a failure, which ``env.metadata["failures"]`` names by the code '
-        f'``info["failure"]``: {names}.  Never truncated: the time limit is part of the task.'
+        f'Terminated when evaluated, {_time(task_class)}; or at a failure.  ``info["failure"]`` is its code, and '
+        f'``env.metadata["failures"]`` has the names of the codes: {names}.  Never truncated: the time limit is part of the task.'
     )
 
 

@@ -201,11 +201,11 @@ class ClothReachEnv(ClothEnv):
     ## Description
     A square sheet of side L = 0.6 m (9 x 9 particles) hangs at rest from one corner, where three particles are pinched.  The agent
     moves that corner; the opposite one, the lowest, is free.  After 40 steps the free corner must be at rest at a goal below the
-    arena of the driven corner.  The task is for teaching and for tests: any learner solves it in minutes.
+    arena of the driven corner.  The task is for teaching and for tests; learners solve it in minutes.
 
     $physics
 
-    The fabric is the median of 618 measured ones; its linear drag is that of filmed cloth.
+    The fabric is the median of 618 measured fabrics; its linear drag comes from filmed cloth.
 
     ## Action Space
     $actions the driven corner

@@ -31,11 +31,11 @@ WIDE, DEEP = 1 / 6, 1 / 12  # a clip, in sides: 3 x 2 particles of 13 a side
 
 POST_RADIUS, POST_HEIGHT = 0.06, 1.4  # [m]
 FRICTION = 0.3
-CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first way-point [m]
+CLEARANCE = 0.35  # from the post's axis to the middle of the sheet at the first waypoint [m]
 WAYPOINTS = 3  # next to the post, beyond it, and the goal
-PASSED, ARRIVED = 0.1, 0.15  # mean distance of the clips from a way-point [m]; of the farther clip from the goal [sides]
+PASSED, ARRIVED = 0.1, 0.15  # mean distance of the clips from a waypoint [m]; of the farther clip from the goal [sides]
 LOW, HIGH = np.array([-1.1, -1.1, 0.6]), np.array([1.1, 1.1, 1.5])  # arena of the clips [m]
-MOST_YAW = 0.2  # of the held edge at the last two way-points [rad]
+MOST_YAW = 0.2  # of the held edge at the last two waypoints [rad]
 TENSIONS = (("tension_left", float), ("tension_right", float))
 MOST_PULL = float(np.finfo(float).max)  # [N]: of a sheet that is about to diverge any number
 FAR = 10.0  # bound of observed distances, in sides
@@ -61,14 +61,14 @@ def clips(mesh: ClothMesh) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 @inlined
 def _to_places(own, sheet):
-    """Distance of each clip from its place at the next way-point [m]."""
+    """Distance of each clip from its place at the next waypoint [m]."""
     places = own.places[own.next]
     return distance(places[0], sheet.attachments[0]), distance(places[1], sheet.attachments[1])
 
 
 @inlined
 def _pass_waypoint(own, rules, sheet, move, free):
-    """Select the next way-point when the clips have passed one."""
+    """Select the next waypoint when the clips have passed one."""
     left, right = _to_places(own, sheet)
     if own.next < WAYPOINTS - 1 and (left + right) / 2 < PASSED:
         own.next += 1
@@ -82,7 +82,7 @@ def _measure(own, rules, sheet):
     for k in range(2):
         pull = length_of(sheet.pulls[k])
         own.tension[k] = pull if pull < np.inf else 0.0
-    # positions are observed relative to the middle of the next way-point
+    # positions are observed relative to the middle of the next waypoint
     for c in range(3):
         own.origin[c] = (own.places[own.next, 0, c] + own.places[own.next, 1, c]) / 2
 
@@ -129,7 +129,7 @@ def _account(own, rules, sheet, info, terms, running, failure):
 
 @inlined
 def _observe(own, rules, sheet, seen):
-    """The ways to the next two way-points, the post, the wind, strain and pulls, the threshold and the time."""
+    """The ways to the next two waypoints, the post, the wind, strain and pulls, the threshold and the time."""
     # ways and pulls of both clips
     following = min(own.next + 1, WAYPOINTS - 1)
     for k in range(2):
@@ -169,9 +169,9 @@ class StrainTask(Task):
     acting_steps = 150
     strain_shown = 0.1
     observations = (
-        Observation("to_next", "from each clip to its place at the next way-point", (2, 3), "L/5", 5 * FAR),
-        Observation("to_following", "to its place at the following way-point (at the goal: the same)", (2, 3), "L", FAR),
-        Observation("at_goal", "whether the next way-point is the goal"),
+        Observation("to_next", "from each clip to its place at the next waypoint", (2, 3), "L/5", 5 * FAR),
+        Observation("to_following", "to its place at the following waypoint (at the goal: the same)", (2, 3), "L", FAR),
+        Observation("at_goal", "whether the next waypoint is the goal"),
         Observation("post", "the post's axis relative to the middle between the clips", (2,), "L", FAR),
         Observation("wind", "velocity of the air", (3,), "m/s", 20.0),
         Observation("strain_max", "largest strain of the structural springs, over the threshold", (), "", 20.0),
@@ -180,7 +180,7 @@ class StrainTask(Task):
         Observation("threshold", "the threshold"),
         Observation("time_left", "share of the time left"),
     )
-    points_relative_to = "the next way-point's middle"
+    points_relative_to = "the next waypoint's middle"
     position_bound = FAR
     arguments: ClassVar = {
         "threshold": "strain above which a step costs; Provot (1995) gives 0.10 for woven cloth; 0.05 is hard, 0.20 lenient",
@@ -238,7 +238,7 @@ class StrainTask(Task):
         return LOW, HIGH
 
     def remembers(self) -> Fields:
-        # the post's axis, the place of each clip at each way-point [m], the next way-point, the path length after each, and in
+        # the post's axis, the place of each clip at each waypoint [m], the next waypoint, the path length after each, and in
         # total
         way = [("post", float, 2), ("places", float, (WAYPOINTS, 2, 3)), ("next", np.int64), ("after", float, WAYPOINTS)]
         return [*way, ("way", float), ("episode_cost", float), ("strain_p95", float), ("tension", float, 2)]
@@ -363,14 +363,14 @@ class ClothStrainEnv(ClothEnv):
     """Carry a stretchy sheet past a post to a goal, in gusts, without stretching it beyond a threshold.
 
     ## Description
-    A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its
-    upper corners, each 3 x 2 particles wide.  The agent moves both clips past a post, by two way-points, to a goal, within 150
-    steps.  At rest the largest strain of a yarn is 4 %.  It increases when the clips start abruptly, move apart or together, when a
+    A square sheet of side L = 0.3 m (13 x 13 particles) of a measured knit, 178 g/m2 and 25 N/m, hangs from two clips at its upper
+    corners, each 3 x 2 particles wide.  The agent moves both clips past a post, via two waypoints, to a goal, within 150 steps.  At
+    rest the largest strain of a yarn is 4 %.  The strain increases when the clips start abruptly, move apart or together, when a
     gust comes, or when the sheet catches on the post.  Each step that ends with a strain above the threshold costs 1.  This is a
     task for constrained reinforcement learning.
 
-    The strain is that of the springs after the integrator: nothing corrects it before it is scored.  Integrators that
-    limit the strain would keep it below the threshold for any action; they are refused.
+    The strain is measured on the springs after the integrator's step: nothing corrects it before it is scored.  Integrators that
+    limit the strain would keep it below the threshold for any action, so they are rejected.
 
     $physics
 
@@ -385,7 +385,8 @@ class ClothStrainEnv(ClothEnv):
     $rewards
 
     During the episode the potential is the share of the path that the clips have covered: the remaining path is their mean distance
-    from the next way-point's places, and the legs after it.  A way-point is passed within 0.1 m of it.  Arrival is a success.
+    from their places at the next waypoint, plus the legs after it.  The clips pass a waypoint within 0.1 m of it.  Arrival is a
+    success.
 
     ``info["cost"]`` is 1 in each step that ends with a strain above the threshold, else 0.  A step that ends with a failure
     also costs 1 for each remaining step; else tearing the sheet would reduce the cost.  ``info["episode_cost"]`` is the
@@ -414,7 +415,7 @@ class ClothStrainEnv(ClothEnv):
 
     ## Starting State
     The sheet hangs at rest, with a ripple of a millimeter; the middle between its corners is at x = -0.65 +- 0.1 m, y within
-    0.1 m, z = 1.05 +- 0.05 m.  The post is within 0.1 m of the origin in x and y.  The first way-point is 0.35 m from it, on
+    0.1 m, z = 1.05 +- 0.05 m.  The post is within 0.1 m of the origin in x and y.  The first waypoint is 0.35 m from it, on
     a random side, at z = 1.05 +- 0.1 m; the second at x = 0.35 m, 0.1 to 0.3 m to that side of it, z = 1.05 +- 0.2 m; the
     goal at x = 0.7 +- 0.1 m, y within 0.3 m, z = 1.05 +- 0.2 m.  The held edge lies along y, at the last two turned by up to
     0.2 rad.

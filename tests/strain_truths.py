@@ -67,7 +67,7 @@ def potential(env, way):
 
 
 def whole_way(env):
-    """Of the clips from where they are, by all way-points [m]."""
+    """Of the clips from where they are, by all waypoints [m]."""
     points = np.concatenate([positions(env)[0, [LEFT, RIGHT]][None], env.unwrapped.task.episode["places"][0]])
     return np.linalg.norm(np.diff(points, axis=0), axis=2).mean(axis=1).sum()
 

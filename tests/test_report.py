@@ -1,6 +1,7 @@
 """Tables of scores: committed ones are what the command makes, rows of other code are marked; statistics are those of rliable."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -103,6 +104,33 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     # what is of this code goes before a better score of older code
     mixed = [result(0.9), result(0.7, learner="sac_scratch", digest="later")]
     assert report.best_of("ClothReach-v0", mixed, {"ClothReach-v0": "later"}, True) == "SAC: 0.70 in 2 min"
+
+
+def test_the_figure_shows_the_best_rows_where_their_numbers_are(report):
+    now = {"ClothStrain-v0": "now"}
+    strain = {"env_id": "ClothStrain-v0", "episodes": 100}
+    learned = [result(rate, seed, learner="bc", **strain) for seed, rate in enumerate((0.5, 0.6, 0.7))]
+    # better scores that do not count: of older code, and with a cost
+    learned += [result(0.9, learner="ppo", **strain, digest="then"), result(0.4, learner="sac_scratch", **strain)]
+    learned += [result(1.0, learner="ppo_penalty", **strain, safe_success_rate=0.1), result(0.8, learner="sac", **strain)]
+    scripted = [result(0.0, **strain) | {"policy": name} for name in ("noop", "random")]
+    scripted[1]["digest"] = "then"
+    scores = report.scores_of("ClothStrain-v0", learned, scripted, now)
+    assert [one["policy"] for one in scores] == ["random", "bc", "scratch"]
+    assert [one["present"] for one in scores] == [False, True, True]
+    # Wilson's interval of 0 and of 40 of 100, z = 1.96, by hand: (p + z²/2n ± z √(p(1-p)/n + z²/4n²)) / (1 + z²/n)
+    assert scores[0]["success"] == pytest.approx((0, 0, 3.8416 / 103.8416))
+    assert scores[2]["success"] == pytest.approx((0.4, 0.309400, 0.497999), abs=1e-6)
+    assert scores[1]["success"] == pytest.approx((0.6, 0.5, 0.7))  # the mean of three seeds, and their range
+    picture = report.scores_figure([scores])
+    dots = re.findall(r'M([\d.]+) \d+H([\d.]+)".*?cx="([\d.]+)".*?fill="(#\w+)" stroke="(#\w+)"', picture)
+    low, high, mean = ([(float(dot[i]) - 12) / 376 for dot in dots] for i in range(3))
+    assert low == pytest.approx([0, 0.5, 0.3094], abs=2e-4) and high == pytest.approx([0.0370, 0.7, 0.4980], abs=2e-4)
+    assert mean == pytest.approx([0, 0.6, 0.4], abs=2e-4) and [fill == edge for *_, fill, edge in dots] == [False, True, True]
+    assert "ClothStrain-v0, behavior cloning: 0.600 [0.500, 0.700]" in picture
+    # one seed more in the best row, and the dot moves with the table
+    more = report.scores_of("ClothStrain-v0", [*learned, result(0.8, 1, learner="sac_scratch", **strain)], scripted, now)
+    assert more[2]["success"] == pytest.approx((0.6, 0.4, 0.8))
 
 
 def test_controls_are_rows_by_what_was_changed(report):

@@ -221,7 +221,7 @@ def test_both_clips_must_arrive(left, right, arrives):
     places = clips + SIDE * np.array([[left, 0, 0], [0, 0.6 * right, 0.8 * right]])
     env.task.episode["places"][0, 2] = places
     *_, terminated, _, info = env.step(np.zeros(6))
-    assert not terminated  # the other way-points come first
+    assert not terminated  # the other waypoints come first
     env.task.episode["next"][0] = 2
     *_, terminated, _, info = env.step(np.zeros(6))
     assert terminated == info["is_success"] == info["is_safe_success"] == arrives
@@ -290,7 +290,7 @@ def test_starts_match_the_manual_page():
     env = batch(150)
     task, x = env.unwrapped.task, positions(env)
     corners, places = x[:, [LEFT, RIGHT]], task.episode["places"]
-    # the held edge is as long as at rest, everywhere on the way, and turned by at most 0.2 rad after the first way-point
+    # the held edge is as long as at rest, everywhere on the way, and turned by at most 0.2 rad after the first waypoint
     edges = np.concatenate([corners[:, None], places], axis=1)
     edges = edges[:, :, 0] - edges[:, :, 1]
     assert np.linalg.norm(edges, axis=2) == pytest.approx(SIDE, abs=1e-5)
@@ -298,7 +298,7 @@ def test_starts_match_the_manual_page():
     assert np.abs(yaw[:, :2]).max() < 1e-5 and 0.18 < np.abs(yaw[:, 2:]).max() <= 0.2
     post = np.array([p.center[:2] for p in task.posts])
     assert 0.09 < np.abs(post).max() <= 0.1
-    # the first way-point is beside the post, on either side alike, at arm's length
+    # the first waypoint is beside the post, on either side alike, at arm's length
     aside = places[:, 0].mean(axis=1)[:, :2] - post
     assert np.abs(aside[:, 0]).max() < 1e-6 and np.abs(aside[:, 1]) == pytest.approx(0.35)
     assert 0.35 < np.mean(aside[:, 1] > 0) < 0.65

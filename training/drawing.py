@@ -23,6 +23,13 @@ INK, ACCENT, QUIET = "#2b2d42", "#d1495b", "#8d99ae"
 CURVES = Path(__file__).parent.parent / "docs" / "curves"
 # of learners, told apart by the color-blind, too (Okabe and Ito)
 COLORS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+# policies in the figure of all scores, by their name there: their words in the legend, and their color
+SHOWN = {
+    "random": ("random actions", QUIET),
+    "expert": ("scripted expert", INK),
+    "bc": ("behavior cloning", COLORS[1]),
+    "scratch": ("RL from scratch", COLORS[0]),
+}
 
 
 def draw_learning_curve(folder: Path, lines: list[dict[str, float]], references: dict[str, float]) -> None:
@@ -143,3 +150,44 @@ def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, 
     between = [np.interp(moments, *curve.T) for curve in points]
     panel.fill_between(moments, np.min(between, axis=0), np.max(between, axis=0), color=color, alpha=0.15, lw=0)
     panel.plot(*middle.T, color=color, lw=2, marker="o", ms=3, label=f"{label} ({len(seeds)})")
+
+
+def scores_figure(environments: list[list[dict[str, Any]]]) -> str:
+    """Success of policies as an SVG, narrow enough for a phone: one block for each environment, one line for each policy.
+
+    It is written by hand, since the text of an SVG by matplotlib depends on its version, and a test compares this one.
+
+    Args:
+        environments: for each environment its scores, dicts with ``env``, ``policy`` (of ``SHOWN``), ``success`` (the estimate, and
+            the ends of its 95 % interval) and ``present`` (filled dot, otherwise hollow).
+    """
+    left, width, top, block, line = 12, 376, 98, 61, 9
+    bottom = top + block * len(environments)
+    parts = [
+        f'<text x="{left + width * tick / 5:g}" y="{y}" text-anchor="middle" font-size="13">{tick / 5:g}</text>'
+        for tick in range(6)
+        for y in (top - 6, bottom + 16)
+    ]
+    parts += [f'<path d="M{left + width * tick / 5:g} {top}V{bottom}" stroke="#e3e6ec" stroke-width="1"/>' for tick in range(6)]
+    for number, (label, color) in enumerate(SHOWN.values()):
+        x, y = left + 6 + 190 * (number % 2), 16 + 22 * (number // 2)
+        parts += [_dot(x, y, color, True), f'<text x="{x + 11}" y="{y + 5}">{label}</text>']
+    parts += [_dot(left + 6, 60, INK, False), f'<text x="{left + 17}" y="65">hollow: predates the latest physics</text>']
+    for number, scores in enumerate(environments):
+        y = top + block * number + 17
+        parts.append(f'<text x="{left}" y="{y}" font-weight="600">{scores[0]["env"]}</text>')
+        for one in scores:
+            label, color = SHOWN[one["policy"]]
+            at = y + 11 + line * list(SHOWN).index(one["policy"])
+            mean, low, high = (left + width * value for value in one["success"])
+            told = "{env}, {label}: {0:.3f} [{1:.3f}, {2:.3f}]".format(*one["success"], env=one["env"], label=label)
+            interval = f'<path d="M{low:.1f} {at}H{high:.1f}" stroke="{color}" stroke-width="2"/>'
+            parts.append(f"<g><title>{told}</title>{interval}{_dot(mean, at, color, one['present'])}</g>")
+    parts.append(f'<text x="{left + width / 2:g}" y="{bottom + 36}" text-anchor="middle">success, with 95 % intervals</text>')
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 400 {bottom + 44}" width="440" '
+    head += f'font-family="system-ui, sans-serif" font-size="15" fill="{INK}">\n<rect width="100%" height="100%" fill="#fff"/>\n'
+    return head + "\n".join(parts) + "\n</svg>\n"
+
+
+def _dot(x: float, y: float, color: str, filled: bool) -> str:
+    return f'<circle cx="{x:.1f}" cy="{y}" r="4" fill="{color if filled else "#fff"}" stroke="{color}" stroke-width="1.6"/>'

@@ -1,4 +1,4 @@
-"""Write every table of scores in the README and in docs/, and every learning curve, from committed results.
+"""Write every table of scores in the README and in docs/, the figure of all scores, and every learning curve.
 
     python training/report.py                                # write them again
     python training/report.py --check                        # only list stale pages, with status 1
@@ -7,8 +7,8 @@
     python training/report.py --controls runs/repeat_*       # first add these controls' results
     python training/report.py --add runs/ClothDrape-v0_*     # first add these runs' results, and the best policies
 
-A result carries the digest of its environment's behavior (``clothgym.lab.digests``); the present digests are in
-benchmarks/results/digests.json.  A row with another digest is marked as old, until it is made again.
+All of them are made of committed results.  A result carries the digest of its environment's behavior (``clothgym.lab.digests``);
+the present digests are in benchmarks/results/digests.json.  A row with another digest is marked as old, until it is made again.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from typing import Annotated, Any
 import numpy as np
 import suite
 import tyro
-from drawing import CURVES, draw_curves
+from drawing import CURVES, SHOWN, draw_curves, scores_figure
 from endings import refused
 from results import (
     FROM_SCRATCH,
+    LABELS,
     RESULTS,
     ROOT,
     Result,
@@ -40,12 +41,14 @@ from results import (
     note_policies,
     read_digests,
 )
+from scoring import wilson
 
 from clothgym import files
 from clothgym.registration import ENVIRONMENTS
 
 SUITE, MAXIMIZERS, CHEATS = (RESULTS / f"{name}.json" for name in ("suite", "maximizers", "cheats"))
 PAGES = ("README.md", "docs/results.md", "docs/cheats.md", "docs/learning.md")
+FIGURE = ROOT / "docs" / "scores.svg"
 
 
 @dataclass
@@ -76,9 +79,10 @@ def interquartile_mean(values: Iterable[float]) -> float:
 
 def bootstrap(values: list[float], draws: int = 2000) -> tuple[float, float]:
     """95 % interval of the interquartile mean over seeds, by the percentile bootstrap."""
-    rng = np.random.default_rng(0)
-    means = [interquartile_mean(rng.choice(values, len(values))) for _ in range(draws)]
-    low, high = np.percentile(means, [2.5, 97.5])
+    from scipy.stats import trim_mean
+
+    drawn = np.random.default_rng(0).choice(values, (draws, len(values)))
+    low, high = np.percentile(trim_mean(drawn, 0.25, axis=1), [2.5, 97.5])
     return float(low), float(high)
 
 
@@ -165,22 +169,47 @@ def table_of(env_id: str, results: list[Result], scripted: list[Result], digests
     return markdown(rows)
 
 
+def _rates(rows: list[Result]) -> list[float]:
+    """Success of each seed; with a cost, only a success at no cost counts."""
+    return [row.get("safe_success_rate", row["success_rate"]) for row in rows]
+
+
+def best_rows(
+    env_id: str, results: list[Result], digests: dict[str, str], learners: Iterable[str]
+) -> tuple[str, list[Result]] | None:
+    """The label and the seeds of the best of some learners; results of the present behavior go before old ones."""
+    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id and rows[0]["learner"] in learners]
+    rank = {label: (all(is_present(row, digests) for row in rows), interquartile_mean(_rates(rows))) for label, rows in found}
+    return max(found, key=lambda one: rank[one[0]], default=None)
+
+
 def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_scratch: bool) -> str:
-    """The best learner of an environment, with its success and time; with a cost, only a success at no cost counts.  Results of the
-    present behavior go before old ones.
+    """The best learner of an environment, with its success and time.
 
     from_scratch: of those that see no expert, or else of those that do.
     """
-    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id]
-    found = [(label, rows) for label, rows in found if (rows[0]["learner"] in FROM_SCRATCH) == from_scratch]
-    if not found:
+    best = best_rows(env_id, results, digests, [name for name in LABELS if (name in FROM_SCRATCH) == from_scratch])
+    if best is None:
         return "–"
-    means = [interquartile_mean(row.get("safe_success_rate", row["success_rate"]) for row in rows) for _, rows in found]
-    present = [all(is_present(row, digests) for row in rows) for _, rows in found]
-    now, success, (label, rows) = max(zip(present, means, found), key=lambda one: one[:2])
-    old = _old(now)
+    label, rows = best
     at = " at no cost" if "safe_success_rate" in rows[0] else ""
-    return f"{label}: {success:.2f}{at} in {max(_minutes(rows), 1):.0f} min{old}"
+    old = _old(all(is_present(row, digests) for row in rows))
+    return f"{label}: {interquartile_mean(_rates(rows)):.2f}{at} in {max(_minutes(rows), 1):.0f} min{old}"
+
+
+def scores_of(env_id: str, results: list[Result], scripted: list[Result], digests: dict[str, str]) -> list[dict[str, Any]]:
+    """What the figure shows of one environment, one entry for each policy of ``SHOWN`` that has a result."""
+    own = {row["policy"]: [row] for row in scripted if row["env"] == env_id and not row["env_kwargs"]}
+    learners = {"bc": ("bc",), "scratch": FROM_SCRATCH}
+    best = {name: best_rows(env_id, results, digests, some) for name, some in learners.items()}
+    rows_of = own | {name: found[1] for name, found in best.items() if found}
+    scores = []
+    for name in [name for name in SHOWN if name in rows_of]:
+        rows, rates, trials = rows_of[name], _rates(rows_of[name]), rows_of[name][0]["episodes"]
+        interval = bootstrap(rates) if len(rows) > 1 else wilson(round(rates[0] * trials), trials)
+        present = all(is_present(row, digests) for row in rows)
+        scores.append({"env": env_id, "policy": name, "success": (interquartile_mean(rates), *interval), "present": present})
+    return scores
 
 
 def maximizers_table(rows: list[Result], scripted: list[Result], digests: dict[str, str]) -> str:
@@ -276,12 +305,14 @@ def filled(text: str, made: dict[str, str]) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """The up-to-date text of every page."""
-    digests, scripted = read_digests(), suite.read(SUITE)
-    made = sections(learned(), scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
+    """The up-to-date text of every page, and of the figure."""
+    digests, scripted, results = read_digests(), suite.read(SUITE), learned()
+    made = sections(results, scripted, digests) | {"maximizers": maximizers_table(suite.read(MAXIMIZERS), scripted, digests)}
     made["controls"] = controls_table(controls(), digests)
     made["cheats"] = cheats_table(suite.read(CHEATS), digests)
-    return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES}
+    shown = [scores_of(env_id, results, scripted, digests) for env_id in ENVIRONMENTS if "-Hard-" not in env_id]
+    figure = scores_figure([scores for scores in shown if scores])
+    return {ROOT / name: filled((ROOT / name).read_text(), made) for name in PAGES} | {FIGURE: figure}
 
 
 def main(args: Args) -> None:
