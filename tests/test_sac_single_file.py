@@ -254,7 +254,7 @@ SHORT = {
 }
 
 
-def trained(single, monkeypatch, folder, *, stop_at=None, resume=False):
+def trained(single, monkeypatch, folder, *, stop_at=None, resume=False, env_kwargs='{"physics": "fast"}'):
     """A short run; stop_at: updates after which it is interrupted."""
     import learning
 
@@ -264,7 +264,7 @@ def trained(single, monkeypatch, folder, *, stop_at=None, resume=False):
     if resume:
         args = single.Args(resume=folder, **kwargs)
     else:
-        args = single.Args(seed=3, run=folder, options=json.dumps(SHORT), env_kwargs='{"physics": "fast"}', **kwargs)
+        args = single.Args(seed=3, run=folder, options=json.dumps(SHORT), env_kwargs=env_kwargs, **kwargs)
     update, count = single.Agent.update, [0]
 
     def counted(agent, *given, **more):
@@ -285,7 +285,8 @@ def trained(single, monkeypatch, folder, *, stop_at=None, resume=False):
 
 def test_a_run_leaves_its_story_and_the_same_bits_again(single, tmp_path, monkeypatch):
     updates = trained(single, monkeypatch, tmp_path / "one")
-    trained(single, monkeypatch, tmp_path / "other")
+    # on any number of threads
+    trained(single, monkeypatch, tmp_path / "other", env_kwargs='{"physics": "fast", "threads": 1}')
     # 50 decisions of each environment, the first 8 of them at random
     assert updates == 2 * (50 - 8)
     one, other = (policies.read(tmp_path / name / "policy.npz") for name in ("one", "other"))
