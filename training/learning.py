@@ -69,7 +69,7 @@ class Record:
         self.lines = [line for line in read_progress(folder) if line["timesteps"] <= before["num_timesteps"]]
         self.clock = Clock(before["times"].get("training_seconds", 0.0), before["times"].get("core_seconds", 0.0))
         self.saved = time.perf_counter()
-        # time in which environments step [s]; PPO chooses actions in it, too, and the SAC of sac_single_file.py is updated meanwhile
+        # time in which environments step [s]; PPO also chooses actions in it, and SAC from scratch is updated meanwhile
         self.collecting = before["times"].get("collecting_seconds", 0.0)
 
     def times(self) -> dict[str, float]:
