@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from clothgym.checks import finite, shown
 from clothgym.envs.episode import DIVERGED, Fields
+from clothgym.envs.observing import PICTURES
 from clothgym.envs.physics import checked_ranges
 from clothgym.parameters import PROPERTIES
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 # the greatest end of each range; the least is 0
 LIMITS = {"action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
-VECTORS = ("keypoints", "particles")  # observation modes that have noise
 PREFIX = "randomization/"  # of the keys in info
 
 
@@ -33,7 +33,7 @@ class Disturbances:
         ranges: of those of ``LIMITS`` that are drawn: ``action_delay``, in control steps, and standard deviations of normal noise,
             ``action_noise``, in each number of an action and control step, and ``observation_noise``, in each number of the
             state vector, in its unit.
-        longest: the longest delay.
+        max_delay: the longest delay that can be drawn, in control steps.
     """
 
     def __init__(self, ranges: Mapping[str, Sequence[float]]) -> None:
@@ -45,17 +45,17 @@ class Disturbances:
             if name == "action_delay" and (pair != np.rint(pair)).any():
                 raise ValueError(f"randomize: {name}={shown(bounds)} must be a range of whole control steps")
             self.ranges[name] = pair[0].item(), pair[1].item()
-        self.longest = int(self.ranges.get("action_delay", (0, 0))[1])
+        self.max_delay = int(self.ranges.get("action_delay", (0, 0))[1])
 
     def check_observed(self, obs_mode: str) -> None:
         """Refuse noise of observations that are not the state vector."""
-        if "observation_noise" in self.ranges and obs_mode not in VECTORS:
-            raise ValueError(f"randomize: no observation_noise with obs_mode={obs_mode!r}: it is for {' and '.join(VECTORS)}")
+        if "observation_noise" in self.ranges and obs_mode in PICTURES:
+            raise ValueError(f"randomize: no observation_noise with obs_mode={obs_mode!r}: only the state vector has noise")
 
     def remembers(self, actions: int) -> Fields:
-        """Fields of an episode: what it has drawn, and the last actions, those of control step t in row ``t mod (longest + 1)``."""
+        """Fields of an episode: what it has drawn, and its last actions, of control step t in row ``t mod (max_delay + 1)``."""
         drawn: Fields = [(name, float) for name in self.ranges]
-        return [*drawn, ("last_actions", float, (self.longest + 1, actions))] if self.longest else drawn
+        return [*drawn, ("last_actions", float, (self.max_delay + 1, actions))] if self.max_delay else drawn
 
     def draw(self, own: Any, generator: np.random.Generator) -> None:
         """Draw an episode's, into its record."""
@@ -73,11 +73,10 @@ class Disturbances:
         for env in envs.tolist():
             own = task.episode[env]
             if "action_noise" in self.ranges:
-                applied[env] = np.clip(applied[env], -1, 1) + own["action_noise"] * task.generators[env].normal(
-                    size=actions.shape[1]
-                )
-            if self.longest:
-                step, delay, rows = int(own["step"]), int(own["action_delay"]), self.longest + 1
+                noise = task.generators[env].normal(size=actions.shape[1])
+                applied[env] = np.clip(applied[env], -1, 1) + own["action_noise"] * noise
+            if self.max_delay:
+                step, delay, rows = int(own["step"]), int(own["action_delay"]), self.max_delay + 1
                 own["last_actions"][step % rows] = applied[env]
                 applied[env] = own["last_actions"][(step - delay) % rows] if step >= delay else 0
         return applied

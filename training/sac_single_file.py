@@ -390,6 +390,8 @@ class Run:
 
     def enter(self) -> None:
         """Begin episodes in new environments: those of the curriculum until its steps are done, then the run's own."""
+        from clothgym.envs.observing import PICTURES  # imported here: it loads the tasks
+
         config, curriculum = self.config, self.config["curriculum"]
         self.easy = self.done < curriculum.get("n_timesteps", 0)
         kwargs = config["env_kwargs"] | (curriculum["env_kwargs"] if self.easy else {})
@@ -399,7 +401,7 @@ class Run:
         self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
         self.pictured = "state" in self.keys
         mode = self.env.task.obs_mode
-        if mode not in ("keypoints", "particles") and not (self.pictured and mode == "depth"):
+        if mode in PICTURES and not (self.pictured and mode == "depth"):
             raise ValueError(f"obs_mode={mode!r}: of pictures the script takes obs_mode='depth', with privileged=True")
         # environment i begins with seed + i, below all held-out seeds
         observation, info = self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))
