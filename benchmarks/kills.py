@@ -31,7 +31,7 @@ SHORT = """
 ClothReach-v0:
   {n_envs: 4, n_timesteps: 160, policy: MlpPolicy, n_steps: 10, batch_size: 40, n_epochs: 1, policy_kwargs: {net_arch: [8]}}
 """
-OPTIONS = '{"n_envs": 4, "timesteps": 1600, "updates": 1, "batch_size": 16, "net_arch": [8], "buffer_size": 300}'
+OPTIONS = '{"n_envs": 4, "random_decisions": 100, "timesteps": 1600, "updates": 1, "batch_size": 16, "net_arch": [8]}'
 # arguments of a new run, by script
 BEGIN = {
     "train": ("--env", "ClothReach-v0", "--hyperparams", "short.yml"),
@@ -157,7 +157,6 @@ def _train(script: str, *arguments: str) -> None:
     import tyro
 
     learning.film = learning.draw_learning_curve = lambda *ignored: None
-    sac_single_file.LEARNED_FROM = 100
     module, work = (train, train.main) if script == "train" else (sac_single_file, sac_single_file.train)
     common = ("--evaluations", "4", "--eval-episodes", "1", "--final-episodes", "1")
     with endings.stopped():

@@ -44,10 +44,9 @@ def steps_a_second(env: str, overlaps: bool) -> float:
     """Control steps a second of a new run, after its first updates."""
     import sac_single_file
 
-    sac_single_file.LEARNED_FROM = 256
     kwargs = {"action_repeat": 4, "threads": 1} | ({} if env == "ClothReach-v0" else {"settling": "at_once"})
     config = {"env": env, "seed": 0, "threads": 1, "timesteps": 10**9, "curriculum": {}, "env_kwargs": kwargs}
-    run = sac_single_file.Run(config | {"hyperparameters": asdict(sac_single_file.Options())}, None)
+    run = sac_single_file.Run(config | {"hyperparameters": asdict(sac_single_file.Options(random_decisions=256))}, None)
     if not overlaps:
         run.thread = Done()  # type: ignore[assignment]
     steps = run.steps()

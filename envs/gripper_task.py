@@ -31,7 +31,7 @@ PHYSICS = replace(draping.PHYSICS, grippers=(Gripper(speed=2 * draping.PHYSICS.a
 LARGE_SILK = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0})
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
 CORNERS = 4
-ACTION_MODES = ("velocity", "pick_place")
+ACTION_MODES = ("velocity", "pick_place", "pick_particle")
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
 
 
@@ -79,13 +79,13 @@ class GripperTask(Task):
 
     Args:
         slip_force: pull at which the cloth slips out of a gripper [N]; None for the grippers' own.
-        action_mode: "velocity", or "pick_place", see the module of that name.
+        action_mode: "velocity", or "pick_place" or "pick_particle", see the module ``pick_place``.
 
     Attributes:
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
-        picks: actions of an episode with "pick_place", after which the sheet settles in one more step.
+        picks: actions of an episode that picks and places, after which the sheet settles in one more step.
         workspace: half of the square in which these pick and place, in sides.
-        no_picks: why there is no "pick_place", of tasks that have none.
+        no_picks: why nothing is picked and placed, of tasks in which only velocities make sense.
     """
 
     actions_per_attachment = 4
@@ -97,7 +97,8 @@ class GripperTask(Task):
         "slip_force": "pull at which the cloth slips out of a gripper [N]",
         "action_mode": '"velocity", or "pick_place": an action is 60 control steps, and 5 numbers in [-1, 1] for each gripper: '
         "where it picks, x and y, where it places, x and y, in a square about the origin, and how high it lifts, from 0 to 1 side; "
-        "an episode has $picks of these, and $rests in which the sheet settles",
+        "an episode has $picks of these, and $rests in which the sheet settles; or "
+        '"pick_particle", where the first two numbers are a place of the flat sheet, and the particle there is picked',
     }
 
     def __init__(self, num_envs: int, slip_force: float | None = None, action_mode: str = "velocity", **kwargs: Any) -> None:
@@ -108,18 +109,18 @@ class GripperTask(Task):
         if slip_force is not None:
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
-        if action_mode == "pick_place":
+        if action_mode != "velocity":
             if kwargs.get("action_repeat", 1) != 1:
                 given = f"action_repeat={shown(kwargs['action_repeat'])}"
                 raise ValueError(
-                    f"{given}: must be 1 with action_mode='pick_place', an action of which is {pick_place.STEPS} control steps"
+                    f"{given}: must be 1 with action_mode={action_mode!r}, an action of which is {pick_place.STEPS} control steps"
                 )
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
-        if action_mode == "pick_place":
+        if action_mode != "velocity":
             for name in ("action_delay", "action_noise"):
                 if name in self.disturbances.ranges:
-                    raise ValueError(f"randomize: no {name} with action_mode='pick_place', whose motions are closed loops")
+                    raise ValueError(f"randomize: no {name} with action_mode={action_mode!r}, whose motions are closed loops")
             self.control_steps = pick_place.STEPS
             size = pick_place.NUMBERS * self.num_attachments
             self.single_action_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)
@@ -136,6 +137,8 @@ class GripperTask(Task):
         return pick_place.commands(self, actions)
 
     def expert(self) -> NDArray:
+        if self.action_mode == "pick_particle":
+            return GripperTask.expert_picks(self)
         return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
 
     def expert_picks(self) -> NDArray:
@@ -145,7 +148,7 @@ class GripperTask(Task):
             NotImplementedError: this task has none.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} has no scripted expert for action_mode='pick_place': take action_mode='velocity'"
+            f"{type(self).__name__} has no scripted expert for action_mode={self.action_mode!r}: take action_mode='velocity'"
         )
 
     def _drawn(self) -> list[NDArray]:

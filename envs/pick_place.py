@@ -1,5 +1,10 @@
 """``action_mode="pick_place"``: an action gives the pick position, the place position and the lift of each gripper.
 
+With ``"pick_particle"`` the pick position is a place of the flat sheet: the particle there is picked, wherever it lies (as in
+Lin et al. 2021, "Learning visible connectivity dynamics for cloth smoothing"), and the place is relative to the origin of the
+task's observations.  Every such pick takes hold of cloth, what an agent sees says where it places, and two grippers never pull
+their particles farther apart than they are in the flat sheet: random actions do not tear it.
+
 One such action takes ``STEPS`` control steps in every environment, for any distance: the motion is spread evenly over them.  A
 batch therefore stays synchronous, and no environment waits for another.  When the time is up the sheet settles in further steps,
 whose actions are ignored.
@@ -37,20 +42,55 @@ class Path(NamedTuple):
     approach: NDArray
 
 
-def path_of(actions: NDArray, tips: NDArray, cloth: NDArray, half: float, side: float) -> Path:
-    """What an action asks for.
+def places_of(actions: NDArray, cloth: NDArray, half: float) -> tuple[NDArray, NDArray]:
+    """Tips at the pick and at the place of an action with "pick_place" [m], (num_envs, grippers, 3) each.
 
-    actions: within [-1, 1], (num_envs, grippers, NUMBERS).  tips: of the grippers [m], (num_envs, grippers, 3).
-    cloth: its particles [m], (num_envs, particles, 3).  half: of the square about the origin in which they pick and place [m].
+    actions: within [-1, 1], (num_envs, grippers, NUMBERS).  cloth: its particles [m], (num_envs, particles, 3).
+    half: of the square about the origin in which they pick and place [m].
     """
-    low = np.full((*tips.shape[:2], 1), LOWEST)
+    low = np.full((*actions.shape[:2], 1), LOWEST)
     pick, place = (np.concatenate([half * actions[..., i : i + 2], low], axis=2) for i in (0, 2))
-    lift = (actions[..., 4] + 1) / 2 * side
     # a tip goes to the top of what lies there, and comes down to the floor at the place
     across = cloth[:, None, :, :2] - pick[:, :, None, :2]
     near = across[..., 0] ** 2 + across[..., 1] ** 2 <= PICK_RADIUS**2
     tops = np.where(near, cloth[:, None, :, 2], 0).max(axis=2)
     pick[..., 2] = np.maximum(tops, LOWEST)
+    return pick, place
+
+
+def particles_of(actions: NDArray, flat: NDArray) -> NDArray[np.intp]:
+    """The particles that actions with "pick_particle" pick, (num_envs, grippers): those nearest to a place of the flat sheet.
+
+    actions: (num_envs, grippers, NUMBERS), the first two from -1 to 1 across the flat sheet along x and y.
+    flat: particles of the flat sheet [m], (particles, 3).
+    """
+    low, high = flat[:, :2].min(axis=0), flat[:, :2].max(axis=0)
+    at = low + (actions[..., :2] + 1) / 2 * (high - low)
+    away = at[:, :, None] - flat[:, :2]
+    return np.argmin(away[..., 0] ** 2 + away[..., 1] ** 2, axis=2)
+
+
+def keep_together(pick: NDArray, place: NDArray, lift: NDArray, apart: NDArray) -> None:
+    """Move the places and the lifts of two grippers toward each other, until their tips are never farther apart than they may be.
+
+    pick, place: [m], (num_envs, 2, 3).  lift: [m], (num_envs, 2).  apart: the largest distance [m], at least that of the picks,
+    (num_envs,).
+    """
+    between, middle = place[:, 1] - place[:, 0], place.mean(axis=1)
+    between *= np.minimum(apart / np.maximum(length(between), 1e-9), 1)[:, None]
+    place[:, 0], place[:, 1] = middle - between / 2, middle + between / 2
+    # both are half of their ways at once, where the arcs are highest
+    halfway = (between + pick[:, 1] - pick[:, 0]) / 2 * (1, 1, 0)
+    most = np.sqrt(np.maximum(apart**2 - length(halfway) ** 2, 0))
+    higher = np.clip(lift[:, 1] - lift[:, 0], -most, most)
+    lift[...] = lift.mean(axis=1, keepdims=True) + higher[:, None] * (-0.5, 0.5)
+
+
+def path_of(pick: NDArray, place: NDArray, tips: NDArray, lift: NDArray) -> Path:
+    """The way of tips over the pick to the place, each [m], (num_envs, grippers, 3).
+
+    lift: of the arc between [m], (num_envs, grippers).
+    """
     # the way to the place, an arc, has as much of the time as of the length; both ways have some of it.  The grippers of one sheet
     # close and open together, by the longest of their ways: one that lifts what the other still holds down tears it
     to_pick, to_place = (way.max(axis=1, keepdims=True) for way in (length(pick - tips), length(place - pick) + 2 * lift))
@@ -88,7 +128,17 @@ def commands(task: Any, actions: NDArray) -> Callable[[int], NDArray]:
     grippers, side = task.num_attachments, task.physics.side
     limited = np.clip(actions.reshape(task.num_envs, grippers, NUMBERS), -1, 1)
     tips, cloth = task.simulation.grippers.positions.astype(np.float64), task.simulation.positions.astype(np.float64)
-    path = path_of(limited, tips, cloth, task.workspace * side, side)
+    pick, place = places_of(limited, cloth, task.workspace * side)
+    lift = (limited[..., 4] + 1) / 2 * side
+    if task.action_mode == "pick_particle":
+        envs, flat = np.arange(task.num_envs)[:, None], task.physics.mesh.rest_positions
+        chosen = particles_of(limited, flat)
+        pick = cloth[envs, chosen]
+        pick[..., 2] = np.maximum(pick[..., 2], LOWEST)
+        place[..., :2] += task.episode["origin"][:, None, :2]
+        if grippers == 2:
+            keep_together(pick, place, lift, length(flat[chosen[:, 1]] - flat[chosen[:, 0]]))
+    path = path_of(pick, place, tips, lift)
     reach = float(task.rules["reach"][0])
 
     def at(step: int) -> NDArray:

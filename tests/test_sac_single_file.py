@@ -154,16 +154,21 @@ def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than
     config = {"env": "ClothStrain-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}}
     # the discounted sum of 30 a decision: 30 / (1 - gamma)
     for gamma, most in ((0.9, 150), (0.7, 100)):
-        own = {"n_envs": 2, "cost_limit": 0.3, "least_reward": -0.02, "gamma": gamma}
+        own = {"n_envs": 2, "cost_limit": 0.3, "least_reward": -0.02, "bounded_for": 0.5, "gamma": gamma}
         hyperparameters = single.asdict(options(single, **own))
         run = single.Run(config | {"env_kwargs": {"action_repeat": 30}, "hyperparameters": hyperparameters}, None)
-        run.rng = SimpleNamespace(uniform=lambda low, high, size: np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float))
+        tear = np.array([[0, 1, 0, 0, -1, 0], [0, 0, 0, 0, 0, 0]], float)
+        run.rng = SimpleNamespace(uniform=lambda low, high, size, tear=tear: tear, integers=run.rng.integers)
         collect(run)
         assert run.replay.rows["cost"][:2].tolist() == pytest.approx([most, 0]) and run.replay.rows["goes_on"][:2].tolist() == [
             0,
             1,
         ]
-        assert run.replay.rows["reward"][0] == pytest.approx(-0.2) and run.replay.rows["reward"][1] > -0.2
+        # of rewards ten times as large, the bound holds for half of the steps
+        lost = run.replay.rows["reward"][0]
+        assert lost < -1 and run.replay.rows["reward"][1] > -0.2
+        for run.done, least in ((499, -0.2), (500, lost)):
+            assert min(batch["reward"].min() for batch in run.minibatches()) == pytest.approx(least)
 
 
 def test_a_policy_pays_the_price_of_its_costs(single):
@@ -251,6 +256,7 @@ SHORT = {
     "batch_size": 32,
     "net_arch": [16, 16],
     "buffer_size": 300,
+    "random_decisions": 64,
 }
 
 
@@ -258,7 +264,6 @@ def trained(single, monkeypatch, folder, *, stop_at=None, resume=False, env_kwar
     """A short run; stop_at: updates after which it is interrupted."""
     import learning
 
-    monkeypatch.setattr(single, "LEARNED_FROM", 64)
     monkeypatch.setattr(learning, "film", lambda *args, **kwargs: None)
     kwargs = {"evaluations": 2, "eval_episodes": 2, "final_episodes": 4}
     if resume:
@@ -331,12 +336,11 @@ def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatc
     assert trained(single, monkeypatch, folder, resume=True) == 0
 
 
-def test_a_curriculum_ends_with_the_arguments_of_the_run(single, monkeypatch):
-    monkeypatch.setattr(single, "LEARNED_FROM", 10**6)
+def test_a_curriculum_ends_with_the_arguments_of_the_run(single):
     config = {
         "env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 24, "env_kwargs": {"action_repeat": 2},
         "curriculum": {"n_timesteps": 12, "env_kwargs": {"physics": "fast"}},
-        "hyperparameters": single.asdict(options(single, n_envs=4)),
+        "hyperparameters": single.asdict(options(single, n_envs=4, random_decisions=10**6)),
     }  # fmt: skip
     run, seen = single.Run(config, None), []
     for _ in run.steps():

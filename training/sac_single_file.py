@@ -44,7 +44,6 @@ from clothgym import files
 from clothgym.registration import checked_id
 
 ALGO = "sac_scratch"
-LEARNED_FROM = 3_000  # decisions at random, before the first update
 LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviation, before the tanh
 FIRST_LOG_STD = -1.5
 FOLLOWING = {"observation": "following", "picture": "following_picture"}  # names in the replay buffer
@@ -54,11 +53,11 @@ EPISODES = 200  # training episodes whose mean is shown, and whose mean cost set
 MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sheets, and is not to learn from it to stand still
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
-    "timesteps": (1, 10**12), "n_envs": (1, 10**5), "updates": (1, 10**4), "policy_delay": (1, 10**4), "batch_size": (1, 10**6),
-    "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1), "tau": (0, 1), "first_alpha": (1e-6, 10),
-    "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6), "least_reward": (-1e6, 0), "cost_limit": (0, 1e6),
-    "multiplier_rate": (0, 1), "net_arch": (1, 10**4), "seed": (0, 2**32 - 1),
-    "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
+    "timesteps": (1, 10**12), "n_envs": (1, 10**5), "random_decisions": (1, 10**8), "updates": (1, 10**4),
+    "policy_delay": (1, 10**4), "batch_size": (1, 10**6), "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1),
+    "tau": (0, 1), "first_alpha": (1e-6, 10), "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6),
+    "least_reward": (-1e6, 0), "bounded_for": (0, 1), "cost_limit": (0, 1e6), "multiplier_rate": (0, 1), "net_arch": (1, 10**4),
+    "seed": (0, 2**32 - 1), "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
 }  # fmt: skip
 
 
@@ -68,6 +67,7 @@ class Options:
 
     timesteps: int = 200_000  # control steps of all environments, without those in which sheets settle at once
     n_envs: int = 32  # environments in the batch
+    random_decisions: int = 3_000  # before the first update
     updates: int = 8  # updates of the critics after each step of the batch
     policy_delay: int = 2  # of these, the policy and the temperature are updated in every such one
     batch_size: int = 256  # transitions in an update
@@ -79,6 +79,7 @@ class Options:
     target_entropy: float = -1.0  # of each number of an action; less means less noise
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
     least_reward: float = -1e6  # of a decision: what is lost by a release, or at an episode's end, weighs no more than this
+    bounded_for: float = 1.0  # share of the control steps for which least_reward holds
     cost_limit: float | None = None  # the mean cost of an episode that is allowed
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
     normalize: bool = True  # whether observations are normalized
@@ -426,14 +427,14 @@ class Run:
 
     def steps(self) -> Iterator[int]:
         """A step of the batch and its updates, again and again, until the control steps are done; yields how many were done."""
-        options, least = self.options, LEARNED_FROM
+        options, least = self.options, self.options.random_decisions
         while self.done < self.config["timesteps"]:
             learns = self.replay.added >= least
             action = self.choose(at_random=not learns)
             stepping = self.thread.submit(self.step, action)
             if learns:
                 self.agent.set_rate(options.learning_rate * max(1 - self.done / self.config["timesteps"], LEAST_RATE))
-                for batch in self.replay.minibatches(options.updates, options.batch_size, self.rng, self.normalizer):
+                for batch in self.minibatches():
                     self.updates += 1
                     self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
             self.keep(action, *stepping.result())
@@ -442,6 +443,13 @@ class Run:
             yield options.n_envs * self.env.task.control_steps
             if self.easy and self.config["curriculum"]["n_timesteps"] <= self.done < self.config["timesteps"]:
                 self.enter()
+
+    def minibatches(self) -> Iterator[dict[str, Any]]:
+        """Those of a step of the batch; losses weigh no more than they may, until it is time to learn what they are."""
+        options, least = self.options, self.options.reward_scale * self.options.least_reward
+        bounded = self.done < options.bounded_for * self.config["timesteps"]
+        for batch in self.replay.minibatches(options.updates, options.batch_size, self.rng, self.normalizer):
+            yield batch | {"reward": batch["reward"].clamp(min=least)} if bounded else batch
 
     def set_multiplier(self) -> None:
         """Dual ascent: the price of costs grows while the mean cost of the last training episodes is above its limit."""
@@ -496,8 +504,7 @@ class Run:
             last[name][acting] = 0
             last[name] += earned
         self.settling = info["settling"]
-        kept = {name: part[~self.settling] for name, part in last.items()}
-        self.replay.add(**kept | {"reward": np.maximum(kept["reward"], options.reward_scale * options.least_reward)})
+        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it; None of a policy that sees pictures."""
