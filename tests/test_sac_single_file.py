@@ -171,6 +171,23 @@ def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than
             assert min(batch["reward"].min() for batch in run.minibatches()) == pytest.approx(least)
 
 
+def test_in_hindsight_the_goal_is_that_which_was_reached(single):
+    config = {"env": "ClothFoldGoal-v0", "seed": 0, "threads": 1, "timesteps": 100, "curriculum": {}, "env_kwargs": {}}
+    hyperparameters = single.asdict(options(single, n_envs=2, hindsight=True))
+    run = single.Run(config | {"hyperparameters": hyperparameters}, None)
+    before = run.now["observation"].copy()
+    collect(run)
+    rows, after = run.replay.rows, run.now["observation"]
+    assert run.replay.added == 4 and rows["reward"][:4].tolist() == pytest.approx([-10, -10, 0, 0])
+    # what is achieved comes first, then the goal, 12 numbers each
+    for name, seen in (("observation", before), ("following", after)):
+        assert np.array_equal(rows[name][:2], seen) and np.array_equal(rows[name][2:4, 12:24], after[:, :12])
+        assert np.array_equal(np.delete(rows[name][2:4], np.s_[12:24], axis=1), np.delete(seen, np.s_[12:24], axis=1))
+    for changed in ({"env": "ClothReach-v0"}, {"env_kwargs": {"reward_mode": "delta"}}):
+        with pytest.raises(ValueError, match=r"hindsight=true: Cloth.* needs goals, and reward_mode='goal'"):
+            single.Run(config | changed | {"hyperparameters": hyperparameters}, None)
+
+
 def test_a_policy_pays_the_price_of_its_costs(single):
     """Of an action a the reward is a, and the cost a^2: best is a = 1 / (2 multiplier)."""
     import torch

@@ -45,8 +45,8 @@ from clothgym.registration import checked_id
 
 ALGO = "sac_scratch"
 LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviation, before the tanh
-FIRST_LOG_STD = -1.5
 FOLLOWING = {"observation": "following", "picture": "following_picture"}  # names in the replay buffer
+GOALS = ("achieved_goal", "desired_goal")  # the first keys of an observation with goals
 NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
@@ -55,7 +55,7 @@ MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sh
 LIMITS = {
     "timesteps": (1, 10**12), "n_envs": (1, 10**5), "random_decisions": (1, 10**8), "updates": (1, 10**4),
     "policy_delay": (1, 10**4), "batch_size": (1, 10**6), "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1),
-    "tau": (0, 1), "first_alpha": (1e-6, 10), "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6),
+    "tau": (0, 1), "first_log_std": LOG_STD, "first_alpha": (1e-6, 10), "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6),
     "least_reward": (-1e6, 0), "bounded_for": (0, 1), "cost_limit": (0, 1e6), "multiplier_rate": (0, 1), "net_arch": (1, 10**4),
     "seed": (0, 2**32 - 1), "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
 }  # fmt: skip
@@ -75,6 +75,7 @@ class Options:
     learning_rate: float = 0.001  # of Adam, at the beginning; it decays linearly over the run
     gamma: float = 0.95  # discount of a decision, that is, of action_repeat control steps
     tau: float = 0.01  # share of the critics that their targets take over in an update
+    first_log_std: float = -1.5  # logarithm of an action's standard deviation, before the tanh, at the beginning
     first_alpha: float = 0.05  # temperature, the price of entropy, at the beginning
     target_entropy: float = -1.0  # of each number of an action; less means less noise
     reward_scale: float = 10.0  # rewards are a hundredth a step, values of an untrained net about one
@@ -82,6 +83,7 @@ class Options:
     bounded_for: float = 1.0  # share of the control steps for which least_reward holds
     cost_limit: float | None = None  # the mean cost of an episode that is allowed
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
+    hindsight: bool = False  # whether each transition is also learned from as if what it reached had been its goal (HER)
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -131,7 +133,8 @@ class Args:
         if unknown := set(options) - set(Options.__dataclass_fields__):
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
-        limited = {name: value for name, value in chosen.items() if name != "normalize" and (name, value) != ("cost_limit", None)}
+        free = {"normalize", "hindsight"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        limited = {name: value for name, value in chosen.items() if name not in free}
         _within_limits("--options: ", limited)
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
@@ -180,7 +183,7 @@ class Agent:
 
             encoder = DepthEncoder(pictures)
             self.policy = nn.Sequential(encoder, *net(encoder.features_dim, 2 * actions, normalized=False))
-        nn.init.constant_(self.policy[-1].bias[actions:], FIRST_LOG_STD)
+        nn.init.constant_(self.policy[-1].bias[actions:], options.first_log_std)
         self.critics, self.targets = (
             nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(2 if options.cost_limit is None else 4))
             for _ in range(2)
@@ -408,6 +411,8 @@ class Run:
         observation, info = self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))
         if self.options.cost_limit is not None and "cost" not in info:
             raise ValueError(f"cost_limit={self.options.cost_limit}: {config['env']} has no costs")
+        if self.options.hindsight and (self.keys[:2] != GOALS or self.env.task.reward_mode != "goal"):
+            raise ValueError(f"hindsight=true: {config['env']} needs goals, and reward_mode='goal' in --env-kwargs")
         self.now = self.parts(observation)
         self.settling = np.zeros(self.options.n_envs, bool)
         self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
@@ -504,7 +509,20 @@ class Run:
             last[name][acting] = 0
             last[name] += earned
         self.settling = info["settling"]
-        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
+        kept = {name: part[~self.settling] for name, part in last.items()}
+        self.replay.add(**kept)
+        if options.hindsight:
+            self.replay.add(**self.in_hindsight(kept))
+
+    def in_hindsight(self, transitions: dict[str, NDArray]) -> dict[str, NDArray]:
+        """Transitions with the goal that they reached, where nothing is lost (Andrychowicz et al., "Hindsight Experience Replay",
+        2017, with one goal for each)."""
+        size = self.env.single_observation_space[GOALS[0]].shape[0]
+        reached = transitions["following"][:, :size]
+        changed = {name: transitions[name].copy() for name in ("observation", "following")}
+        for part in changed.values():
+            part[:, size : 2 * size] = reached
+        return transitions | changed | {"reward": np.zeros(len(reached), np.float32)}
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it; None of a policy that sees pictures."""
