@@ -101,10 +101,7 @@ MOVED = """
 """
 
 
-@pytest.mark.parametrize(
-    ("given", "meant"),
-    [("kernels", "{here}/kernels"), ("~/kernels", "{here}/home/kernels"), ("./a/../b", "{here}/b"), ("{here}/c", "{here}/c")],
-)
+@pytest.mark.parametrize(("given", "meant"), [("./a/../kernels", "{here}/kernels"), ("~/kernels", "{here}/home/kernels")])
 def test_cache_folder_is_resolved_at_import(given, meant, tmp_path):
     """A program that goes into a folder of its own, as Hydra's do, and what it starts there, use one cache."""
     where = {"HOME": str(tmp_path / "home"), "CLOTHGYM_CACHE_DIR": given.format(here=tmp_path)}
