@@ -59,7 +59,7 @@ SCENES = """
     made = {name: simulated(integrator=name, anchors=mesh.corners[2:]) for name in methods}
     made["strict"] = simulated(self_collision="strict")
     made["gripper"] = simulated(grippers=[clothgym.Gripper(position=(0, 0, 0.03))])
-    made["ClothReach-v0"] = environment("ClothReach-v0", render_mode="rgb_array", width=8, height=8)
+    made["ClothReach-v0"] = environment("ClothReach-v0", substeps=30, render_mode="rgb_array", width=8, height=8)
     if few:
         np.savez(sys.argv[1], **made)
         sys.exit()
