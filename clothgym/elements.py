@@ -120,6 +120,9 @@ class SurfaceArrays(NamedTuple):
 class Topology(NamedTuple):
     """Everything that exerts forces on a sheet, in the form that the memory layout needs.
 
+    No array is the mesh's own, which are read-only: numba has another type for these, and copies and pickles of a simulation hold
+    none, so that all kernels would be compiled once more for a copy.
+
     springs: one by one.  elements: springs and hinges, one by one or by kinds.  air: triangles, or cells.  triangles: (triangles,
     3).  offset: of the kinds, where the particles of a regular grid are adjacent in memory; otherwise empty.
     """
@@ -147,8 +150,8 @@ def element_arrays(mesh: ClothMesh, dtype: np.dtype, hinged: bool, any_order: bo
     # hinges, or none
     used = slice(None) if hinged else slice(0)
     curves = np.sqrt(h.weight)[used, None] * h.slopes[used]
-    bends = BendArrays(h.particles[used], h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype), curves.astype(dtype))
-    return Elements(springs, bends)
+    members, weight, rest_angle = h.particles[used].copy(), h.weight[used].astype(dtype), h.rest_angle[used].astype(dtype)
+    return Elements(springs, BendArrays(members, weight, rest_angle, curves.astype(dtype)))
 
 
 def topology_of(mesh: ClothMesh, elements: Elements, surface: SurfaceArrays, bending: str, regular: bool) -> Topology:
@@ -283,4 +286,4 @@ def surface_arrays(mesh: ClothMesh, dtype: np.dtype) -> SurfaceArrays:
     shares = mesh.area[triangles] / np.maximum(around, 1)[triangles]
     a, b, c = (mesh.rest_positions[triangles[:, corner]] for corner in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    return SurfaceArrays(triangles, (shares / shares.sum(axis=1, keepdims=True)).astype(dtype), area.astype(dtype))
+    return SurfaceArrays(triangles.copy(), (shares / shares.sum(axis=1, keepdims=True)).astype(dtype), area.astype(dtype))

@@ -223,8 +223,9 @@ def test_linear_drag_slows_a_free_sheet(name):
 def test_a_sheet_that_lies_flat_stays_where_it_is_in_the_wind(name):
     """Skin friction, 0.05 N/m^2 at 2 m/s, against 0.7 N/m^2 of the floor's."""
     simulation = Simulation(
-        grid(5, 5, 0.2, 0.2), Material(air_drag=0.72), integrator=name, wind=(2, 0, 0), colliders=[Plane(friction=0.5)]
-    )
+        grid(5, 5, 0.2, 0.2), Material(air_drag=0.72), integrator=name, wind=(2, 0, 0), colliders=[Plane(friction=0.5)],
+        dtype="float64",
+    )  # fmt: skip
     simulation.reset(positions=simulation.mesh.rest_positions + (0, 0, 0.001))
     before = simulation.positions
     simulation.step(120)

@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 from gymnasium.utils.play import play
@@ -73,6 +74,15 @@ def test_a_copy_of_a_simulation_goes_on_with_the_same_bits(way, name):
         each.grippers.move(np.array([0.1, 0.0, 0.1]), np.ones(1))
         each.step(4)
     assert all(np.array_equal(a, b) for a, b in zip(cloth.get_state().arrays().values(), twin.get_state().arrays().values()))
+
+
+@every_way
+def test_a_copy_needs_no_kernels_of_its_own(way):
+    """What they are given has the types of the original's arrays; read-only ones would be of another type."""
+    for mesh in (clothgym.grid(4, 4, 0.3, 0.3), clothgym.disc(0.2, 2)):
+        cloth = Simulation(mesh, self_collision="fast", bending="hinge", colliders=[Plane()])
+        one, twin = (numba.typeof((s._topology, s._contact.sheet, s._fabric, s._solids.shapes)) for s in (cloth, WAYS[way](cloth)))
+        assert one == twin and "readonly" not in str(one)
 
 
 def test_methods_are_copied_with_their_options():

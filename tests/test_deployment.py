@@ -59,7 +59,7 @@ SCENES = """
     made = {name: simulated(integrator=name, anchors=mesh.corners[2:]) for name in methods}
     made["strict"] = simulated(self_collision="strict")
     made["gripper"] = simulated(grippers=[clothgym.Gripper(position=(0, 0, 0.03))])
-    made["ClothReach-v0"] = environment("ClothReach-v0", render_mode="rgb_array", width=8, height=8)
+    made["ClothReach-v0"] = environment("ClothReach-v0", substeps=30, render_mode="rgb_array", width=8, height=8)
     if few:
         np.savez(sys.argv[1], **made)
         sys.exit()
@@ -101,10 +101,7 @@ MOVED = """
 """
 
 
-@pytest.mark.parametrize(
-    ("given", "meant"),
-    [("kernels", "{here}/kernels"), ("~/kernels", "{here}/home/kernels"), ("./a/../b", "{here}/b"), ("{here}/c", "{here}/c")],
-)
+@pytest.mark.parametrize(("given", "meant"), [("./a/../kernels", "{here}/kernels"), ("~/kernels", "{here}/home/kernels")])
 def test_cache_folder_is_resolved_at_import(given, meant, tmp_path):
     """A program that goes into a folder of its own, as Hydra's do, and what it starts there, use one cache."""
     where = {"HOME": str(tmp_path / "home"), "CLOTHGYM_CACHE_DIR": given.format(here=tmp_path)}

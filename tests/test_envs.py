@@ -152,8 +152,7 @@ def test_info_explains_the_reward_and_the_evaluation(env_id, policy):
     assert policy == "random" or info["normalized_performance"] > 0.3
 
 
-@two_tasks
-@pytest.mark.parametrize("reward_mode", ["delta", "sparse"])
+@pytest.mark.parametrize(("env_id", "reward_mode"), [(TWO[0], "delta"), (TWO[0], "sparse"), (TWO[1], "delta")])
 def test_the_return_is_within_the_documented_bounds(env_id, reward_mode):
     """Sparse: the performance at the evaluation alone.  Delta: within the potential's span, the bonus and the penalty."""
     env = make_vec(env_id, 3, reward_mode=reward_mode, autoreset_mode="Disabled")

@@ -52,15 +52,30 @@ def mine(filled, tmp_path):
     return root, start
 
 
-@pytest.mark.parametrize("files", ["*.nbi", "*.nbc"])
-@pytest.mark.parametrize("place", [0.0, 0.01, 0.4, 0.999], ids=["checksum", "head", "middle", "end"])
-def test_a_flipped_bit_is_compiled_again(files, place, mine):
+def one_of_each(root, kernels):
+    """A file of each kernel: the index of the first, and the code of the second."""
+    paths = [path for kind, name in zip(("nbi", "nbc"), kernels) for path in root.rglob(f"*{name}*.{kind}")]
+    assert len(paths) == 2
+    return paths
+
+
+CALLEE_FIRST, CALLER_FIRST = ("double", "shifted"), ("shifted", "double")
+
+
+@pytest.mark.parametrize(
+    ("place", "kernels"),
+    [(0.0, CALLEE_FIRST), (0.01, CALLER_FIRST), (0.4, CALLEE_FIRST), (0.999, CALLER_FIRST), (None, CALLEE_FIRST)],
+    ids=["checksum", "head", "middle", "end", "cut short"],
+)
+def test_a_flipped_bit_is_compiled_again(place, kernels, mine):
+    """Whether it is in an index or in code: either kernel alone would be one that is compiled."""
     root, start = mine
-    entries = list(root.rglob(files))
-    assert len(entries) == 2
-    for path in entries:
+    for path in one_of_each(root, kernels):
         content = bytearray(path.read_bytes())
-        content[max(int(place * len(content)), 33 if place else 0)] ^= 1
+        if place is None:
+            del content[100:]
+        else:
+            content[max(int(place * len(content)), 33 if place else 0)] ^= 1
         path.write_bytes(content)
     out, err = start()
     assert out == "7.0 2" and err.count("\n") == 1 and "compiling kernels" in err
@@ -75,12 +90,13 @@ class Planted:
         return os.mkdir, (str(self.marker),)
 
 
-@pytest.mark.parametrize("files", ["*.nbi", "*.nbc"])
-@pytest.mark.parametrize("checked", [True, False], ids=["with a checksum of another key", "bare"])
-def test_foreign_cache_entries_are_not_unpickled(files, checked, mine, tmp_path):
+@pytest.mark.parametrize(
+    ("checked", "kernels"), [(True, CALLEE_FIRST), (False, CALLER_FIRST)], ids=["with a checksum of another key", "bare"]
+)
+def test_foreign_cache_entries_are_not_unpickled(checked, kernels, mine, tmp_path):
     root, start = mine
     payload = pickle.dumps(Planted(tmp_path / "marker"))
-    for path in root.rglob(files):
+    for path in one_of_each(root, kernels):
         code = hmac.digest(bytes(32), f"{path.parent.name}/{path.name}\0".encode() + payload, hashlib.sha256)
         path.write_bytes(code + payload if checked else payload)
     assert start()[0] == "7.0 2"
@@ -97,17 +113,18 @@ def test_one_entry_does_not_pass_for_another(mine):
     assert start()[0] == "7.0 1"
 
 
-@pytest.mark.parametrize("which", [0, 1, 2], ids=["root", "inside", "the other inside"])
-def test_a_folder_that_others_can_write_is_refused(which, mine):
+def test_a_folder_that_others_can_write_is_refused(mine):
     root, start = mine
-    folder = [root, *sorted(path for path in root.iterdir() if path.is_dir())][which]
-    folder.chmod(0o777)
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    out, err = start()
-    assert out == "7.0 2"
-    assert err.count("UserWarning") == 1 and "other users" in err and "chmod go-w" in err and "CLOTHGYM_CACHE_DIR" in err
-    assert before == {path: path.stat().st_mtime_ns for path in root.rglob("*")}
-    folder.chmod(0o700)
+    folders = [root, *(path for path in root.iterdir() if path.is_dir())]
+    assert len(folders) == 3
+    for folder in folders:
+        folder.chmod(0o777)
+        before = {path: path.stat().st_mtime_ns for path in root.rglob("*")}
+        out, err = start()
+        assert out == "7.0 2"
+        assert err.count("UserWarning") == 1 and "other users" in err and "chmod go-w" in err and "CLOTHGYM_CACHE_DIR" in err
+        assert before == {path: path.stat().st_mtime_ns for path in root.rglob("*")}
+        folder.chmod(0o700)
     assert start() == ("7.0 0", "")
 
 

@@ -36,15 +36,15 @@ def start(code, **environment):
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory):
-    """A cold cache that ten processes have filled at once, and what they said."""
+    """A cold cache that four processes have filled at once, and what they said."""
     folder = tmp_path_factory.mktemp("cache")
-    processes = [start(SIMULATE, CLOTHGYM_CACHE_DIR=str(folder)) for _ in range(10)]
+    processes = [start(SIMULATE, CLOTHGYM_CACHE_DIR=str(folder)) for _ in range(4)]
     outputs = [process.communicate(timeout=300) for process in processes]
     assert all(process.returncode == 0 for process in processes), outputs
     return folder, outputs
 
 
-def test_ten_processes_on_a_cold_cache_compile_each_kernel_once_between_them(filled):
+def test_four_processes_on_a_cold_cache_compile_each_kernel_once_between_them(filled):
     _, outputs = filled
     compiled = [int(out.split()[0]) for out, _ in outputs]
     assert sum(compiled) == 1
@@ -62,10 +62,10 @@ def test_a_folder_that_cannot_be_written_costs_a_sentence(tmp_path):
     assert "cannot use its kernel cache" in err and "CLOTHGYM_CACHE_DIR" in err
 
 
-@pytest.mark.parametrize("module", ["torch", "stable_baselines3", "matplotlib", "imageio", "numba", "scipy.sparse"])
-def test_importing_the_package_loads_nothing_heavy(module):
-    out, err = start(f"import sys, clothgym; print({module!r} in sys.modules)").communicate(timeout=60)
-    assert out.strip() == "False", err
+def test_importing_the_package_loads_nothing_heavy():
+    heavy = {"torch", "stable_baselines3", "matplotlib", "imageio", "numba", "scipy.sparse"}
+    out, err = start(f"import sys, clothgym; print({heavy} & set(sys.modules))").communicate(timeout=60)
+    assert out == "set()\n", err
 
 
 def test_the_folder_envs_refuses_its_bare_name():
@@ -103,16 +103,6 @@ def test_two_threads_that_compile_at_once_leave_the_lock_free(tmp_path):
     }
     out, err = start("import two; two.go()", **cache).communicate(timeout=300)
     assert out.strip() == "0 7.0 8.0", err
-
-
-@pytest.mark.parametrize("files", ["*.nbc", "*.nbi"])
-def test_a_broken_cache_file_is_compiled_anew(files, tmp_path):
-    for said in ("1 0.5\n", "0 0.5\n"):
-        assert start(ONE_KERNEL, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)[0] == said
-    for path in tmp_path.rglob(files):
-        path.write_bytes(path.read_bytes()[:100])
-    out, err = start(ONE_KERNEL, CLOTHGYM_CACHE_DIR=str(tmp_path)).communicate(timeout=300)
-    assert out == "1 0.5\n", err
 
 
 def test_a_folder_that_vanishes_costs_a_sentence(tmp_path):

@@ -24,23 +24,12 @@ from clothgym.simulation import Simulation
 Policy = Callable[[Any, NDArray], NDArray]  # (environment, observation) -> action
 
 
-def expert(env: Any, observation: NDArray) -> NDArray:
-    """What the task's scripted expert does."""
-    return env.expert_action()
-
-
-def noop(env: Any, observation: NDArray) -> NDArray:
-    """What keeps the attachments where they are."""
-    return np.zeros(env.action_space.shape, np.float32)
-
-
-def random(env: Any, observation: NDArray) -> NDArray:
-    """Random actions, drawn from the action space's own generator."""
-    return env.action_space.sample()
-
-
 FAILED = {"diverged": "blew up", "torn": "tore", "out_of_bounds": "was carried out of reach"}
-POLICIES: dict[str, Policy] = {"expert": expert, "noop": noop, "random": random}
+POLICIES: dict[str, Policy] = {
+    "expert": lambda env, observation: env.expert_action(),
+    "noop": lambda env, observation: np.zeros(env.action_space.shape, np.float32),  # attachments stay where they are
+    "random": lambda env, observation: env.action_space.sample(),
+}
 
 
 @dataclass(frozen=True)
@@ -257,11 +246,6 @@ OFFSETS = np.array([(0.5 * APART, 0, 0), (-0.5 * APART, 0, 0)], np.float32)  # o
 CAMERA = Camera(eye=(2.35, -1.55, 1.4), target=(0.05, -0.2, 0.26), vertical_fov=33.0)  # the way is to the right
 
 
-def still(env: Any, observations: Any) -> NDArray:
-    """Keep attachments where they are: the visitor moves them."""
-    return np.zeros((1, *env.action_space.shape), np.float32)
-
-
 class Race(Stage):
     """Two environments with the same seed, the visitor's in front.
 
@@ -291,7 +275,9 @@ class Race(Stage):
     def choose(self, policy: str) -> None:
         """Race against another policy, from the start."""
         self.theirs = EpisodeStage(TASK, self.policies, policy, self.seed)
-        self.mine = EpisodeStage(TASK, {YOU: Learnt(still, self.theirs.env_kwargs or {})}, YOU, self.seed)
+        # attachments stay where they are, until the visitor moves them
+        still = Learnt(lambda env, seen: np.zeros((1, *env.action_space.shape), np.float32), self.theirs.env_kwargs or {})
+        self.mine = EpisodeStage(TASK, {YOU: still}, YOU, self.seed)
         self.policy, of = policy, self.mine.recording
         self.recording = Recording(TITLE, of.mesh, SLOWLY * of.time_step, CAMERA, (YOU, policy), of.strained)
         self.reset()

@@ -151,7 +151,6 @@ class Scene:
     """A sheet and its world.
 
     Attributes:
-        name: by which it is chosen.
         about: what there is to see and to try, as a sentence.
         mesh: the sheet at rest; ``start``: initial positions [m], (particles, 3).
         settings: at the start.
@@ -165,7 +164,6 @@ class Scene:
         downwind: where the steady wind blows, a unit vector.
     """
 
-    name: str
     about: str
     mesh: ClothMesh
     start: NDArray
@@ -358,7 +356,6 @@ def gathered(mesh: ClothMesh, share: float, waves: int) -> NDArray:
 def pinned_patch() -> Scene:
     mesh = grid(33, 33, 0.6, 0.6)
     return Scene(
-        name="patch",
         about="A patch of cloth in a breath of air. Pull the gravity slider, and see which threads light up.",
         mesh=mesh,
         start=gathered(mesh, PINNED, 2) + (0, 0, 0.8),
@@ -376,7 +373,6 @@ def flag() -> Scene:
     start = hung(mesh, 1.5)
     pole = Drawn(Capsule(center=(-0.462, 0.0, 0.79), radius=0.012, height=1.58), STEEL)
     return Scene(
-        name="flag",
         about="A flag of silk. The wind has a steady part and gusts; turn either down and the flag sinks to the pole.",
         mesh=mesh,
         start=start,
@@ -387,13 +383,10 @@ def flag() -> Scene:
     )
 
 
-def sheet_over(
-    name: str, about: str, solid: Sphere | Box | MeshCollider, color: tuple[int, int, int], top: float, side: int = 41
-) -> Scene:
+def sheet_over(about: str, solid: Sphere | Box | MeshCollider, color: tuple[int, int, int], top: float, side: int = 41) -> Scene:
     """A sheet of so many particles a side that falls onto a solid."""
     mesh = grid(side, side, 0.9, 0.9)
     return Scene(
-        name=name,
         about=about,
         mesh=mesh,
         start=rippled(mesh) + (0.02, 0.03, top + 0.14),
@@ -406,19 +399,19 @@ def sheet_over(
 
 def sphere() -> Scene:
     about = "A sheet falls over a ball. Drag it off."
-    return sheet_over("sphere", about, Sphere(center=(0, 0, 0.24), radius=0.22), SAGE, 0.46)
+    return sheet_over(about, Sphere(center=(0, 0, 0.24), radius=0.22), SAGE, 0.46)
 
 
 def box() -> Scene:
     solid = Box(center=(0, 0, 0.18), half_sides=(0.18, 0.18, 0.18), yaw=0.4)
-    return sheet_over("box", "A sheet falls over a box, and folds at its corners.", solid, OAK, 0.36)
+    return sheet_over("A sheet falls over a box, and folds at its corners.", solid, OAK, 0.36)
 
 
 def sheet_over_pawn() -> Scene:
     vertices, triangles = pawn()
     solid = MeshCollider(vertices=vertices, triangles=triangles)
     about = "A sheet falls over a chess pawn, a mesh of triangles."
-    return sheet_over("pawn", about, solid, CLAY, 0.5, 33)
+    return sheet_over(about, solid, CLAY, 0.5, 33)
 
 
 def cape() -> Scene:
@@ -432,7 +425,6 @@ def cape() -> Scene:
     way, out = facing + np.pi + COLLAR[-1] * across, SHOULDERS + (HEM - SHOULDERS) * np.sqrt(down)
     start = place + np.stack([out * np.cos(way), out * np.sin(way), NECK - 0.79 * down], axis=1)
     return Scene(
-        name="cape",
         about="A cape on the shoulders of a person who walks a figure of eight.",
         mesh=mesh,
         start=start,
@@ -452,7 +444,6 @@ def cape() -> Scene:
 def folding() -> Scene:
     mesh = grid(33, 33, 0.6, 0.6)
     return Scene(
-        name="fold",
         about="Two corners lower a sheet while they sway: it lies down on itself, and never passes through.",
         mesh=mesh,
         start=hung(mesh, 0.64),
@@ -466,23 +457,15 @@ def folding() -> Scene:
 
 
 SCENES = {
-    "patch": pinned_patch,
-    "flag": flag,
-    "sphere": sphere,
-    "box": box,
-    "pawn": sheet_over_pawn,
-    "cape": cape,
-    "fold": folding,
+    "patch": ("Pinned patch", pinned_patch),
+    "flag": ("Flag in gusty wind", flag),
+    "sphere": ("Sheet over a sphere", sphere),
+    "box": ("Sheet over a box", box),
+    "pawn": ("Sheet over a mesh", sheet_over_pawn),
+    "cape": ("Cape on moving shoulders", cape),
+    "fold": ("Cloth that folds on itself", folding),
 }
-TITLES = {
-    "patch": "Pinned patch",
-    "flag": "Flag in gusty wind",
-    "sphere": "Sheet over a sphere",
-    "box": "Sheet over a box",
-    "pawn": "Sheet over a mesh",
-    "cape": "Cape on moving shoulders",
-    "fold": "Cloth that folds on itself",
-}
+TITLES = {name: title for name, (title, _) in SCENES.items()}
 
 
 @cache
@@ -493,4 +476,4 @@ def scene_named(name: str) -> Scene:
         ValueError: an unknown name; the message lists the known ones.
     """
     known("scene", name, SCENES)
-    return SCENES[name]()
+    return SCENES[name][1]()

@@ -108,21 +108,6 @@ class Hand {
     else this.burst = AGAIN_AFTER; // not a number is not less, either
   }
 
-  // The largest strain of a yarn.
-  get strain() {
-    const { rows, cols, x, rest_length: rest } = this.cloth;
-    let most = 0;
-    for (let row = 0; row < rows; row++) {
-      for (let col = 0; col < cols; col++) {
-        const p = row * cols + col;
-        for (const [q, length, there] of [[p + 1, rest[0], col + 1 < cols], [p + cols, rest[1], row + 1 < rows]]) {
-          if (there) most = Math.max(most, Math.hypot(x[0][q] - x[0][p], x[1][q] - x[1][p], x[2][q] - x[2][p]) / length - 1);
-        }
-      }
-    }
-    return most;
-  }
-
   // The particle that a finger at a place in the picture would take, see camera.js.
   near(viewer, place, size) {
     return caught(viewer, viewer.sheets[0].sheet, (p) => this.#at(p), place, size);

@@ -101,7 +101,7 @@ class Page extends Picture {
     hand.advance(seconds);
     if (hand.burst <= 0) {
       this.#place();
-      $("#strain b").textContent = percent(hand.strain);
+      $("#strain b").textContent = percent(Math.max(...this.viewer.sheets[0].sheet.own));
     }
     for (const button of $("#tools").querySelectorAll("[data-flag]")) button.setAttribute("aria-pressed", hand[button.dataset.flag]);
     $("#verdict").classList.toggle("told", hand.burst > 0);

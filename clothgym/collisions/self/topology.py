@@ -172,8 +172,8 @@ def pairs_of(mesh: ClothMesh) -> Pairs:
 
 
 def _int(values: NDArray) -> Int:
-    """As contiguous int32."""
-    return np.ascontiguousarray(values, np.int32)
+    """A contiguous copy as int32; of the mesh's own arrays, too, see ``elements.Topology``."""
+    return np.array(values, np.int32, order="C")
 
 
 def _ranges(counts: NDArray) -> Int:

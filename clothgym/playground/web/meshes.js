@@ -79,8 +79,7 @@ class Sheet {
       this.strain.set(this.own);
     }
     for (const { solid, center } of solids) this.#pushOut(solid, center);
-    if (this.grid) this.#turn();
-    else turnTriangles(this.positions, this.triangles, this.normals);
+    turnTriangles(this.positions, this.triangles, this.normals);
   }
 
   #refine(x) {
@@ -149,24 +148,6 @@ class Sheet {
       }
     }
   }
-
-  #turn() {
-    const { positions: x, normals, fineRows, fineCols } = this;
-    for (let row = 0; row < fineRows; row++) {
-      const up = 3 * fineCols * Math.min(row + 1, fineRows - 1), down = 3 * fineCols * Math.max(row - 1, 0);
-      for (let col = 0; col < fineCols; col++) {
-        const right = 3 * Math.min(col + 1, fineCols - 1), left = 3 * Math.max(col - 1, 0);
-        const i = 3 * (row * fineCols + col), j = 3 * row * fineCols;
-        const ux = x[j + right] - x[j + left], uy = x[j + right + 1] - x[j + left + 1], uz = x[j + right + 2] - x[j + left + 2];
-        const k = 3 * col;
-        const vx = x[up + k] - x[down + k], vy = x[up + k + 1] - x[down + k + 1], vz = x[up + k + 2] - x[down + k + 2];
-        const nx = uy * vz - uz * vy, ny = uz * vx - ux * vz, nz = ux * vy - uy * vx, length = Math.hypot(nx, ny, nz) || 1;
-        normals[i] = nx / length;
-        normals[i + 1] = ny / length;
-        normals[i + 2] = nz / length;
-      }
-    }
-  }
 }
 
 // Normals of vertices, as the triangles around each add up.
@@ -183,11 +164,6 @@ function turnTriangles(x, triangles, normals) {
       normals[v + 2] += nz;
     }
   }
-}
-
-// A solid that comes as a mesh.
-function flatMesh({ positions, normals, triangles }) {
-  return { positions: new Float32Array(positions), normals: new Float32Array(normals), triangles: new Uint32Array(triangles) };
 }
 
 // Weights of four points in a row for a place between the middle two, 0 to 1 (Catmull and Rom 1974).
@@ -235,5 +211,5 @@ function solidMesh({ kind, axes, half, radius }, quarter = 10) {
     const [a, b, c, d] = turn > 0 ? corners : corners.reverse();
     triangles.push(a, b, c, a, c, d);
   }
-  return { positions: new Float32Array(positions), normals: new Float32Array(normals), triangles: new Uint32Array(triangles) };
+  return { positions, normals, triangles };
 }

@@ -41,7 +41,7 @@ class Viewer {
   }
 
   #made({ positions, normals, triangles }) {
-    return buffers(this.gl, [[positions, 3], [normals, 3]], triangles);
+    return buffers(this.gl, [[new Float32Array(positions), 3], [new Float32Array(normals), 3]], new Uint32Array(triangles));
   }
 
   // Take up a scene: how many sheets, their mesh (see Sheet), the camera [m], the middle and half the width of what can move [m], and
@@ -62,7 +62,7 @@ class Viewer {
 
   // One more solid: a box swept by a ball (axes, a row each, half sides and radius [m]), or a mesh of its own; see solidMesh().
   add(solid) {
-    const mesh = solid.positions ? flatMesh(solid) : solidMesh(solid, solid.radius > 0 && solid.radius < 0.03 ? 6 : 12);
+    const mesh = solid.positions ? solid : solidMesh(solid, solid.radius > 0 && solid.radius < 0.03 ? 6 : 12);
     this.solids.push({ solid, parts: this.#made(mesh), center: [0, 0, 0], there: false });
   }
 
