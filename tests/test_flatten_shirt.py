@@ -22,15 +22,16 @@ def turned(x, yaw, over=False):
     return x - (0, 0, x[:, 2].min() - 0.003)
 
 
-def evaluated(x=None, seed=3):
-    """Info of the last step of an episode, from this shirt, or from the start."""
+def evaluated(x=None, seed=3, steps=25):
+    """Info of the last step of an episode, after so many steps from this shirt, or from the start."""
     env = gym.make(ID).unwrapped
     env.reset(seed=seed)
     task, own = env.task, env.task.episode[0]
     if x is not None:
         task.simulation.reset(positions=x)
-    own["settling_since"], own["step"] = task.acting_steps, task.acting_steps + task.settling_steps - 1
-    *_, terminated, _, info = env.step(np.zeros(8))
+    own["settling_since"], own["step"] = task.acting_steps, task.acting_steps + task.settling_steps - steps
+    for _ in range(steps):
+        *_, terminated, _, info = env.step(np.zeros(8))
     assert terminated
     return info
 
@@ -73,7 +74,7 @@ def test_starts_are_crumpled_shirts_free_of_intersections():
     assert min(covered) > 0.2 and max(covered) < 0.55
     ends, length, *_ = SHIRT.mesh.springs
     stretch = np.linalg.norm(sheets[:, ends[:, 0]] - sheets[:, ends[:, 1]], axis=2) / length
-    assert np.quantile(stretch, 0.99) < 1.02 and np.all(sheets[:, :, 2].min(axis=1) > 0)
+    assert stretch.max() < 1.15 and np.all(sheets[:, :, 2].min(axis=1) > 0)
 
 
 def test_a_mirrored_shirt_is_a_shirt_and_not_inside_out():
