@@ -146,7 +146,7 @@ class SpreadingTask(ManipulationTask):
     """
 
     enough: ClassVar[float]
-    evaluation = (("softgym_coverage", float), ("rms_speed", float))
+    evaluation: ClassVar[Fields] = (("softgym_coverage", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (*ManipulationTask.accounts, ("coverage", float), ("coverage_start", float))
     observations: ClassVar[tuple[Observation, ...]] = (
         *ManipulationTask.observations,
