@@ -1,13 +1,13 @@
-"""The sheets with which episodes may begin: rumpled ones of ClothDrapeGripper-v0, crumpled ones of ClothFlatten-v0.
+"""The sheets with which episodes may begin: rumpled ones of ClothDrapeGripper-v0, crumpled ones of ClothFlatten-v0, T-shirts too.
 
-    python benchmarks/rumpled_sheets.py [rumpled crumpled crumpled_large]            # writes envs/NAME.npz, in some minutes
+    python benchmarks/rumpled_sheets.py [rumpled crumpled crumpled_large crumpled_shirts]    # writes envs/NAME.npz, in some minutes
 
-Sheets that lie flat are lifted at a random particle, carried some way and dropped, twice or thrice, and come to rest, in strict
-self-collision (``starts.make``): rumpled ones were lifted a little, crumpled ones high.  Of the rumpled ones the most rumpled are
-kept, by mean height, of those whose two corners at the target can be taken: they lie half a side apart, and no cloth from elsewhere
-is within a gripper's reach of them.  Of the crumpled ones those that cover least.  Layers of a kept sheet are so far apart that
-neither rounding nor the unevenness of a task's start makes it intersect itself.  The file is in tenths of a millimeter,
-relative to the middle of the sheet on the floor.
+Sheets that lie flat are lifted at a random particle, carried some way and dropped, twice or thrice, T-shirts once, and come to
+rest, in strict self-collision (``starts.make``): rumpled ones were lifted a little, crumpled ones high.  Of the rumpled ones
+the most rumpled are kept, by mean height, of those whose two corners at the target can be taken: they lie half a side apart,
+and no cloth from elsewhere is within a gripper's reach of them.  Of the crumpled ones those that cover least.  Layers of a kept
+sheet are so far apart that neither rounding nor the unevenness of a task's start makes it intersect itself.  The file is in
+tenths of a millimeter, relative to the middle of the sheet on the floor.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from tqdm import tqdm
 from clothgym import starts
 from clothgym.envs.coverage import FINE_CELL, covered_area
 from clothgym.envs.draping import PHYSICS
+from clothgym.envs.fold_shirt import FoldShirtTask, garment_named
 from clothgym.envs.gripper_task import REACH
+from clothgym.envs.physics import Physics
 from clothgym.envs.rumpled import BANKS, RUMPLED, UNIT, Bank, robust
 from clothgym.envs.targets import ON_FLOOR
 from clothgym.mesh import ClothMesh, grid
@@ -43,14 +45,14 @@ def graspable(mesh: ClothMesh, x: NDArray) -> NDArray:
     return free
 
 
-def made(bank: Bank, mesh: ClothMesh) -> NDArray:
+def made(bank: Bank, mesh: ClothMesh, physics: Physics) -> NDArray:
     """Sheets at rest [m], (sheets, particles, 3); seeds of which one does not come to rest are left out with their batch."""
-    options = {name: getattr(PHYSICS, name) for name in ("time_step", "substeps", "air_density", "bending", "contact")}
+    options = {name: getattr(physics, name) for name in ("time_step", "substeps", "air_density", "bending", "contact")}
     sheets = []
     for seed in tqdm(range(0, bank.made, AT_ONCE), unit="batch"):
         try:
             x = starts.make(
-                mesh, PHYSICS.material, bank.kind, AT_ONCE, seed=seed, thickness=3 * ON_FLOOR, picks=bank.picks, **options
+                mesh, physics.material, bank.kind, AT_ONCE, seed=seed, thickness=3 * ON_FLOOR, picks=bank.picks, **options
             )
         except RuntimeError as error:
             print(f"seeds {seed} to {seed + AT_ONCE - 1} are left out: {error}")
@@ -60,8 +62,11 @@ def made(bank: Bank, mesh: ClothMesh) -> NDArray:
 
 
 def write(bank: Bank) -> None:
-    mesh = grid(bank.rows, bank.rows, bank.side, bank.side)
-    x = made(bank, mesh)
+    if bank.garment:
+        mesh, physics = garment_named(bank.garment).mesh, FoldShirtTask.physics
+    else:
+        mesh, physics = grid(bank.rows, bank.rows, bank.side, bank.side), PHYSICS
+    x = made(bank, mesh, physics)
     x[:, :, :2] -= x[:, :, :2].mean(axis=1, keepdims=True)
     x[:, :, 2] += ON_FLOOR - x[:, :, 2].min(axis=1, keepdims=True)
     x = np.round(x / UNIT) * UNIT
@@ -73,8 +78,9 @@ def write(bank: Bank) -> None:
         order = -x[fits][:, :, 2].mean(axis=1)
     else:
         triangles = mesh.triangles.astype(np.int64)
-        area = [covered_area(np.ascontiguousarray(sheet.T, np.float32), triangles, FINE_CELL) for sheet in x[fits]]
-        order = np.array(area) / bank.side**2
+        sheets = np.ascontiguousarray(np.stack([mesh.rest_positions, *x[fits]]).transpose(0, 2, 1), np.float32)
+        flat, *area = (covered_area(sheet, triangles, FINE_CELL) for sheet in sheets)
+        order = np.array(area) / flat
     chosen = np.argsort(order, kind="stable")[: bank.kept]
     x = x[fits][chosen]
     print(

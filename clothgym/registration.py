@@ -74,6 +74,10 @@ ENVIRONMENTS = {
         "ClothFlattenHard",
         "Spread a larger crumpled sheet, of a thinner fabric, on the floor with two grippers and release it.",
     ),
+    "ClothFlattenShirt-v0": (
+        "ClothFlattenShirt",
+        "Spread a crumpled T-shirt on the floor with two grippers and release it.",
+    ),
     "ClothFling-v0": (
         "ClothFling",
         "Swing a crumpled sheet, held by two corners, and lay it flat on a table within three throws.",
@@ -86,8 +90,8 @@ ENVIRONMENTS = {
 # length of the longest episode of each id, in steps
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
-    "ClothFlatten-Hard-v0": 360, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120,
-    "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
+    "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 490, "ClothFold-v0": 210, "ClothFold-Hard-v0": 280,
+    "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
     "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
     "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip

@@ -8,6 +8,7 @@ from clothgym.envs.drape import ClothDrapeEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv
+from clothgym.envs.flatten_shirt import ClothFlattenShirtEnv
 from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldHardEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv
@@ -27,6 +28,7 @@ from clothgym.envs.vector import ClothVectorEnv, batched
 ClothDrapeGripperVectorEnv = batched(ClothDrapeGripperEnv)
 ClothDrapeVectorEnv = batched(ClothDrapeEnv)
 ClothFlattenHardVectorEnv = batched(ClothFlattenHardEnv)
+ClothFlattenShirtVectorEnv = batched(ClothFlattenShirtEnv)
 ClothFlattenVectorEnv = batched(ClothFlattenEnv)
 ClothFlingHardVectorEnv = batched(ClothFlingHardEnv)
 ClothFlingVectorEnv = batched(ClothFlingEnv)
@@ -43,11 +45,11 @@ ClothReachVectorEnv = batched(ClothReachEnv)
 
 __all__ = [
     "ClothDrapeEnv", "ClothDrapeGripperEnv", "ClothDrapeGripperVectorEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothFlattenEnv",
-    "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv",
-    "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv", "ClothFoldGoalEnv", "ClothFoldGoalHardEnv",
-    "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv", "ClothFoldHardVectorEnv", "ClothFoldShirtEnv",
-    "ClothFoldShirtVectorEnv", "ClothFoldVectorEnv", "ClothHangEnv", "ClothHangHardEnv", "ClothHangHardVectorEnv",
-    "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv", "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv",
-    "ClothReachVectorEnv", "ClothStrainEnv", "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation",
-    "Physics", "Task", "TaskState",
+    "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenShirtEnv", "ClothFlattenShirtVectorEnv",
+    "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv", "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv",
+    "ClothFoldGoalEnv", "ClothFoldGoalHardEnv", "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv",
+    "ClothFoldHardVectorEnv", "ClothFoldShirtEnv", "ClothFoldShirtVectorEnv", "ClothFoldVectorEnv", "ClothHangEnv",
+    "ClothHangHardEnv", "ClothHangHardVectorEnv", "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv",
+    "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv", "ClothReachVectorEnv", "ClothStrainEnv",
+    "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation", "Physics", "Task", "TaskState",
 ]  # fmt: skip

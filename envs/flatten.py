@@ -21,7 +21,7 @@ from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, Bank, rumpled_sheets
 from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
-from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, corner_neighbors, observe_next
+from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, neighbors_of, observe_next
 from clothgym.mesh import grid
 
 HOLDING = 0.1  # share of the potential for holding the sheet
@@ -74,7 +74,7 @@ def spread_potential(own, rules, sheet):
 def evaluate_spread(own, rules, sheet, info):
     """Write the sheet's coverage and speed; returns the normalized improvement."""
     info.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL) / rules.flat_area, 1.0)
-    info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.flat_area
+    info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.softgym_area
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = info.coverage >= rules.enough and info.rms_speed < ENOUGH_REST and holds_nothing(own, rules, sheet)
     return improvement(info.coverage, own.coverage_start)
@@ -146,7 +146,7 @@ class SpreadingTask(ManipulationTask):
     """
 
     enough: ClassVar[float]
-    evaluation = (("softgym_coverage", float), ("rms_speed", float))
+    evaluation: ClassVar[Fields] = (("softgym_coverage", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (*ManipulationTask.accounts, ("coverage", float), ("coverage_start", float))
     observations: ClassVar[tuple[Observation, ...]] = (
         *ManipulationTask.observations,
@@ -161,11 +161,28 @@ class SpreadingTask(ManipulationTask):
         grippers = len(self.physics.grippers)
         return [*super().remembers(), ("coverage", float), ("coverage_start", float), ("raised", float, grippers)]
 
+    @property
+    def corners(self) -> NDArray:
+        """Particles that grippers take: of the flat sheet those at (-x, -y), (+x, -y), (-x, +y), (+x, +y), (4,)."""
+        return np.array(self.physics.mesh.corners)
+
+    @property
+    def spacing(self) -> float:
+        """Largest distance of neighboring particles at rest [m]."""
+        return max(self.physics.mesh.spacing)
+
+    def flat_areas(self) -> tuple[float, float]:
+        """Area that the flat sheet covers, and that by SoftGym's measure [m^2]."""
+        width, height = self.physics.mesh.size
+        return width * height, width * height
+
     def constants(self) -> dict[str, Any]:
         mesh = self.physics.mesh
-        own = {"flat_area": mesh.size[0] * mesh.size[1], "particle_radius": max(mesh.spacing), "enough": self.enough}
-        taken = {"corners": np.array(mesh.corners), "corner_neighbors": corner_neighbors(mesh), "columns": mesh.grid_shape[1]}
-        return super().constants() | own | taken
+        own = {"particle_radius": self.spacing, "enough": self.enough}
+        areas = dict(zip(("flat_area", "softgym_area"), self.flat_areas()))
+        neighbors = neighbors_of(mesh, self.corners, self.spacing)
+        taken = {"corners": self.corners, "corner_neighbors": neighbors, "columns": (mesh.shape or (0, 0))[1]}
+        return super().constants() | own | areas | taken
 
 
 class FlattenTask(SpreadingTask):
@@ -181,6 +198,7 @@ class FlattenTask(SpreadingTask):
     picks = 6
     enough = 0.95
     bank: ClassVar[Bank] = CRUMPLED
+    entangles: ClassVar[bool] = False  # whether the expert lifts one corner first, and pulls carefully
     observations = (
         *SpreadingTask.observations,
         WAYS,
@@ -205,15 +223,26 @@ class FlattenTask(SpreadingTask):
 
     def __init__(self, num_envs: int, **kwargs: Any) -> None:
         super().__init__(num_envs, **kwargs)
-        # the sheets of this resolution, before the first reset needs them
-        rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+        self.sheets()  # before the first reset needs them
+
+    def across(self) -> NDArray:
+        """Distance at rest from each of ``EDGES`` to the opposite one [m], (4,)."""
+        return np.full(len(EDGES), self.physics.side)
+
+    def sheets(self) -> NDArray:
+        """The sheets with which episodes begin [m], (sheets, particles, 3)."""
+        return rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
+
+    def mirrored(self, x: NDArray) -> NDArray:
+        """A sheet's mirror image [m], (particles, 3)."""
+        return x * (-1, 1, 1)
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side
-        sheets = rumpled_sheets(*self.physics.mesh.grid_shape, side, self.bank)
+        sheets = self.sheets()
         x = sheets[int(rng.integers(len(sheets)))].copy()
         # mirrored, turned and moved
-        x[:, 0] *= 1 if rng.uniform() < 0.5 else -1
+        x = x if rng.uniform() < 0.5 else self.mirrored(x)
         yaw = rng.uniform(-np.pi, np.pi)
         c, s = np.cos(yaw), np.sin(yaw)
         x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]]) + side * rng.uniform(-0.2, 0.2, 2)

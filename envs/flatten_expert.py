@@ -1,6 +1,7 @@
 """The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
 
-It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.
+It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  A garment
+gets entangled: it is always lifted by one corner first, and the pull on the cloth that is held is limited.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sh
 # NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
 AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
 TEARING = 0.5  # strain at which it lets go
+# of garments: strain of held cloth from which it pulls more slowly, and at which one gripper lets go; strain anywhere at which both
+# do; and after so many steps the other end of an edge is lifted first
+PULLING, LETTING, ALMOST_TORN, OTHER_END = 0.25, 0.35, 0.85, 50
 AGAIN = 95  # steps that another try takes
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
 PULLS = ((0, 1, 2, 3), (2, 3, 0, 1), (0, 3, 1, 2), (1, 2, 0, 3), (0, 3, 1, 2), (1, 2, 0, 3))
@@ -33,8 +37,8 @@ LIFT_EDGE, LIFT_CORNER = 0.5, 0.2  # in sides
 
 def flatten_actions(task: Any) -> NDArray:
     """Actions of all environments, (num_envs, 8)."""
-    mesh, side, grippers = task.physics.mesh, task.physics.side, task.simulation.grippers
-    corners, rest = np.array(mesh.corners), mesh.rest_positions
+    side, grippers, across = task.physics.side, task.simulation.grippers, task.across()
+    corners, rest = task.corners, task.physics.mesh.rest_positions
     x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)
     v = task.simulation.velocities.astype(np.float64)
     speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
@@ -52,16 +56,24 @@ def flatten_actions(task: Any) -> NDArray:
             # nothing is held by mistake
             move[e, :, 2], grip[e] = 0.3, [1.0 if corner[k] < 0 else -1.0 for k in range(2)]
         elif corner[0] >= 0 and corner[1] >= 0:
-            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, side, own, speed[e], v[e])
+            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, (side, across), own, speed[e], v[e])
             # entangled cloth is pulled slowly, and released before it tears
-            strain = float(task.info["strain_max"][e])
+            strain = _strain(task, e, holder[e], x[e])
             move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
-            grip[e] = 1 if strain > TEARING else grip[e]
+            if task.entangles and strain > LETTING:
+                grip[e, tips[e, :, 2].argmin()] = 1
+            elif strain > TEARING:
+                grip[e] = 1
         elif corner[0] >= 0 or corner[1] >= 0:
             move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
+            if task.entangles and (strain := _strain(task, e, holder[e], x[e])) > PULLING:
+                move[e] *= np.clip(1.6 - 4 * strain, 0.0, 1.0)
+                grip[e] = 1 if strain > LETTING else grip[e]
         elif own["coverage"] >= task.enough + FLAT or own["step"] > task.acting_steps - AGAIN:
             move[e, :, 2] = np.where(tips[e, :, 2] < 0.3, 0.5, 0)
         else:
+            if task.entangles and others[e].min() >= 0:
+                others[e, own["step"] // OTHER_END % 2] = -1
             move[e], grip[e] = _take_first(tips[e], goals[e], others[e], side)
     # fingers that have closed on nothing open again
     grip[(grippers.openings == 0) & (grippers.held == 0)] = 1
@@ -77,7 +89,7 @@ def flatten_picks(task: Any) -> NDArray:
     function of their positions and of time.  A flat sheet is left alone.
     """
     n, side, half = task.num_envs, task.physics.side, task.workspace * task.physics.side
-    p = task.simulation.positions[:, list(task.physics.mesh.corners), :2].astype(np.float64)
+    p = task.simulation.positions[:, task.corners, :2].astype(np.float64)
     actions = np.ones((n, 2, 5))
     number = task.episode["step"] // STEPS
     for k, (a, b, c, d) in enumerate(PULLS):
@@ -103,6 +115,16 @@ def flatten_picks(task: Any) -> NDArray:
 def _to(goal: NDArray, tip: NDArray) -> NDArray:
     """Velocity that takes a tip half of the way in a step [m/s]."""
     return (goal - tip) * 15
+
+
+def _strain(task: Any, e: int, holder: NDArray, x: NDArray) -> float:
+    """Largest strain of an environment's sheet; of a garment that of the cloth that is held, unless it almost tears elsewhere."""
+    largest = float(task.info["strain_max"][e])
+    if not task.entangles or largest > ALMOST_TORN:
+        return largest
+    ends, rest, *_ = task.physics.mesh.springs
+    pulled = (holder[ends] >= 0).any(axis=1)
+    return float((length(x[ends[pulled, 1]] - x[ends[pulled, 0]]) / rest[pulled]).max()) - 1
 
 
 def _take_first(tips: Any, goals: Any, others: Any, side: float) -> Any:
@@ -140,7 +162,7 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
     return move, grip
 
 
-def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, side: float, own: Any, speed: float, v: Any) -> Any:
+def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, sizes: Any, own: Any, speed: float, v: Any) -> Any:
     """Lift the edge, stretch it, lay the sheet down behind its far edge, and let go."""
     ends = corners[corner]
     between = rest[held[0]][:, None] - rest[held[1]]
@@ -148,6 +170,7 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     edge = next((i for i in range(4) if set(EDGES[i]) == set(corner)), -1)
     if edge < 0:  # a diagonal
         return np.zeros((2, 3)), np.array([-1.0, 1.0])
+    side, deep = sizes[0], sizes[1][edge]
     # along the edge, and to the far edge, its front up
     along = (tips[1] - tips[0]) * (1, 1, 0)
     along /= max(np.linalg.norm(along), 1e-9)
@@ -178,11 +201,11 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     if middle[2] > LIFTED[1] * side - 0.01 and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
         return keep, -np.ones(2)
     height = x[ends, 2].mean()
-    if low < 0.012 and (reach > 0.96 * side or -middle @ out > 1.3 * side):
+    if low < 0.012 and (reach > 0.96 * deep or -middle @ out > 1.3 * side):
         return np.zeros((2, 3)), np.ones(2)
     # down behind the far edge, backward when it touches the floor; at the end slowly enough that cloth off the floor does not fold
-    touching = far[2] < 0.03 or height < 0.5 * side
-    slack = float(np.clip(side - 0.01 - AHEAD * height - reach, 0.0, NEARER)) if height < 0.5 * side else 0.0
-    back = LAYING * max(height / side, 0.4 if reach < 0.97 * side else 0.0) + CORRECTION * slack if touching else 0.4 * LAYING
-    down = LAYING * max(reach / side, 0.15) * (1 - CORRECTION * slack) if touching else 0.8 * LAYING
+    touching = far[2] < 0.03 or height < 0.5 * deep
+    slack = float(np.clip(deep - 0.01 - AHEAD * height - reach, 0.0, NEARER)) if height < 0.5 * deep else 0.0
+    back = LAYING * max(height / deep, 0.4 if reach < 0.97 * deep else 0.0) + CORRECTION * slack if touching else 0.4 * LAYING
+    down = LAYING * max(reach / deep, 0.15) * (1 - CORRECTION * slack) if touching else 0.8 * LAYING
     return keep - back * out - (0, 0, down), -np.ones(2)

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from clothgym._jit import apart, kernel
 from clothgym.checks import finite, known, not_negative, numbers, positive
 from clothgym.envs.coverage import FINE_CELL, covered_area, shared_area, softgym_area
 from clothgym.garments import Garment
@@ -120,18 +121,68 @@ def funnels_distance(x: ArrayLike, goal: ArrayLike, area: float) -> FunnelsDista
     area.  pose: mean distance of the goal from itself, superimposed on the garment.  Each is the smaller of those from the goal and
     from the mirrored goal.  As in the source, rotations are those of space, so that a garment may be turned over.
     """
-    one, two = _sheet("x", x) * [1, 1, 0], _sheet("goal", goal) * [1, 1, 0]
-    root = np.sqrt(positive("area", area))
-    mirrored = two * [-1, 1, 1]
-    shaped = _superimposed(one, two, np.ones(len(one), bool))
+    x, goal, area = _columns(_sheet("x", x)), _columns(_sheet("goal", goal)), positive("area", area)
+    return FunnelsDistance(*funnels(x, goal, np.sqrt(area)))
+
+
+@kernel
+def _superimpose(x, goal, limit):
+    """Move points rigidly, in place, so that those that lie within a limit of their goals come closest to these (Kabsch 1976).
+
+    A rotation of space takes the plane to itself by a rotation or a reflection.  The best of each has a closed form as in
+    ``fold.aligned``; that of both is the one with the larger sum of products.  x, goal: [m], (2, particles).  limit: [m].
+    """
+    # both centers
+    near, px, py, gx, gy = 0, 0.0, 0.0, 0.0, 0.0
+    for p in range(x.shape[1]):
+        if (x[0, p] - goal[0, p]) ** 2 + (x[1, p] - goal[1, p]) ** 2 < limit * limit:
+            near, px, py, gx, gy = near + 1, px + x[0, p], py + x[1, p], gx + goal[0, p], gy + goal[1, p]
+    if near == 0:
+        return
+    px, py, gx, gy = px / near, py / near, gx / near, gy / near
+    # sums of products
+    xx = xy = yx = yy = 0.0
+    for p in range(x.shape[1]):
+        if (x[0, p] - goal[0, p]) ** 2 + (x[1, p] - goal[1, p]) ** 2 < limit * limit:
+            a, b, u, v = x[0, p] - px, x[1, p] - py, goal[0, p] - gx, goal[1, p] - gy
+            xx, xy, yx, yy = xx + a * u, xy + a * v, yx + b * u, yy + b * v
+    turned, mirrored = (xx + yy) ** 2 + (xy - yx) ** 2, (xx - yy) ** 2 + (xy + yx) ** 2
+    way = 1.0 if turned >= mirrored else -1.0
+    c, s = xx + way * yy, xy - way * yx
+    size = max(np.sqrt(c * c + s * s), 1e-30)
+    c, s = c / size, s / size
+    for p in range(x.shape[1]):
+        a, b = x[0, p] - px, x[1, p] - py
+        x[0, p], x[1, p] = gx + c * a - way * s * b, gy + s * a + way * c * b
+
+
+@kernel
+def _away(x, goal):
+    """Mean distance of points from their goals, or from these mirrored in x if that is less [m]."""
+    one, other = 0.0, 0.0
+    for p in range(x.shape[1]):
+        across = (x[1, p] - goal[1, p]) ** 2
+        one += np.sqrt((x[0, p] - goal[0, p]) ** 2 + across)
+        other += np.sqrt((x[0, p] + goal[0, p]) ** 2 + across)
+    return min(one, other) / x.shape[1]
+
+
+@apart
+def funnels(x, goal, root):
+    """The numbers of ``FunnelsDistance``; x, goal: [m], (2 or 3, particles).  root: of the area [m]."""
+    count, limit = x.shape[1], OUTLIERS * root
+    own, shaped, posed, two = np.empty((2, count)), np.empty((2, count)), np.empty((2, count)), np.empty((2, count))
+    for p in range(count):
+        for c in range(2):
+            own[c, p] = shaped[c, p] = x[c, p]
+            two[c, p] = posed[c, p] = goal[c, p]
+    _superimpose(shaped, two, np.inf)
     for _ in range(PASSES):
-        shaped = _superimposed(shaped, two, np.linalg.norm(shaped - two, axis=1) < OUTLIERS * root)
-    posed = _superimposed(two, one, np.ones(len(one), bool))
-    posed = _superimposed(posed, one, np.linalg.norm(posed - one, axis=1) < OUTLIERS * root)
-    shape, pose = (
-        min(float(np.linalg.norm(own - other, axis=1).mean()) for other in (two, mirrored)) / root for own in (shaped, posed)
-    )
-    return FunnelsDistance(SHAPE * shape + (1 - SHAPE) * pose, shape, pose)
+        _superimpose(shaped, two, limit)
+    _superimpose(posed, own, np.inf)
+    _superimpose(posed, own, limit)
+    shape, pose = _away(shaped, two) / root, _away(posed, two) / root
+    return SHAPE * shape + (1 - SHAPE) * pose, shape, pose
 
 
 def softgym_coverage(x: ArrayLike, flat: ArrayLike, radius: float = SOFTGYM_RADIUS) -> float:
@@ -192,14 +243,3 @@ def _sheet(name: str, value: ArrayLike) -> NDArray[np.float64]:
 def _columns(x: NDArray) -> NDArray[np.float64]:
     """Positions as kernels read them, (3, particles)."""
     return np.ascontiguousarray(x.T, np.float64)
-
-
-def _superimposed(x: NDArray, goal: NDArray, inliers: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The rigid motion of x [m], (particles, 3), that brings its inliers closest to those of the goal (Kabsch 1976)."""
-    if not inliers.any():
-        return x
-    one, two = x[inliers], goal[inliers]
-    u, _, vt = np.linalg.svd((one - one.mean(axis=0)).T @ (two - two.mean(axis=0)))
-    if np.linalg.det(vt.T @ u.T) < 0:
-        vt[2] *= -1
-    return (x - one.mean(axis=0)) @ (vt.T @ u.T).T + two.mean(axis=0)

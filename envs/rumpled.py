@@ -22,7 +22,8 @@ TRIALS = 20  # uneven starts of each sheet that must be free of intersections
 class Bank(NamedTuple):
     """A file of sheets: its name, the kind of ``starts.make``, how often each was dropped, rows, side [m], and how many.
 
-    made: those of which the file keeps some.
+    made: those of which the file keeps some.  garment: its name in ``fold_shirt.SIZES``, of a sheet that is no grid, without rows
+    and a side.
     """
 
     file: str
@@ -32,12 +33,21 @@ class Bank(NamedTuple):
     side: float
     made: int
     kept: int
+    garment: str = ""
 
 
 RUMPLED = Bank("rumpled.npz", "rumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 256, 64)
 CRUMPLED = Bank("crumpled.npz", "crumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 192, 128)
 CRUMPLED_LARGE = Bank("crumpled_large.npz", "crumpled", 3, 21, 0.8, 144, 96)
-BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE)}
+CRUMPLED_SHIRTS = Bank("crumpled_shirts.npz", "crumpled", 1, 0, 0.0, 48, 32, "tshirt")
+BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE, CRUMPLED_SHIRTS)}
+
+
+@cache
+def stored(bank: Bank) -> NDArray:
+    """The sheets of a file [m], (sheets, particles, 3)."""
+    with resources.as_file(resources.files("clothgym.envs").joinpath(bank.file)) as path, np.load(path) as file:
+        return file["positions"] * UNIT
 
 
 @cache
@@ -50,8 +60,7 @@ def rumpled_sheets(rows: int, columns: int, side: float, bank: Bank = RUMPLED) -
     Raises:
         ValueError: all do.
     """
-    with resources.as_file(resources.files("clothgym.envs").joinpath(bank.file)) as path, np.load(path) as file:
-        sheets = file["positions"] * UNIT
+    sheets = stored(bank)
     own = grid(bank.rows, bank.rows, bank.side, bank.side)
     if (rows, columns) == own.grid_shape and side == bank.side:
         return sheets

@@ -50,10 +50,18 @@ def _directions() -> NDArray:
 DIRECTIONS = _directions()
 
 
-def corner_neighbors(mesh: ClothMesh) -> NDArray:
-    """Neighbors of each corner, which a grasp may include, (4, particles), as 0 or 1: records hold no bool arrays."""
+def neighbors_of(mesh: ClothMesh, corners: NDArray, spacing: float) -> NDArray:
+    """Neighbors of each corner, which a grasp may include, (4, particles), as 0 or 1: records hold no bool arrays.
+
+    corners: their particles, (4,).  spacing: of the particles [m].
+    """
     rest = mesh.rest_positions
-    return (np.linalg.norm(rest[list(mesh.corners)][:, None] - rest, axis=2) < 1.5 * max(mesh.spacing)).astype(np.uint8)
+    return (np.linalg.norm(rest[corners][:, None] - rest, axis=2) < 1.5 * spacing).astype(np.uint8)
+
+
+def corner_neighbors(mesh: ClothMesh) -> NDArray:
+    """The same of the corners of a grid."""
+    return neighbors_of(mesh, np.array(mesh.corners), max(mesh.spacing))
 
 
 @apart
@@ -254,9 +262,9 @@ def observe_next(own, rules, sheet, seen, edges):
 
 def _of(task: Any) -> tuple[Any, ...]:
     """Positions of a task's sheets [m], (num_envs, 3, particles), and tips [m]; their corners, and the neighbors of these."""
-    simulation, mesh = task.simulation, task.physics.mesh
+    simulation, rules = task.simulation, task.rules[0]
     x = np.ascontiguousarray(simulation.positions.transpose(0, 2, 1).astype(np.float64))
-    return x, simulation.grippers.positions.astype(np.float64), np.array(mesh.corners), corner_neighbors(mesh)
+    return x, simulation.grippers.positions.astype(np.float64), rules["corners"], rules["corner_neighbors"]
 
 
 @kernel

@@ -96,6 +96,33 @@ def test_cloth_funnels_distance_is_that_of_closed_forms(shirt):
     assert shrunk.pose == pytest.approx(abs(0.1 - middle) / root, rel=1e-6)
 
 
+def by_singular_values(x, goal, inliers):
+    """The source's way to superimpose, in space: Kabsch 1976."""
+    one, two = x[inliers], goal[inliers]
+    u, _, vt = np.linalg.svd((one - one.mean(axis=0)).T @ (two - two.mean(axis=0)))
+    if np.linalg.det(vt.T @ u.T) < 0:
+        vt[2] *= -1
+    return (x - one.mean(axis=0)) @ (vt.T @ u.T).T + two.mean(axis=0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cloth_funnels_distance_is_that_of_rotations_of_space(shirt, seed):
+    """Of crumpled shirts, half of which are turned over, against the source's way by singular values."""
+    rng, goal = np.random.default_rng(seed), shirt.mesh.rest_positions * [1, 1, 0]
+    x = turned(goal * [(-1) ** seed, 1, 0], 6 * rng.uniform(), (0.4, -0.2, 0)) * [1, 0.5, 0] + 0.1 * rng.normal(size=goal.shape)
+    x, area = x * [1, 1, 0], flat_area(shirt)
+    root = np.sqrt(area)
+    shaped = by_singular_values(x, goal, np.ones(len(x), bool))
+    for _ in range(5):
+        shaped = by_singular_values(shaped, goal, np.linalg.norm(shaped - goal, axis=1) < 0.3 * root)
+    posed = by_singular_values(goal, x, np.ones(len(x), bool))
+    posed = by_singular_values(posed, x, np.linalg.norm(posed - x, axis=1) < 0.3 * root)
+    shape, pose = (
+        min(np.linalg.norm(own - way, axis=1).mean() for way in (goal, goal * [-1, 1, 1])) / root for own in (shaped, posed)
+    )
+    assert funnels_distance(x, goal, area) == pytest.approx((0.65 * shape + 0.35 * pose, shape, pose), rel=1e-9)
+
+
 def test_cloth_funnels_leaves_outliers_out(shirt):
     """A sleeve far away does not turn the rest: the shape is the share of its particles times their distance."""
     goal, area = shirt.mesh.rest_positions, flat_area(shirt)

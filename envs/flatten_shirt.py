@@ -1,0 +1,137 @@
+"""ClothFlattenShirt-v0: spread a crumpled T-shirt on the floor."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import apart, inlined
+from clothgym.envs import garment_scores
+from clothgym.envs.coverage import softgym_area
+from clothgym.envs.episode import Fields
+from clothgym.envs.flatten import FlattenTask, evaluate_spread
+from clothgym.envs.fold_shirt import SPACING, FoldShirtTask, garment_named
+from clothgym.envs.garment_scores import funnels
+from clothgym.envs.gripper_task import GripperTask
+from clothgym.envs.rumpled import CRUMPLED_SHIRTS, stored
+from clothgym.envs.single import ClothEnv
+from clothgym.envs.taking import EDGES, OPPOSITE
+from clothgym.mesh import ClothMesh
+
+SHIRT = garment_named(CRUMPLED_SHIRTS.garment)
+CORNERS = ("waist_left", "waist_right", "sleeve_top_left", "sleeve_top_right")  # that grippers take
+
+
+@apart
+def facing_up(x, triangles, share):
+    """Share of a panel that looks up; x: [m], (3, particles).  share: of the panel's area at rest, by triangle, 0 elsewhere."""
+    total = 0.0
+    for t in range(triangles.shape[0]):
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        up = (x[0, b] - x[0, a]) * (x[1, c] - x[1, a]) - (x[1, b] - x[1, a]) * (x[0, c] - x[0, a])
+        if up > 0:
+            total += share[t]
+    return total
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write what ``flatten`` measures, the distance of Cloth Funnels, and how far the front looks up; returns the improvement."""
+    info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.x, rules.canonical, np.sqrt(rules.flat_area))
+    info.face_up = facing_up(sheet.x, sheet.mesh.triangles, rules.front)
+    return evaluate_spread(own, rules, sheet, info)
+
+
+class FlattenShirtTask(FlattenTask):
+    """The task of ``ClothFlattenShirt-v0``, see ``ClothFlattenShirtEnv``."""
+
+    physics = FoldShirtTask.physics
+    kernels = FlattenTask.kernels._replace(evaluate=_evaluate)
+    acting_steps = 450
+    enough = 0.9
+    entangles = True
+    bank = CRUMPLED_SHIRTS
+    key_points = FoldShirtTask.key_points
+    evaluation: ClassVar[Fields] = (
+        *FlattenTask.evaluation, ("face_up", float), ("peer_funnels", float), ("peer_funnels_shape", float),
+    )  # fmt: skip
+
+    @classmethod
+    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+        """The garment's key points."""
+        return np.array(list(SHIRT.key_points.values()))
+
+    @property
+    def corners(self) -> NDArray:
+        return np.array([SHIRT.key_points[name] for name in CORNERS])
+
+    @property
+    def spacing(self) -> float:
+        return SPACING
+
+    def flat_areas(self) -> tuple[float, float]:
+        flat = np.ascontiguousarray(SHIRT.mesh.rest_positions.T)
+        return garment_scores.flat_area(SHIRT), float(softgym_area(flat, SPACING))
+
+    def across(self) -> NDArray:
+        at = SHIRT.mesh.rest_positions[self.corners]
+        return np.linalg.norm(at[EDGES].mean(axis=1) - at[OPPOSITE].mean(axis=1), axis=1)
+
+    def constants(self) -> dict[str, Any]:
+        a, b, c = (SHIRT.mesh.rest_positions[SHIRT.mesh.triangles[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * SHIRT.front
+        canonical = np.ascontiguousarray(SHIRT.mesh.rest_positions[:, :2].T)
+        return super().constants() | {"canonical": canonical, "front": area / area.sum()}
+
+    def sheets(self) -> NDArray:
+        return stored(self.bank)
+
+    def mirrored(self, x: NDArray) -> NDArray:
+        # left particles take the places of right ones: the mirror image itself would be a shirt that is inside out
+        return super().mirrored(x)[SHIRT.mirror]
+
+    def expert_picks(self) -> NDArray:
+        return GripperTask.expert_picks(self)
+
+
+class ClothFlattenShirtEnv(ClothEnv):
+    """Spread a crumpled T-shirt on the floor with two grippers and release it.
+
+    ## Description
+    A T-shirt of two layers lies crumpled on the floor.  Two grippers can grasp it, including other layers.  After 450 steps they
+    open, and the shirt settles for 40 steps, in which actions are ignored; then it is evaluated.  Either side may be up.
+
+    The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
+    along shoulders, sleeves and sides, and open at neck, hem and cuffs.  L is its width from cuff to cuff, 0.76 m.  All
+    environments have the same sizes; ``randomize`` draws fabrics.
+
+    $physics
+
+    ## Observation Space
+    $observations
+
+    The corners are the left and right end of the hem, and of the sleeves' upper side.  The edges between them are the hem, the
+    sides, and the line from sleeve to sleeve.  ``next`` is chosen as in ``ClothFlatten-v0``, until the coverage is 0.905.
+
+    ## Rewards
+    As in ``ClothFlatten-v0``.
+
+    ## Evaluation
+    The coverage and the normalized performance are those of ``ClothFlatten-v0``, relative to the area that the flat shirt covers,
+    0.31 m^2.  In a success, the coverage is 0.9 or more, and the shirt is released and at rest (less than 0.02 m/s rms).
+
+    ``info`` is that of ``ClothFlatten-v0``; ``softgym_coverage`` is relative to the same measure of the flat shirt.  At the
+    evaluation it also has ``face_up``, the share of the front panel that looks up, and Cloth Funnels' distance from the canonical
+    pose: the flat shirt about the origin, its neck toward +y.  ``peer/funnels`` is 0.65 times the distance in shape plus 0.35 times
+    that in pose, and ``peer/funnels_shape`` is the distance in shape, see ``clothgym.envs.garment_scores``.
+
+    ## Starting State
+    One of 32 crumpled shirts that cover 0.24 to 0.47 of the flat shirt's area (``benchmarks/rumpled_sheets.py``): lifted high at a
+    random particle and dropped.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
+    y.  Held-out seeds draw from the same shirts, in new combinations.  The grippers are open, 0.3 to 0.5 L to the left and right of
+    the origin, 0.4 to 0.6 L above the floor.
+    """
+
+    task_class = FlattenShirtTask
