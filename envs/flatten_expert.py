@@ -24,8 +24,8 @@ SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sh
 # NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
 AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
 TEARING = 0.5  # strain at which it lets go
-# of garments: strain of held cloth from which it pulls more slowly, and at which one gripper lets go; strain anywhere at which both
-# do; and after so many steps the other end of an edge is lifted first
+# of garments: strain of held cloth from which it pulls more slowly, and at which a gripper lets go, of two the lower one; strain
+# anywhere from which that counts instead; and after so many steps the other end of an edge is lifted first
 PULLING, LETTING, ALMOST_TORN, OTHER_END = 0.25, 0.35, 0.85, 50
 AGAIN = 95  # steps that another try takes
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals

@@ -217,7 +217,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of keywords: the task's own, then those of all tasks."""
     physics, rows = task_class.physics, ["| Argument | Default | Meaning |", "| --- | --- | --- |"]
     own = {
-        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "–",
+        "$rows": str(physics.mesh.shape[0]) if physics.mesh.shape else "",
         "$side": f"{physics.side:g}",
         "$integrator": f'"{physics.integrator}"',
         "$substeps": str(physics.substeps),
@@ -229,6 +229,8 @@ def arguments_of(task_class: type[Task]) -> list[str]:
     inherited = keywords_of(Task)
     defaults = {**keywords_of(task_class), **{name: None for name in ("render_mode", "render_color", "width", "height")}}
     for name, default in defaults.items():
+        if name in ("rows", "side") and not physics.mesh.shape:
+            continue  # a mesh that is no grid has one size
         shown, meaning = COMMON.get(name, ("", ""))
         if not shown or (name in inherited and default != inherited[name]):  # a task may have another default than all others
             shown = f"``{json.dumps(default) if isinstance(default, str) else repr(default)}``"

@@ -93,8 +93,8 @@ class Physics:
             return self
         if self.mesh.shape is None or (self.anchors and not callable(self.anchors)):
             raise ValueError(
-                f"rows={shown(rows)}, side={shown(side)}: this task has one mesh; its mesh must be a grid, and Physics.anchors a "
-                "function of the mesh"
+                f"rows={shown(rows)}, side={shown(side)}: this task has one mesh; leave them out, or make its mesh a grid, and "
+                "Physics.anchors a function of the mesh"
             )
         (own_rows, columns), size = self.mesh.shape, self.mesh.size
         number_of_rows = own_rows if rows is None else count("rows", rows, least=ROWS[0], most=ROWS[1])

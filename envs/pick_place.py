@@ -3,7 +3,7 @@
 With ``"pick_particle"`` the pick position is a place of the flat sheet: the particle there is picked, wherever it lies (as in
 Lin et al. 2021, "Learning visible connectivity dynamics for cloth smoothing"), and the place is relative to the origin of the
 task's observations.  Every such pick takes hold of cloth, what an agent sees says where it places, and two grippers never pull
-their particles farther apart than they are in the flat sheet: random actions do not tear it.
+their particles farther apart than they are in the flat sheet.
 
 One such action takes ``STEPS`` control steps in every environment, for any distance: the motion is spread evenly over them.  A
 batch therefore stays synchronous, and no environment waits for another.  When the time is up the sheet settles in further steps,
@@ -27,6 +27,7 @@ MOVING = STEPS - 2 * FINGERS - RESTING
 RETREAT, LEAVING = 0.15, 4  # how far the grippers rise at the end, in sides, and in how many steps
 PICK_RADIUS = 0.03  # horizontal radius around the pick position in which the top of the cloth sets the tip's height [m]
 LOWEST = 0.012  # height of a tip that picks [m]
+ALONG = np.arange(0.05, 1, 0.05)  # shares of a way at which two tips may not be too far apart
 
 
 class Path(NamedTuple):
@@ -59,7 +60,8 @@ def places_of(actions: NDArray, cloth: NDArray, half: float) -> tuple[NDArray, N
 
 
 def particles_of(actions: NDArray, flat: NDArray) -> NDArray[np.intp]:
-    """The particles that actions with "pick_particle" pick, (num_envs, grippers): those nearest to a place of the flat sheet.
+    """The particles that actions with "pick_particle" pick, (num_envs, grippers): those nearest to a place of the flat sheet, of a
+    garment those of its front.
 
     actions: (num_envs, grippers, NUMBERS), the first two from -1 to 1 across the flat sheet along x and y.
     flat: particles of the flat sheet [m], (particles, 3).
@@ -79,10 +81,13 @@ def keep_together(pick: NDArray, place: NDArray, lift: NDArray, apart: NDArray) 
     between, middle = place[:, 1] - place[:, 0], place.mean(axis=1)
     between *= np.minimum(apart / np.maximum(length(between), 1e-9), 1)[:, None]
     place[:, 0], place[:, 1] = middle - between / 2, middle + between / 2
-    # both are half of their ways at once, where the arcs are highest
-    halfway = (between + pick[:, 1] - pick[:, 0]) / 2 * (1, 1, 0)
-    most = np.sqrt(np.maximum(apart**2 - length(halfway) ** 2, 0))
-    higher = np.clip(lift[:, 1] - lift[:, 0], -most, most)
+    # on the ways from pick to place the tips are ``(1 - s) (p1 - p0) + s (q1 - q0)`` apart, and the arcs add ``4 s (1 - s)`` of the
+    # difference of the lifts to the height of that: what is left of the distance bounds it
+    higher = lift[:, 1] - lift[:, 0]
+    for s in ALONG:
+        way = (1 - s) * (pick[:, 1] - pick[:, 0]) + s * between
+        left, arc = np.sqrt(np.maximum(apart**2 - way[:, 0] ** 2 - way[:, 1] ** 2, 0)), 4 * s * (1 - s)
+        higher = np.clip(higher, np.minimum((-left - way[:, 2]) / arc, 0), np.maximum((left - way[:, 2]) / arc, 0))
     lift[...] = lift.mean(axis=1, keepdims=True) + higher[:, None] * (-0.5, 0.5)
 
 

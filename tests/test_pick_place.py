@@ -87,7 +87,8 @@ def test_the_particle_of_a_place_is_the_nearest_one():
 
 def test_random_picks_never_carry_two_particles_farther_apart_than_in_the_flat_sheet():
     rng, count = np.random.default_rng(4), 500
-    pick, place = rng.uniform(-0.3, 0.3, (2, count, 2, 3)) * (1, 1, 0) + (0, 0, pick_place.LOWEST)
+    pick, place = rng.uniform(-0.3, 0.3, (2, count, 2, 3))
+    pick[..., 2], place[..., 2] = rng.uniform(pick_place.LOWEST, 0.25, (count, 2)), pick_place.LOWEST
     place *= (3, 3, 1)
     lift, tips = rng.uniform(0, 0.6, (count, 2)), np.zeros((count, 2, 3))
     apart = np.linalg.norm(pick[:, 1] - pick[:, 0], axis=1) * rng.uniform(1, 1.5, count)

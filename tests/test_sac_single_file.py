@@ -171,23 +171,6 @@ def test_a_torn_sheet_costs_as_much_as_all_steps_to_come_and_a_loss_no_more_than
             assert min(batch["reward"].min() for batch in run.minibatches()) == pytest.approx(least)
 
 
-def test_in_hindsight_the_goal_is_that_which_was_reached(single):
-    config = {"env": "ClothFoldGoal-v0", "seed": 0, "threads": 1, "timesteps": 100, "curriculum": {}, "env_kwargs": {}}
-    hyperparameters = single.asdict(options(single, n_envs=2, hindsight=True))
-    run = single.Run(config | {"hyperparameters": hyperparameters}, None)
-    before = run.now["observation"].copy()
-    collect(run)
-    rows, after = run.replay.rows, run.now["observation"]
-    assert run.replay.added == 4 and rows["reward"][:4].tolist() == pytest.approx([-10, -10, 0, 0])
-    # what is achieved comes first, then the goal, 12 numbers each
-    for name, seen in (("observation", before), ("following", after)):
-        assert np.array_equal(rows[name][:2], seen) and np.array_equal(rows[name][2:4, 12:24], after[:, :12])
-        assert np.array_equal(np.delete(rows[name][2:4], np.s_[12:24], axis=1), np.delete(seen, np.s_[12:24], axis=1))
-    for changed in ({"env": "ClothReach-v0"}, {"env_kwargs": {"reward_mode": "delta"}}):
-        with pytest.raises(ValueError, match=r"hindsight=true: Cloth.* needs goals, and reward_mode='goal'"):
-            single.Run(config | changed | {"hyperparameters": hyperparameters}, None)
-
-
 def test_a_policy_pays_the_price_of_its_costs(single):
     """Of an action a the reward is a, and the cost a^2: best is a = 1 / (2 multiplier)."""
     import torch
@@ -382,6 +365,12 @@ def test_goals_are_observed_by_the_policy(single):
 WRONG = {
     "--env ClothHang-Hard-v0": "has no hyperparameters for 'ClothHang-Hard-v0' (there are: ClothReach-v0",
     '--options {"gamma":2}': "--options: gamma 2: must be from 0 to 1",
+    '--options {"updates":2.5}': "--options: updates 2.5: must be a count",
+    '--options {"n_envs":true}': "--options: n_envs True: must be a count",
+    '--options {"normalize":"no"}': "--options: normalize 'no': must be true or false",
+    '--options {"cost_limit":true}': "--options: cost_limit True: must be a number",
+    '--options {"net_arch":[64,true]}': "--options: net_arch [64, True]: must be a list of counts",
+    '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",
     "--resume taken": "is a run of ppo, which train.py goes on with",

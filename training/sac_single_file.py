@@ -46,7 +46,6 @@ from clothgym.registration import checked_id
 ALGO = "sac_scratch"
 LOG_STD = (-5.0, 2.0)  # range of the logarithm of an action's standard deviation, before the tanh
 FOLLOWING = {"observation": "following", "picture": "following_picture"}  # names in the replay buffer
-GOALS = ("achieved_goal", "desired_goal")  # the first keys of an observation with goals
 NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
@@ -83,7 +82,6 @@ class Options:
     bounded_for: float = 1.0  # share of the control steps for which least_reward holds
     cost_limit: float | None = None  # the mean cost of an episode that is allowed
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
-    hindsight: bool = False  # whether each transition is also learned from as if what it reached had been its goal (HER)
     normalize: bool = True  # whether observations are normalized
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -133,9 +131,9 @@ class Args:
         if unknown := set(options) - set(Options.__dataclass_fields__):
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
-        free = {"normalize", "hindsight"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
-        limited = {name: value for name, value in chosen.items() if name not in free}
-        _within_limits("--options: ", limited)
+        _of_their_types(chosen)
+        free = {"normalize"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
             raise ValueError(f"{self.folder} holds a run already: go on with --resume {self.folder}, or choose another with --run")
@@ -144,6 +142,18 @@ class Args:
             "num_envs": chosen["n_envs"], "timesteps": chosen["timesteps"], "seed": self.seed, "threads": 1,
             "curriculum": curriculum, "hyperparameters": chosen,
         }  # fmt: skip
+
+
+def _of_their_types(chosen: dict[str, Any]) -> None:
+    """Refuse options of another type than that of their defaults."""
+    for name, value in chosen.items():
+        default = Options.__dataclass_fields__[name].default
+        kinds, wanted = {
+            bool: ({bool}, "true or false"), int: ({int}, "a count"), tuple: ({list, tuple}, "a list of counts"),
+        }.get(type(default), ({int, float, type(default)}, "a number"))  # fmt: skip
+        counts = value if type(value) in (list, tuple) else ()
+        if type(value) not in kinds or {type(one) for one in counts} - {int} or (kinds == {list, tuple} and not counts):
+            raise ValueError(f"--options: {name} {value!r}: must be {wanted}")
 
 
 def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
@@ -411,8 +421,6 @@ class Run:
         observation, info = self.env.reset(seed=self.seeds()[0] % (HELD_OUT - self.options.n_envs))
         if self.options.cost_limit is not None and "cost" not in info:
             raise ValueError(f"cost_limit={self.options.cost_limit}: {config['env']} has no costs")
-        if self.options.hindsight and (self.keys[:2] != GOALS or self.env.task.reward_mode != "goal"):
-            raise ValueError(f"hindsight=true: {config['env']} needs goals, and reward_mode='goal' in --env-kwargs")
         self.now = self.parts(observation)
         self.settling = np.zeros(self.options.n_envs, bool)
         self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
@@ -509,20 +517,7 @@ class Run:
             last[name][acting] = 0
             last[name] += earned
         self.settling = info["settling"]
-        kept = {name: part[~self.settling] for name, part in last.items()}
-        self.replay.add(**kept)
-        if options.hindsight:
-            self.replay.add(**self.in_hindsight(kept))
-
-    def in_hindsight(self, transitions: dict[str, NDArray]) -> dict[str, NDArray]:
-        """Transitions with the goal that they reached, where nothing is lost (Andrychowicz et al., "Hindsight Experience Replay",
-        2017, with one goal for each)."""
-        size = self.env.single_observation_space[GOALS[0]].shape[0]
-        reached = transitions["following"][:, :size]
-        changed = {name: transitions[name].copy() for name in ("observation", "following")}
-        for part in changed.values():
-            part[:, size : 2 * size] = reached
-        return transitions | changed | {"reward": np.zeros(len(reached), np.float32)}
+        self.replay.add(**{name: part[~self.settling] for name, part in last.items()})
 
     def policy(self, about: dict[str, Any]) -> Any:
         """The mean action as it is now, as a file holds it; None of a policy that sees pictures."""
