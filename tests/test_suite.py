@@ -107,6 +107,9 @@ def test_an_interrupted_suite_goes_on(scripts, tmp_path, monkeypatch):
     assert len(begun) == 4  # of three rows one was there
     rows, whole = (files.read_json(one, "", "")["rows"] for one in (path, tmp_path / "whole.json"))
     assert [{**row, "seconds": 0} for row in rows] == [{**row, "seconds": 0} for row in whole]
+    # the scores of one id are no suite, and do not take the place of one
+    with pytest.raises(ValueError, match=r"suite.json: holds a suite's rows, which would be lost: add --suite"):
+        evaluate.Args(env=(ENV,), policy=("noop",), json=path)
 
 
 def test_rows_of_another_machine_or_file_are_not_added_to(scripts, tmp_path):

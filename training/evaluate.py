@@ -69,6 +69,8 @@ class Args:
         if self.suite:
             suite.rows_of(self.env, self.policy, self.seed, kwargs)
             return
+        if self.json is not None and suite.is_file(self.json):
+            raise ValueError(f"--json {self.json}: holds a suite's rows, which would be lost: add --suite, or name another file")
         if self.anew:
             raise ValueError("--anew: is for --suite; without it everything is scored anew")
         for name in self.policy:

@@ -8,6 +8,7 @@ writes to a file.
 from __future__ import annotations
 
 import datetime
+import json
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -56,6 +57,14 @@ def read(path: Path) -> list[Row]:
         ValueError: it is another file, or damaged.
     """
     return files.read_json(path, "file of a suite's scores", ADVICE)["rows"] if path.exists() else []
+
+
+def is_file(path: Path) -> bool:
+    """Whether a path is a file of a suite's scores."""
+    try:
+        return "rows" in json.loads(path.read_text())
+    except (OSError, ValueError):
+        return False
 
 
 def keep(path: Path | None, row: Row) -> None:
