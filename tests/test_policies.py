@@ -209,6 +209,7 @@ def test_what_committed_policies_say_is_in_the_table(scripts):
     table = results.learned()
     for env_id, learner in COMMITTED:
         about = policies.load(env_id, learner).about
-        rows = [row for row in table if (row["env"], row["learner"], row["seed"]) == (env_id, learner, about["seed"])]
+        same = (env_id, learner, about["seed"], about["env_kwargs"])
+        rows = [row for row in table if (row["env"], row["learner"], row["seed"], row["env_kwargs"]) == same]
         assert [(row["success_rate"], row["digest"]) for row in rows] == [(about["success_rate"], about["digest"])], env_id
         assert rows[0].get("safe_success_rate") == about.get("safe_success_rate")

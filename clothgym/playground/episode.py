@@ -253,7 +253,7 @@ class Race(Stage):
     the screen, so the visitor says how far and how high; sideways the lane leads the sheet to the middle of the target.
 
     Args:
-        policies: the opponents, by name; the race starts with the first.
+        policies: the opponents, by name.  The race starts with the first of those that act most often: the visitor acts as often.
 
     Raises:
         ValueError: there is no policy.
@@ -270,7 +270,7 @@ class Race(Stage):
         if not policies:
             raise ValueError(f"{TASK} has no learned policy here to race against")
         self.name, self.seed, self.policies = RACE, seed, dict(policies)
-        self.choose(next(iter(policies)))
+        self.choose(min(policies, key=lambda name: getattr(policies[name], "env_kwargs", {}).get("action_repeat", 1)))
 
     def choose(self, policy: str) -> None:
         """Race against another policy, from the start."""
