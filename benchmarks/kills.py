@@ -31,7 +31,9 @@ SHORT = """
 ClothReach-v0:
   {n_envs: 4, n_timesteps: 160, policy: MlpPolicy, n_steps: 10, batch_size: 40, n_epochs: 1, policy_kwargs: {net_arch: [8]}}
 """
-OPTIONS = '{"n_envs": 4, "random_decisions": 100, "timesteps": 1600, "updates": 1, "batch_size": 16, "net_arch": [8]}'
+OPTIONS = (
+    '{"n_envs": 4, "random_decisions": 100, "timesteps": 1600, "updates": 1, "batch_size": 16, "net_arch": [8], "buffer_size": 300}'
+)
 # arguments of a new run, by script
 BEGIN = {
     "train": ("--env", "ClothReach-v0", "--hyperparams", "short.yml"),

@@ -62,12 +62,12 @@ def wedge(degrees):
 LOST = {
     "a plate": (plate(0.02), 40, 0.02, (0.1, 0.1, 0)),
     "a plate of one cell": (plate(0.025), 40, 0.025, (0.1, 0.1, 0)),
-    "a film": (plate(0.008), 40, 0.008, (0.1, 0.1, 0)),
-    "a plate on its corner": (plate(0.02, ON_ITS_CORNER), 40, 0.02, (0, 0, 0)),
+    "a film": (plate(0.004), 40, 0.004, (0.1, 0.1, 0)),
+    "a plate on its corner": (plate(0.015, ON_ITS_CORNER), 40, 0.015, (0, 0, 0)),
     "the wall of an L": (angle(0.015), 40, 0.015, (0.0075, 0.3, 0.6)),
-    "a closed box": (hollow(0.024), 32, 0.024, (0.488, 0.1, 0.1)),
+    "a closed box": (hollow(0.018), 32, 0.018, (0.491, 0.1, 0.1)),
     "a rod": (rod(0.015), 40, 0.03 * np.cos(np.pi / 8), (0, 0, 0)),
-    "a thin bowl": (bowl(0.5, 0.47), 40, 0.03, None),
+    "a thin bowl": (bowl(0.5, 0.48), 40, 0.02, None),
     "all of a box": (box_mesh((0.1, 0.1, 0.1)), 1, 0.2, (0, 0, 0)),
 }
 

@@ -62,9 +62,10 @@ def read(path: Path) -> list[Row]:
 def is_file(path: Path) -> bool:
     """Whether a path is a file of a suite's scores."""
     try:
-        return "rows" in json.loads(path.read_text())
+        content = json.loads(path.read_text())
     except (OSError, ValueError):
         return False
+    return isinstance(content, dict) and "rows" in content
 
 
 def keep(path: Path | None, row: Row) -> None:
