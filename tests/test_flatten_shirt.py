@@ -1,4 +1,4 @@
-"""ClothFlattenShirt-v0: its starts, its evaluation of shirts made here, and what its expert does."""
+"""ClothFlattenShirt-v0: its starts, its evaluation of shirts made here, and the edges between the points that its expert takes."""
 
 import gymnasium as gym
 import numpy as np
