@@ -14,7 +14,8 @@ from clothgym.envs import pick_place
 from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
-from clothgym.envs.gripper_task import LARGE_SILK, REACH, ManipulationTask, close_or_open, observe_grippers
+from clothgym.envs.framing import DirectedTask
+from clothgym.envs.gripper_task import LARGE_SILK, PHYSICS, REACH, close_or_open, observe_grippers
 from clothgym.envs.measures import SPEED2
 from clothgym.envs.observing import Observation
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow, grasp
@@ -196,7 +197,7 @@ def along_arc(way: NDArray, height: NDArray, whole: NDArray, low: float) -> tupl
     return step, left
 
 
-class FoldingTask(ManipulationTask):
+class FoldingTask(DirectedTask):
     """Base of the tasks that end with a folded sheet on the floor.
 
     Attributes:
@@ -208,14 +209,15 @@ class FoldingTask(ManipulationTask):
 
     kernels = Kernels(_potential, evaluate_fold, _observe, measure=_measure, account=_account, fingers=close_or_open)
     settling_steps = 60
+    direction = "the sheet's own x axis as it lies at the start"
     observations = (
-        *ManipulationTask.observations,
-        Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0),
+        *DirectedTask.observations,
+        Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0, turns=True),
     )
     points_relative_to = "the initial center of the sheet"
     evaluation: ClassVar[Fields] = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (
-        ("fold_error", float), ("fold_error_max", float), ("height", float), *ManipulationTask.accounts,
+        ("fold_error", float), ("fold_error_max", float), ("height", float), *DirectedTask.accounts,
     )  # fmt: skip
     away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
     turned: ClassVar[float] = np.pi / 4  # largest yaw of the sheet [rad]
@@ -248,6 +250,9 @@ class FoldingTask(ManipulationTask):
         self.episode["origin"][env], self.episode["turn"][env] = (*center, 0), turn
         self.hover(env, rng, x[self.below])
         return self.uneven(x, rng)
+
+    def heading(self) -> NDArray[np.float64]:
+        return self.episode["turn"]
 
     def _began(self) -> NDArray:
         """Initial positions of the sheet's points [m], (num_envs, particles, 3)."""
@@ -310,7 +315,7 @@ class FoldingTask(ManipulationTask):
     def camera(self) -> Camera:
         from clothgym.render import Camera  # imported here: training draws nothing
 
-        far = self.physics.side / ManipulationTask.physics.side
+        far = self.physics.side / PHYSICS.side
         return Camera(eye=(0.9 * far, -1.35 * far, 1.05 * far), target=(0.0, 0.0, 0.05), vertical_fov=36.0)
 
 
@@ -321,7 +326,7 @@ class FoldTask(FoldingTask):
         fold: one of ``FOLDS``.
     """
 
-    arguments: ClassVar = {**ManipulationTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
+    arguments: ClassVar = {**DirectedTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
     acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
 
     def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,12 +14,12 @@ from clothgym.checks import one_of
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
 from clothgym.envs.fold import EXPERT_DONE, EXPERT_LOW, EXPERT_NEAR, PICKING, FoldingTask, along_arc
+from clothgym.envs.framing import DirectedTask
 from clothgym.envs.gripper_task import (
     CORNERS,
     LARGE_SILK,
     REACH,
     WAYS,
-    ManipulationTask,
     close_or_open,
     observe_grippers,
     observe_ways,
@@ -106,7 +107,7 @@ def goal_reward(achieved: Any, desired: Any) -> NDArray[np.float32]:
     return -(away2.max(axis=-1) > np.float32(ENOUGH_NEAR**2)).astype(np.float32)
 
 
-class FoldGoalTask(ManipulationTask):
+class FoldGoalTask(DirectedTask):
     """The task of ``ClothFoldGoal-v0``, see ``ClothFoldGoalEnv``.
 
     Args:
@@ -119,18 +120,19 @@ class FoldGoalTask(ManipulationTask):
     obs_modes = ("keypoints", "particles")
     # the goals come last, for ``as_dict``
     observations = (
-        *ManipulationTask.observations,
+        *DirectedTask.observations,
         WAYS,
-        Observation(GOALS[0], "positions of the four corners", (CORNERS, 3), "L", POSITION_BOUND),
-        Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND),
+        Observation(GOALS[0], "positions of the four corners", (CORNERS, 3), "L", POSITION_BOUND, turns=True),
+        Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND, turns=True),
     )
     goals = GOALS
+    direction = "the edge that is carried, and points are in the order in which they lie along it"
     points_relative_to = "the initial center of the sheet"
     evaluation = (("rms_speed", float),)
-    accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**ManipulationTask.ranges, "carried": (-1, CORNERS - 1)}
+    accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *DirectedTask.accounts)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**DirectedTask.ranges, "carried": (-1, CORNERS - 1)}
     arguments: ClassVar = {
-        **ManipulationTask.arguments,
+        **DirectedTask.arguments,
         "reward_mode": '-1, and 0 where every corner is near its goal; or ``"delta"`` or ``"sparse"``',
     }
     away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
@@ -150,6 +152,40 @@ class FoldGoalTask(ManipulationTask):
 
     def constants(self) -> dict[str, Any]:
         return {"corners": np.array(self.physics.mesh.corners)}
+
+    def _around(self) -> NDArray[np.int64]:
+        """The corners in order around the sheet, from the one of the first gripper on, (num_envs, 4), as places in ``AROUND``."""
+        around = np.array(AROUND)
+        first = np.argmax(around == self.episode["carried"][:, :1], axis=1)
+        return (first[:, None] + np.arange(CORNERS)) % CORNERS
+
+    def heading(self) -> NDArray[np.float64]:
+        # the edge across from it stays where it is
+        rows, (*_, beyond, before) = np.arange(self.num_envs), np.array(AROUND)[self._around()].T
+        edge = self.episode["goal"][rows, beyond] - self.episode["goal"][rows, before]
+        return edge[:, :2] / np.maximum(length(edge), 1e-9)[:, None]
+
+    def order(self) -> NDArray[np.int64]:
+        return self._orders[self._around()[:, 0]]
+
+    @cached_property
+    def _orders(self) -> NDArray[np.int64]:
+        """``order`` for each place in ``AROUND`` of the first gripper's corner, (4, numbers).
+
+        A quarter turn of the sheet takes its points to one another.
+        """
+        rest, slices = self.physics.mesh.rest_positions[:, :2], self.observation_slices
+        flat = (rest - rest.mean(axis=0)) @ (1, 1j)
+        points, corners = flat[self.particles], flat[list(self.physics.mesh.corners)]
+        orders = np.tile(np.arange(self.observation.shape[1]), (CORNERS, 1))
+        for quarters, order in enumerate(orders):
+            for name, among, groups in (
+                *((name, points, 1) for name in list(slices)[:2]), (WAYS.name, corners, 2), *((name, corners, 1) for name in GOALS),
+            ):  # fmt: skip
+                taken = np.argmin(abs(among - 1j**quarters * among[:, None]), axis=1)
+                numbers = np.arange(slices[name].start, slices[name].stop).reshape(groups, len(among), 3)
+                order[slices[name]] = numbers[:, taken].ravel()
+        return orders
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         mesh, side, own = self.physics.mesh, self.physics.side, self.episode[env]

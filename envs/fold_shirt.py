@@ -13,7 +13,7 @@ from clothgym._jit import apart, inlined
 from clothgym.checks import one_of
 from clothgym.envs.episode import Fields
 from clothgym.envs.fold import FoldingTask, evaluate_fold
-from clothgym.envs.gripper_task import PHYSICS, ManipulationTask
+from clothgym.envs.gripper_task import PHYSICS
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.single import ClothEnv
 from clothgym.garments import USUAL_THICKNESS, Garment, make
@@ -110,7 +110,7 @@ class FoldShirtTask(FoldingTask):
     expert_low = (0.03,)
     key_points = "key points of the garment, of ``clothgym.garments``"
     evaluation: ClassVar[Fields] = (*FoldingTask.evaluation, ("vertex_distance", float), ("peer_foldnet", float))
-    arguments: ClassVar = {**ManipulationTask.arguments, "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``'}
+    arguments: ClassVar = {**FoldingTask.arguments, "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``'}
 
     def __init__(self, num_envs: int, garment: str = "tshirt", **kwargs: Any) -> None:
         one_of("garment", garment, *SIZES)

@@ -40,6 +40,7 @@ class Observation(NamedTuple):
     name: its key in ``observation_slices``.  about, unit: for the page; "L" is the sheet's longer side.  shape: of the array.
     bound: largest magnitude, one for all or one for each number along the last axis.  function: its values from the task,
     (num_envs, ...); without one they are the field of ``Task.episode`` of that name, or written by the task's kernel ``observe``.
+    turns: whether the first two numbers along the last axis are x and y, see ``framing``.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Observation(NamedTuple):
     unit: str = ""
     bound: float | tuple[float, ...] = 1.0
     function: Callable[[Any], NDArray] | None = None
+    turns: bool = False
 
 
 class View(NamedTuple):
@@ -195,7 +197,7 @@ class Observer:
 
     def _given(self, which: int | slice) -> Any:
         """Picture or state vector, and what goes with it."""
-        state = self.task.observation[which]
+        state = self.task.returned(self.task.observation[which], which)
         own = (state[..., self._own] if self.pictures is None else self.pictures[which]).copy()
         if not self._goals and not self.privileged:
             return own

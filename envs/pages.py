@@ -223,6 +223,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$substeps": str(physics.substeps),
         "$air_density": f"{physics.air_density:g}",
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
+        "$direction": getattr(task_class, "direction", ""),
         "$picks": str(getattr(task_class, "picks", "")),
         "$rests": str(-(-task_class.settling_steps // STEPS)),
     }

@@ -560,6 +560,10 @@ class Task:
             self.terms["progress"] -= discount
             self.outcome["reward"] -= discount
 
+    def returned(self, state: NDArray, envs: int | slice) -> NDArray:
+        """State vectors as observations have them, of one environment, (numbers,), or of several, (..., numbers)."""
+        return state
+
     def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
         """What each control step of a step is given as its action, a function of the control step: by default the same.
 

@@ -112,7 +112,12 @@ def acting(args: Args) -> policies.Policy | None:
         return policy
     if needs != "keypoints" or args.obs_mode == "particles":
         raise ValueError(f"--obs-mode {args.obs_mode}: {args.policy} observes {needs}; record with --obs-mode {needs}")
-    return lambda env, observations: policy(env, env.unwrapped.task.observation.copy())
+
+    def from_states(env: Any, observations: Any) -> Any:
+        task = env.unwrapped.task
+        return policy(env, task.returned(task.observation.copy(), slice(None)))
+
+    return from_states
 
 
 def record(args: Args) -> None:

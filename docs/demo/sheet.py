@@ -100,10 +100,11 @@ def _solid(kind: int, rows: NDArray) -> dict[str, Any]:
     }
 
 
-def main() -> None:
+def written(rows: int) -> str:
+    """The file for a sheet of so many particles along a side, in the fabrics of the page."""
     sheets = {}
     for name in FABRICS:
-        mesh, fabric = grid(ROWS, ROWS, SIDE, SIDE), Material.preset(name, air_drag=AIR_DRAG)
+        mesh, fabric = grid(rows, rows, SIDE, SIDE), Material.preset(name, air_drag=AIR_DRAG)
         solids = [Plane(friction=0.5), BALL]
         sheets[name] = sheet_of(Simulation(mesh, fabric, colliders=solids, bending="quadratic", contact="particles"))
         del sheets[name]["positions"]  # the page has starts of its own
@@ -113,9 +114,12 @@ def main() -> None:
     own = {
         name: {"title": FABRICS[name]} | {key: sheet[key] for key in sheet if key not in common} for name, sheet in sheets.items()
     }
-    text = json.dumps({"common": {"side": SIDE} | common, "fabrics": own}, separators=(",", ":"))
-    FILE.write_text(f"const SHEETS = {text};\n")
-    print(f"{FILE.name}: {FILE.stat().st_size / 1e3:.0f} kB, substeps {[sheet['substeps'] for sheet in sheets.values()]}")
+    return f"const SHEETS = {json.dumps({'common': {'side': SIDE} | common, 'fabrics': own}, separators=(',', ':'))};\n"
+
+
+def main() -> None:
+    FILE.write_text(written(ROWS))
+    print(f"{FILE.name}: {FILE.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":

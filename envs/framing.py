@@ -1,0 +1,88 @@
+"""Tasks with a direction of their own, in which ``frame="task"`` shows observations and takes actions along it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym.checks import one_of
+from clothgym.envs.gripper_task import ManipulationTask
+
+FRAMES = ("world", "task")
+TURNING = {"obs_mode": ("keypoints", "particles"), "action_mode": ("velocity",)}  # modes that another frame can have
+
+
+def turned(x: NDArray, y: NDArray, cosine: NDArray, sine: NDArray) -> tuple[NDArray, NDArray]:
+    """Vectors turned by an angle about z."""
+    return cosine * x - sine * y, sine * x + cosine * y
+
+
+class DirectedTask(ManipulationTask):
+    """Base of the tasks whose direction ``heading`` says.
+
+    Args:
+        frame: "world", or "task": vectors in the returned state vector are turned, so that x is along ``heading``, and points are
+            in ``order``; velocities of actions are turned back.
+
+    Attributes:
+        direction: description of ``heading``, for the page.
+    """
+
+    arguments: ClassVar = {
+        **ManipulationTask.arguments,
+        "frame": '"world", or "task": x and y of observations and of velocities are along $direction, and across it',
+    }
+
+    direction: ClassVar[str]
+
+    def __init__(self, num_envs: int, frame: str = "world", **kwargs: Any) -> None:
+        one_of("frame", frame, *FRAMES)
+        if frame != "world":
+            for name, turning in TURNING.items():
+                if (given := kwargs.get(name, turning[0])) not in turning:
+                    raise ValueError(f"frame={frame!r}: must be 'world' with {name}={given!r}, which does not turn")
+        self.frame = frame
+        super().__init__(num_envs, **kwargs)
+        # where in the state vector the first number of each vector lies
+        points = len(self.particles)
+        firsts = [np.arange(0, 6 * points, 3)]
+        for one in self.observations:
+            if one.turns:
+                count = int(np.prod(one.shape[:-1]))
+                firsts.append(self.observation_slices[one.name].start + one.shape[-1] * np.arange(count))
+        self._firsts = np.concatenate(firsts)
+
+    def heading(self) -> NDArray[np.float64]:
+        """Cosine and sine of the yaw of each episode's direction, (num_envs, 2)."""
+        raise NotImplementedError
+
+    def order(self) -> NDArray[np.int64] | None:
+        """The number of the state vector that each of the returned ones is, (num_envs, numbers); None: all in their places."""
+        return None
+
+    def returned(self, state: NDArray, envs: int | slice) -> NDArray:
+        if self.frame == "world":
+            return state
+        cosine, sine = np.moveaxis(self.heading()[envs, ..., None], -2, 0)
+        if (order := self.order()) is not None:
+            state = np.take_along_axis(state, order[envs], axis=-1)
+        own, first = state.copy(), self._firsts
+        own[..., first], own[..., first + 1] = turned(state[..., first], state[..., first + 1], cosine, -sine)
+        return np.clip(own, -self.state_bound, self.state_bound)
+
+    def _velocities_turned(self, actions: NDArray, back: bool) -> NDArray:
+        """Actions whose velocities are turned from the task's frame to the world's, or back, (num_envs, numbers)."""
+        cosine, sine = self.heading()[..., None].transpose(1, 0, 2)
+        own = actions.reshape(self.num_envs, -1, self.actions_per_attachment).copy()
+        own[..., 0], own[..., 1] = turned(own[..., 0], own[..., 1], cosine, -sine if back else sine)
+        return own.reshape(actions.shape)
+
+    def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
+        return super().commands(actions if self.frame == "world" else self._velocities_turned(actions, back=False))
+
+    def expert(self) -> NDArray:
+        actions = super().expert()
+        return actions if self.frame == "world" else self._velocities_turned(actions, back=True)
