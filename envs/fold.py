@@ -15,7 +15,7 @@ from clothgym.envs.coverage import FINE_CELL, shared_area
 from clothgym.envs.episode import FINE, Fields, length
 from clothgym.envs.experts import as_actions
 from clothgym.envs.framing import DirectedTask
-from clothgym.envs.gripper_task import LARGE_SILK, PHYSICS, REACH, close_or_open, observe_grippers
+from clothgym.envs.gripper_task import LARGE_SILK, PHYSICS, REACH, ManipulationTask, close_or_open, observe_grippers
 from clothgym.envs.measures import SPEED2
 from clothgym.envs.observing import Observation
 from clothgym.envs.scoring import ENOUGH_REST, SPEED_SCALE, falloff, follow, grasp
@@ -197,7 +197,7 @@ def along_arc(way: NDArray, height: NDArray, whole: NDArray, low: float) -> tupl
     return step, left
 
 
-class FoldingTask(DirectedTask):
+class FoldingTask(DirectedTask, ManipulationTask):
     """Base of the tasks that end with a folded sheet on the floor.
 
     Attributes:
@@ -209,15 +209,16 @@ class FoldingTask(DirectedTask):
 
     kernels = Kernels(_potential, evaluate_fold, _observe, measure=_measure, account=_account, fingers=close_or_open)
     settling_steps = 60
+    arguments: ClassVar = {**ManipulationTask.arguments, **DirectedTask.arguments}
     direction = "the sheet's own x axis as it lies at the start"
     observations = (
-        *DirectedTask.observations,
-        Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0, turns=True),
+        *ManipulationTask.observations,
+        Observation("ways", "from each tip to the corner that it grasps first", (2, 3), "L/10", 40.0, turns=1),
     )
     points_relative_to = "the initial center of the sheet"
     evaluation: ClassVar[Fields] = (("overlap", float), ("fold_error_mm", float), ("rms_speed", float))
     accounts: ClassVar[Fields] = (
-        ("fold_error", float), ("fold_error_max", float), ("height", float), *DirectedTask.accounts,
+        ("fold_error", float), ("fold_error_max", float), ("height", float), *ManipulationTask.accounts,
     )  # fmt: skip
     away: ClassVar[float] = 0.15  # largest distance of the sheet's center from the origin along x and y, in sides
     turned: ClassVar[float] = np.pi / 4  # largest yaw of the sheet [rad]
@@ -326,7 +327,7 @@ class FoldTask(FoldingTask):
         fold: one of ``FOLDS``.
     """
 
-    arguments: ClassVar = {**DirectedTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
+    arguments: ClassVar = {**FoldingTask.arguments, "fold": '``"half"``, ``"diagonal"`` or ``"quarter"``: in half twice'}
     acting: ClassVar[Mapping[str, int]] = ACTING_STEPS  # steps for each fold
 
     def __init__(self, num_envs: int, fold: str = "half", **kwargs: Any) -> None:

@@ -20,6 +20,7 @@ from clothgym.envs.gripper_task import (
     LARGE_SILK,
     REACH,
     WAYS,
+    ManipulationTask,
     close_or_open,
     observe_grippers,
     observe_ways,
@@ -107,7 +108,7 @@ def goal_reward(achieved: Any, desired: Any) -> NDArray[np.float32]:
     return -(away2.max(axis=-1) > np.float32(ENOUGH_NEAR**2)).astype(np.float32)
 
 
-class FoldGoalTask(DirectedTask):
+class FoldGoalTask(DirectedTask, ManipulationTask):
     """The task of ``ClothFoldGoal-v0``, see ``ClothFoldGoalEnv``.
 
     Args:
@@ -120,18 +121,19 @@ class FoldGoalTask(DirectedTask):
     obs_modes = ("keypoints", "particles")
     # the goals come last, for ``as_dict``
     observations = (
-        *DirectedTask.observations,
+        *ManipulationTask.observations,
         WAYS,
-        Observation(GOALS[0], "positions of the four corners", (CORNERS, 3), "L", POSITION_BOUND, turns=True),
-        Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND, turns=True),
+        Observation(GOALS[0], "positions of the four corners", (CORNERS, 3), "L", POSITION_BOUND, turns=1),
+        Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND, turns=1),
     )
     goals = GOALS
     direction = "the edge that is carried, and points are in the order in which they lie along it"
     points_relative_to = "the initial center of the sheet"
     evaluation = (("rms_speed", float),)
-    accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *DirectedTask.accounts)
-    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**DirectedTask.ranges, "carried": (-1, CORNERS - 1)}
+    accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**ManipulationTask.ranges, "carried": (-1, CORNERS - 1)}
     arguments: ClassVar = {
+        **ManipulationTask.arguments,
         **DirectedTask.arguments,
         "reward_mode": '-1, and 0 where every corner is near its goal; or ``"delta"`` or ``"sparse"``',
     }

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym.checks import one_of
-from clothgym.envs.gripper_task import ManipulationTask
+from clothgym.envs.task import Task
 
 FRAMES = ("world", "task")
 TURNING = {"obs_mode": ("keypoints", "particles"), "action_mode": ("velocity",)}  # modes that another frame can have
@@ -20,7 +20,7 @@ def turned(x: NDArray, y: NDArray, cosine: NDArray, sine: NDArray) -> tuple[NDAr
     return cosine * x - sine * y, sine * x + cosine * y
 
 
-class DirectedTask(ManipulationTask):
+class DirectedTask(Task):
     """Base of the tasks whose direction ``heading`` says.
 
     Args:
@@ -31,9 +31,8 @@ class DirectedTask(ManipulationTask):
         direction: description of ``heading``, for the page.
     """
 
-    arguments: ClassVar = {
-        **ManipulationTask.arguments,
-        "frame": '"world", or "task": x and y of observations and of velocities are along $direction, and across it',
+    arguments: ClassVar[Mapping[str, str]] = {
+        "frame": '"world", or "task": x and y of observations and of velocities are along $direction, and across it'
     }
 
     direction: ClassVar[str]
@@ -51,8 +50,8 @@ class DirectedTask(ManipulationTask):
         firsts = [np.arange(0, 6 * points, 3)]
         for one in self.observations:
             if one.turns:
-                count = int(np.prod(one.shape[:-1]))
-                firsts.append(self.observation_slices[one.name].start + one.shape[-1] * np.arange(count))
+                rows = np.arange(self.observation_slices[one.name].start, self.observation_slices[one.name].stop, one.shape[-1])
+                firsts.append((rows[:, None] + 3 * np.arange(one.turns)).ravel())
         self._firsts = np.concatenate(firsts)
 
     def heading(self) -> NDArray[np.float64]:

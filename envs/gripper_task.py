@@ -72,7 +72,7 @@ def observe_ways(rules, sheet, seen):
 
 # what ``observe_ways`` writes, of tasks whose ``rules`` have the corners
 WAYS = Observation(
-    "ways", "for each gripper the ways from its tip to the corners", (2, CORNERS, 3), "L/10", 20 * POSITION_BOUND, turns=True
+    "ways", "for each gripper the ways from its tip to the corners", (2, CORNERS, 3), "L/10", 20 * POSITION_BOUND, turns=1
 )
 
 
@@ -232,7 +232,7 @@ class ManipulationTask(GripperTask):
             (2, 5),
             "",
             (POSITION_BOUND, POSITION_BOUND, POSITION_BOUND, 1.0, 1.0),
-            turns=True,
+            turns=1,
         ),
         *TIME,
     )

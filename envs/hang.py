@@ -180,7 +180,7 @@ def _observe_grippers(own, rules, sheet, seen):
 
 
 OBSERVATIONS = (
-    Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND),
+    Observation("center", "center of area, relative to the middle of the rail", (3,), "L", POSITION_BOUND, turns=1),
     Observation(
         "hang", "share of the sheet beyond the rail, share on the floor, length that the rail supports [L], at most 1", (3,)
     ),
@@ -202,6 +202,7 @@ class RailTask(HangingTask):
     """
 
     stand = frame_at = "rail"
+    direction = "the rail"
     heights, heights_allowed = (0.75, 1.0), (0.6, 1.2)
     radius: ClassVar[float] = 0.05
     rail_friction: ClassVar[float] = FRICTION
@@ -288,6 +289,7 @@ class HangHardTask(RailTask, FromFloorTask):
     rail_thickness = 0.007
     observations = (*OBSERVATIONS, grippers_seen("the middle of the rail"))
     ranges: ClassVar = {**RailTask.ranges, **FromFloorTask.ranges}
+    arguments: ClassVar = {**RailTask.arguments, **FromFloorTask.arguments}
     reset_options: ClassVar[tuple[str, ...]] = ("material", "rail", "rumpled")
 
     @property

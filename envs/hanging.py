@@ -17,12 +17,12 @@ from clothgym.checks import finite, number, shown
 from clothgym.collisions import Collider, Plane
 from clothgym.envs.episode import Fields
 from clothgym.envs.experts import as_actions, carry_by_places
+from clothgym.envs.framing import DirectedTask
 from clothgym.envs.gripper_task import PickingTask, lying_sheet
 from clothgym.envs.observing import POSITION_BOUND, Observation
 from clothgym.envs.rumpled import UNEVEN, rumpled_sheets
 from clothgym.envs.scoring import FOLLOWED, FOLLOWED_INFO, FOLLOWED_RANGES, follow, grasp, holds_nothing, observe_time
 from clothgym.envs.targets import FRICTION, ON_FLOOR
-from clothgym.envs.task import Task
 
 LYING = 0.03  # cloth lower than this lies on the floor [m]
 MOST_LYING = 0.02  # of a success, as a share of the sheet
@@ -89,13 +89,14 @@ def grippers_seen(frame: str) -> Observation:
         (2, 8),
         "",
         (*[POSITION_BOUND] * 3, *[10 * POSITION_BOUND] * 3, 1.0, 1.0),
+        turns=2,
     )
 
 
 # --- the tasks ----------------------------------------------------------------------------------------------------------------
 
 
-class HangingTask(Task):
+class HangingTask(DirectedTask):
     """Base of the hanging tasks, with starts of a held sheet.
 
     Attributes:
@@ -181,6 +182,9 @@ class HangingTask(Task):
         own["turn"] = np.cos(yaw), np.sin(yaw)
 
     # --- its frame ------------------------------------------------------------------------------------------------------
+
+    def heading(self) -> NDArray[np.float64]:
+        return self.episode["turn"]
 
     def in_frame(self, points: NDArray) -> NDArray:
         """World points as along, across and above it [m], (num_envs, points, 3)."""

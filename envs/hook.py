@@ -252,9 +252,9 @@ def _observe_grippers(own, rules, sheet, seen):
 
 
 OBSERVATIONS = (
-    Observation("hole", "middle of the hole's rim, relative to the arm's tip", (3,), "L", POSITION_BOUND),
-    Observation("hole_normal", "unit normal of the hole", (3,)),
-    Observation("arm", "direction of the arm, from its tip to its root, a unit vector", (3,)),
+    Observation("hole", "middle of the hole's rim, relative to the arm's tip", (3,), "L", POSITION_BOUND, turns=1),
+    Observation("hole_normal", "unit normal of the hole", (3,), turns=1),
+    Observation("arm", "direction of the arm, from its tip to its root, a unit vector", (3,), turns=1),
     Observation("tip_height", "height of the arm's tip", (), "L", 2.0),
     Observation("threaded", "whether the arm is in the hole"),
     Observation("lying", "share of the sheet on the floor"),
@@ -285,7 +285,10 @@ class HookingTask(HangingTask):
         "facing": (-1.0, 1.0),
     }  # fmt: skip
     reset_options: ClassVar[tuple[str, ...]] = ("material", "hook")
-    arguments: ClassVar = {"rows": "not supported: the sheet has a fixed triangle mesh", "side": "fixed, as for ``rows``"}
+    direction = "the horizontal across the arm"
+    arguments: ClassVar = {
+        **HangingTask.arguments, "rows": "not supported: the sheet has a fixed triangle mesh", "side": "fixed, as for ``rows``",
+    }  # fmt: skip
 
     def remembers(self) -> Fields:
         # the end of the arm's axis [m]; the hole's middle [m] and normal; and the measures of hanging

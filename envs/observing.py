@@ -40,7 +40,7 @@ class Observation(NamedTuple):
     name: its key in ``observation_slices``.  about, unit: for the page; "L" is the sheet's longer side.  shape: of the array.
     bound: largest magnitude, one for all or one for each number along the last axis.  function: its values from the task,
     (num_envs, ...); without one they are the field of ``Task.episode`` of that name, or written by the task's kernel ``observe``.
-    turns: whether the first two numbers along the last axis are x and y, see ``framing``.
+    turns: so many vectors, x, y and z, are the first numbers along the last axis, see ``framing``.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Observation(NamedTuple):
     unit: str = ""
     bound: float | tuple[float, ...] = 1.0
     function: Callable[[Any], NDArray] | None = None
-    turns: bool = False
+    turns: int = 0
 
 
 class View(NamedTuple):

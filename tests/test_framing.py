@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 FOLD, GOAL, SHIRT = "clothgym:ClothFold-v0", "clothgym:ClothFoldGoal-v0", "clothgym:ClothFoldShirt-v0"
+HOOKED = "clothgym:ClothHook-Hard-v0"
 SIDE, ENVS = 0.6, 20
 # 3 x 3 points of a flat sheet about its center, row by row, in sides
 FLAT = np.array([[x, y] for y in (-0.5, 0, 0.5) for x in (-0.5, 0, 0.5)])
@@ -52,18 +53,30 @@ def test_a_fold_is_seen_as_if_the_first_edge_were_carried_to_the_last_one():
     assert ways == pytest.approx(part(env, seen, "achieved_goal", 1, 4, 3) - tips[:, :, None], abs=1e-3)
 
 
-@pytest.mark.parametrize("env_id", [FOLD, GOAL, SHIRT])
+@pytest.mark.parametrize("env_id", [FOLD, GOAL, SHIRT, HOOKED])
 def test_a_velocity_along_x_of_the_frame_leads_along_x_of_what_is_seen_and_along_the_heading_of_the_world(env_id):
     env, seen = batch(env_id)
     before = env.task.simulation.grippers.positions.astype(float)
-    tips = part(env, seen, "grippers", 2, 5)[..., :3]
+    tips = part(env, seen, "grippers", 2, -1)[..., :3]
     actions = np.tile([0.5, 0, 0, 1], (ENVS, 2)).astype(np.float32)
-    after = part(env, numbers(env.step(actions)[0]), "grippers", 2, 5)[..., :3]
+    after = part(env, numbers(env.step(actions)[0]), "grippers", 2, -1)[..., :3]
     step = 0.5 * env.task.physics.attachment_speed * env.task.physics.time_step
     assert after - tips == pytest.approx(np.tile([step / env.task.physics.side, 0, 0], (ENVS, 2, 1)), abs=1e-5)
     heading = env.task.heading()[:, None]
     moved = env.task.simulation.grippers.positions.astype(float) - before
     assert moved[..., :2] == pytest.approx(step * np.tile(heading, (1, 2, 1)), abs=1e-6)
+
+
+def test_all_arms_point_the_same_way_in_their_frame():
+    env, seen = batch(HOOKED)
+    assert np.ptp(env.task.heading(), axis=0).min() > 0.1  # though they do not in the world
+    arm, hole = (part(env, seen, name, 3) for name in ("arm", "hole_normal"))
+    assert arm == pytest.approx(np.tile(arm[0], (ENVS, 1)), abs=1e-5) and arm[0, 0] == pytest.approx(0, abs=1e-5)
+    # and the ways of both grippers to their corners are those between the places that are seen
+    grippers, points = part(env, seen, "grippers", 2, 8), part(env, seen, "keypoints", -1, 3)
+    corners = np.array([np.flatnonzero(env.task.particles == place)[0] for place in env.task.places])
+    assert grippers[..., 3:6] / 10 == pytest.approx(points[:, corners] - grippers[..., :3], abs=1e-3)
+    assert np.linalg.norm(hole, axis=1) == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize("env_id", [FOLD, GOAL])

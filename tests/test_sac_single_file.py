@@ -186,8 +186,40 @@ def test_a_policy_pays_the_price_of_its_costs(single):
             agent.update(batch | {"goes_on": goes_on}, with_policy=True)
         found = torch.tanh(agent.policy(torch.zeros(1, 1))[0, 0]).item()
         assert found == pytest.approx(want, abs=0.06), multiplier
-        reward, cost = agent.values(agent.critics, torch.zeros(1, 1), torch.tensor([[0.5]])).flatten().tolist()
+        reward, cost = (one.item() for one in agent.values(agent.said(agent.critics, torch.zeros(1, 1), torch.tensor([[0.5]]))))
         assert (reward, cost) == pytest.approx((0.5, 0.25), abs=0.05)
+
+
+def test_quantiles_of_errors_in_the_square_part_of_the_loss_are_expectiles(single):
+    """Rewards are drawn evenly from 0 to 1; nothing follows.  The expectile at the level t is sqrt(t) / (sqrt(t) + sqrt(1-t))."""
+    import torch
+
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    agent, rate = single.Agent(1, 1, options(single, quantiles=5)), 0.005
+    for left in range(500, 0, -1):
+        agent.set_rate(rate * left / 500)
+        seen, drawn = torch.zeros(256, 1), torch.rand(2, 256)
+        batch = {"observation": seen, "following": seen, "action": drawn[:1].T, "reward": drawn[1], "goes_on": torch.zeros(256)}
+        agent.update(batch, with_policy=False)
+    level = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
+    for said in agent.said(agent.critics, torch.zeros(1, 1), torch.tensor([[0.5]])):
+        assert said.detach().numpy()[0] == pytest.approx(np.sqrt(level) / (np.sqrt(level) + np.sqrt(1 - level)), abs=0.03)
+
+
+def test_targets_leave_out_the_largest_quantiles_of_both(single):
+    import torch
+
+    agent = single.Agent(1, 1, options(single, quantiles=3, dropped=1, gamma=0.5))
+    said = [[0.0, 4.0, 9.0], [1.0, 2.0, 3.0]]
+    for target, values in zip(agent.targets, said):
+        target[-1].weight.data.zero_()
+        target[-1].bias.data = torch.tensor(values)
+    batch = {"following": torch.zeros(2, 1), "reward": torch.tensor([10.0, 20.0]), "goes_on": torch.tensor([1.0, 0.0])}
+    wanted = agent.wanted(batch, alpha=0.0)
+    assert len(wanted) == 2 and all(one.tolist() == [[10, 10.5, 11, 11.5], [20, 20, 20, 20]] for one in wanted)
+    # the policy looks at all of them
+    assert agent.values([torch.tensor([values]) for values in said])[0].tolist() == pytest.approx([19 / 6])
 
 
 def test_the_price_follows_the_costs_of_the_last_episodes(single):
