@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any, ClassVar, NamedTuple
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import inlined
 from clothgym.attachments import Gripper
+from clothgym.checks import shown
 from clothgym.envs.episode import Fields, length
 from clothgym.envs.flatten import (
     SpreadingTask,
@@ -21,7 +22,7 @@ from clothgym.envs.flatten import (
     observe_spread,
     spread_potential,
 )
-from clothgym.envs.fling_expert import Throw, fling_actions
+from clothgym.envs.fling_expert import NUMBERS, STEPS, Throw, fling_actions, throw_of
 from clothgym.envs.gripper_task import PHYSICS, REACH, GripperTask, close_or_open
 from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import chosen_fabric
@@ -183,10 +184,18 @@ class FlingTask(SpreadingTask):
         "barred": (0, 1),
     }  # fmt: skip
     no_picks = "picking and placing cannot throw a sheet"
-    arguments: ClassVar = {**GripperTask.arguments, "action_mode": f'only "velocity": {no_picks}'}
+    arguments: ClassVar = {
+        **GripperTask.arguments,
+        "action_mode": f'"velocity", or "throw": an action is a throw, of {STEPS} control steps and {NUMBERS} numbers in [-1, 1]; '
+        "see the description",
+    }
 
-    def __init__(self, num_envs: int, **kwargs: Any) -> None:
+    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
+        if action_mode not in ("velocity", "throw"):
+            raise ValueError(f"action_mode={shown(action_mode)}: must be 'velocity' or 'throw': {self.no_picks}")
         super().__init__(num_envs, **kwargs)
+        if action_mode == "throw":
+            self.move_by("throw", STEPS, NUMBERS)
         # the sheets of this resolution, before the first reset needs them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
 
@@ -247,8 +256,15 @@ class FlingTask(SpreadingTask):
         ordered[self.episode["barred"] == 1] = 1
         wanted[block, :, lane] = ordered
 
+    def motion(self, actions: NDArray) -> Callable[[int], NDArray]:
+        throws = [throw_of(action, step) for action, step in zip(actions, self.episode["step"].tolist())]
+        return lambda step: fling_actions(self, throws)
+
     def expert_actions(self) -> NDArray:
-        return fling_actions(self)
+        return fling_actions(self, [self.throw] * self.num_envs)
+
+    def expert_picks(self) -> NDArray:
+        return np.tile(self.throw.action(), (self.num_envs, 1))
 
 
 class FlingHardTask(FlingTask):
@@ -280,6 +296,12 @@ class ClothFlingEnv(ClothEnv):
     The reach is limited: the tips stay in a box about the origin, 0.3 L to either side along y, 0.9 L along x, and 1.25 L high.
     Along y, the direction of the throw, this reach is too short to lay a sheet down slowly: at 0.5 m/s, grippers reach a coverage
     of about 0.7.  A thrown sheet flies on, and the air supports it.
+
+    With ``action_mode="throw"`` an action is a throw, as in FlingBot (Ha and Song 2021), of 100 control steps; an episode has three
+    of these.  The grippers take what ``next`` shows, if they hold nothing, lift it and stretch it.  After 60 of these steps they
+    follow a way through five places, both at the same height and the same place along y, and then let go.  The numbers of an
+    action are five times, from 1 to 13 control steps, from one place to the next; then, from -0.3 to 0.3 L, six places along y,
+    the first of them where the sheet is stretched; and their six heights, from 0.02 to 1.25 L.
 
     A throw begins when a gripper grasps the sheet, and ends when the sheet is released.  Each gripper grasps once in a throw: after
     its release it stays open until the throw has ended.  After the third throw the fingers do not close any more.  After 300 steps

@@ -7,6 +7,7 @@ cloning.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,13 @@ AGAIN = 52  # steps before a throw at which it still takes what lies there
 FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corners are out of reach, and the tips' height [m/s], [m]
 
 
+# an action that is a throw: its control steps, and after how many of these the hands set out; and the least and the largest value
+# of the steps from one place to the next, and of the places along and above [L]
+STEPS, SETS_OUT, PLACES = 100, 60, 5
+LASTING, ALONG, ABOVE = (1.0, 13.0), (-0.3, 0.3), (0.02, 1.25)
+NUMBERS = PLACES + 2 * (1 + PLACES)
+
+
 class Throw(NamedTuple):
     """When throws begin, and the way of the hands in one, from where they rest before it.
 
@@ -47,9 +55,28 @@ class Throw(NamedTuple):
         times = np.arange(0, steps[-1] + STEP, STEP)
         return times, np.stack([np.interp(times, steps, self.along), np.interp(times, steps, self.above)], axis=1)
 
+    def action(self) -> NDArray[np.float64]:
+        """The way as an action, (NUMBERS,): the steps from one place to the next, and the places along and above, in [-1, 1]."""
+        parts = (np.diff((0.0, *self.steps)), self.along, self.above)
+        return np.concatenate([_scaled(part, bounds) for part, bounds in zip(parts, (LASTING, ALONG, ABOVE))])
 
-def fling_actions(task: Any) -> NDArray:
-    """Actions of all environments, (num_envs, 8)."""
+
+def throw_of(action: NDArray, begins: int) -> Throw:
+    """The throw that an action of an episode's step asks for; action: within [-1, 1], (NUMBERS,)."""
+    lasting, along, above = (
+        low + (part + 1) / 2 * (high - low)
+        for part, (low, high) in zip(np.split(action, (PLACES, 2 * PLACES + 1)), (LASTING, ALONG, ABOVE))
+    )
+    return Throw((begins + SETS_OUT,), tuple(np.cumsum(lasting)), tuple(along), tuple(above))
+
+
+def _scaled(values: Any, bounds: tuple[float, float]) -> NDArray[np.float64]:
+    low, high = bounds
+    return 2 * (np.asarray(values) - low) / (high - low) - 1
+
+
+def fling_actions(task: Any, throws: Sequence[Throw]) -> NDArray:
+    """Velocities and fingers of all environments, (num_envs, 8); throws: of each of them."""
     mesh, side, grippers, n = task.physics.mesh, task.physics.side, task.simulation.grippers, task.num_envs
     corners, rest = np.array(mesh.corners), mesh.rest_positions
     v, tips = task.simulation.velocities.astype(np.float64), grippers.positions.astype(np.float64)
@@ -87,7 +114,7 @@ def fling_actions(task: Any) -> NDArray:
             continue
         hands = [np.flatnonzero(holder[e] == k) for k in range(2)]
         strain = float(task.info["strain_max"][e])
-        move[e], grip[e] = _throw(task.throw, tips[e], rest, hands, side, int(own["step"]), high, strain)
+        move[e], grip[e] = _throw(throws[e], tips[e], rest, hands, side, int(own["step"]), high, strain)
     # fingers that have closed on nothing open again
     grip[(grippers.openings == 0) & (held == 0)] = 1
     limit = task.physics.attachment_speed

@@ -112,23 +112,28 @@ class GripperTask(Task):
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
         if action_mode != "velocity":
-            if kwargs.get("action_repeat", 1) != 1:
-                given = f"action_repeat={shown(kwargs['action_repeat'])}"
-                raise ValueError(
-                    f"{given}: must be 1 with action_mode={action_mode!r}, an action of which is {pick_place.STEPS} control steps"
-                )
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
         if action_mode != "velocity":
-            for name in ("action_delay", "action_noise"):
-                if name in self.disturbances.ranges:
-                    raise ValueError(f"randomize: no {name} with action_mode={action_mode!r}, whose motions are closed loops")
-            self.control_steps = pick_place.STEPS
-            size = pick_place.NUMBERS * self.num_attachments
-            self.single_action_space = gym.spaces.Box(-1.0, 1.0, (size,), np.float32)
+            self.move_by(action_mode, pick_place.STEPS, pick_place.NUMBERS * self.num_attachments)
             # tips move as fast as the grippers can
             self.rules["reach"] = self.physics.time_step * min(gripper.speed for gripper in self.physics.grippers)
         self.gripper_starts = self.simulation.grippers.positions.astype(np.float64)
+
+    def move_by(self, action_mode: str, steps: int, numbers: int) -> None:
+        """Make an action a whole motion, of so many control steps and numbers.
+
+        Raises:
+            ValueError: an action is repeated, delayed or noisy.
+        """
+        if self.control_steps != 1:
+            given = f"action_repeat={self.control_steps}"
+            raise ValueError(f"{given}: must be 1 with action_mode={action_mode!r}, an action of which is {steps} control steps")
+        for name in ("action_delay", "action_noise"):
+            if name in self.disturbances.ranges:
+                raise ValueError(f"randomize: no {name} with action_mode={action_mode!r}, whose motions are closed loops")
+        self.action_mode, self.control_steps = action_mode, steps
+        self.single_action_space = gym.spaces.Box(-1.0, 1.0, (numbers,), np.float32)
 
     def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
         if self.action_mode == "velocity":
@@ -136,6 +141,10 @@ class GripperTask(Task):
         if not np.isfinite(actions).all():
             env, component = np.argwhere(~np.isfinite(actions))[0].tolist()
             raise ValueError(f"action[{component}] of environment {env} is {actions[env, component]}: actions must be finite")
+        return self.motion(np.clip(actions, -1, 1))
+
+    def motion(self, actions: NDArray) -> Callable[[int], NDArray]:
+        """``commands`` of actions that are whole motions; actions: within [-1, 1]."""
         return pick_place.commands(self, actions)
 
     def expert(self) -> NDArray:

@@ -128,10 +128,10 @@ def _eased(share: NDArray) -> NDArray:
 def commands(task: Any, actions: NDArray) -> Callable[[int], NDArray]:
     """The velocities and fingers of each control step of an action, (num_envs, grippers x 4), as a function of the control step.
 
-    task: a ``GripperTask``.  actions: (num_envs, numbers), finite.
+    task: a ``GripperTask``.  actions: within [-1, 1], (num_envs, numbers).
     """
     grippers, side = task.num_attachments, task.physics.side
-    limited = np.clip(actions.reshape(task.num_envs, grippers, NUMBERS), -1, 1)
+    limited = actions.reshape(task.num_envs, grippers, NUMBERS)
     tips, cloth = task.simulation.grippers.positions.astype(np.float64), task.simulation.positions.astype(np.float64)
     pick, place = places_of(limited, cloth, task.workspace * side)
     lift = (limited[..., 4] + 1) / 2 * side

@@ -178,8 +178,47 @@ def test_slow_hands_do_not_lay_the_sheet_down():
     assert np.all(info["coverage_after_1"] < 0.85)
 
 
+def test_an_action_that_is_a_throw_takes_the_hands_through_its_places():
+    env = batch(num_envs=3, action_mode="throw")
+    env.reset(seed=1_000_000)
+    task = env.task
+    assert task.single_action_space.shape == (17,) and task.control_steps == 100
+    # slow: five places that lower the sheet a little
+    lasting, along, above = [8, 7, 8, 7, 5], [0.0, 0.15, 0.1, -0.06, -0.12, 0.0], [1.1, 1.0, 1.1, 1.0, 0.9, 0.8]
+    action = np.concatenate([(np.array(lasting) - 7) / 6, np.array(along) / 0.3, (np.array(above) - 0.635) / 0.615])
+    middles, inner = [], task._control_step
+
+    def noted(actions):
+        inner(actions)
+        middles.append(task.simulation.grippers.positions.astype(float).mean(axis=1)[:, 1:] / SIDE)
+
+    task._control_step = noted
+    task.step(np.tile(action, (3, 1)))
+    assert len(middles) == 100
+    # where the sheet is stretched, and then at each place; hands set out after 60 control steps, or as soon as they are there
+    places = np.stack([along, above], axis=1)
+    for place in places:
+        away = [np.linalg.norm(one - place, axis=1) for one in middles[50:]]
+        assert np.min(away, axis=0) == pytest.approx(np.zeros(3), abs=0.04), place
+    first, last = (np.argmin([np.linalg.norm(one - place, axis=1) for one in middles[50:]], axis=0) for place in places[[1, -1]])
+    assert np.abs(last - first - sum(lasting[1:])).max() <= 4
+    assert np.all(task.info["throws"] == 1) and np.all(task.simulation.grippers.held == 0)
+
+
+def test_the_expert_s_throw_is_its_own_action():
+    """Places and times of the class, as the description says them."""
+    env = batch(num_envs=1, action_mode="throw")
+    env.reset(seed=0)
+    task = env.task
+    steps, along, above = np.split(task.expert()[0], [5, 11])
+    assert np.cumsum(7 + 6 * steps) == pytest.approx(task.throw.steps)
+    assert 0.3 * along == pytest.approx(task.throw.along) and 0.635 + 0.615 * above == pytest.approx(task.throw.above)
+    with pytest.raises(ValueError, match="action_repeat=2: must be 1 with action_mode='throw'"):
+        batch(action_mode="throw", action_repeat=2)
+
+
 def test_macro_actions_are_refused_and_the_hard_tier_is_larger():
-    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity': picking and placing cannot throw a sheet"):
+    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity' or 'throw': picking and placing cannot throw a sheet"):
         gym.make(ID, action_mode="pick_place")
     hard = gym.make("clothgym:ClothFling-Hard-v0").unwrapped
     hard.reset(seed=0)
