@@ -160,16 +160,13 @@ class Cloth {
 
   // The air's force on both triangles of each cell, shared out to its corners; see clothgym/forces.py for the formula.
   blow() {
-    const { n, cols, even, shares, push, airForce } = this, [across, along, density] = this.resistance.map(f32);
+    const { n, cols, shares, push, airForce } = this, [across, along, density] = this.resistance.map(f32);
     const interval = f32(f32(this.air_every) * f32(this.h));
     const most = f32(f32(this.area) * f32(density / larger(f32(larger(across, along) * interval), TINY)));
     const count = n - cols - 1, difference = f32(across - along);
     // corners a, b in one row and c, d in the next; triangles a, b, d and d, c, a in even cells, a, b, c and d, c, b in others
-    for (let p = 0; p < count; p++) {
-      const b = p + 1, c = p + cols, d = c + 1, whole = even[p] > 0;
-      this.blowOn(p, 0, 0, p, b, whole ? d : c, along, difference, most);
-      this.blowOn(p, 4, 3, d, c, whole ? p : b, along, difference, most);
-    }
+    this.blowOn(count, 0, 0, [0, 1, cols + 1, cols], along, difference, most);
+    this.blowOn(count, 4, 3, [cols + 1, cols, 0, 1], along, difference, most);
     for (let c = 0; c < 3; c++) push[c].fill(0);
     [0, 1, cols, cols + 1].forEach((o, corner) => {
       for (let c = 0; c < 3; c++) {
@@ -179,24 +176,30 @@ class Cloth {
     });
   }
 
-  // On one triangle of cell p, between three particles: to three rows from ``row`` on, with the cell's shares from ``part`` on.
-  blowOn(p, part, row, first, second, third, along, difference, most) {
-    const [x, y, z] = this.x, { airForce, cols, shares, wind } = this, half = 0.5;
-    const px = f32(x[second] - x[first]), py = f32(y[second] - y[first]), pz = f32(z[second] - z[first]);
-    const qx = f32(x[third] - x[first]), qy = f32(y[third] - y[first]), qz = f32(z[third] - z[first]);
-    const sa = shares[part][p], sb = shares[part + 1][p], sc = shares[part + 2][p], sd = shares[part + 3][p];
-    const relative = (v, w) => f32(f32(w) - f32(f32(f32(f32(sa * v[p]) + f32(sb * v[p + 1])) + f32(sc * v[p + cols])) + f32(sd * v[p + cols + 1])));
-    const ux = relative(this.v[0], wind[0]), uy = relative(this.v[1], wind[1]), uz = relative(this.v[2], wind[2]);
-    const nx = f32(f32(py * qz) - f32(pz * qy)), ny = f32(f32(pz * qx) - f32(px * qz)), nz = f32(f32(px * qy) - f32(py * qx));
-    const twice = f32(Math.sqrt(f32(f32(f32(f32(nx * nx) + f32(ny * ny)) + f32(nz * nz)) + TINY_NORMAL)));
-    const fastest = f32(most * f32(1 / f32(half * twice)));
-    const length = f32(Math.sqrt(f32(f32(f32(ux * ux) + f32(uy * uy)) + f32(uz * uz)))), speed = fastest < length ? fastest : length;
-    const skin = f32(f32(f32(half * speed) * along) * twice);
-    const through = f32(f32(f32(ux * nx) + f32(uy * ny)) + f32(uz * nz));
-    const face = f32(f32(f32(f32(half * speed) * difference) * through) * f32(1 / twice));
-    airForce[row][p] = f32(face * nx) + f32(skin * ux);
-    airForce[row + 1][p] = f32(face * ny) + f32(skin * uy);
-    airForce[row + 2][p] = f32(face * nz) + f32(skin * uz);
+  // On one triangle of each cell, between three particles: to three rows from ``row`` on, with the cells' shares from ``part`` on.
+  // The corners' distances from the cell's own particle are those of the first and second, and of the third in even and other cells.
+  blowOn(count, part, row, [first, second, thirdOfEven, thirdOfOther], along, difference, most) {
+    const [x, y, z] = this.x, [vx, vy, vz] = this.v, [wx, wy, wz] = this.wind.map(f32), { cols, even } = this, half = 0.5;
+    const [ofA, ofB, ofC, ofD] = this.shares.slice(part, part + 4), [fx, fy, fz] = this.airForce.slice(row, row + 3);
+    for (let p = 0; p < count; p++) {
+      const i = p + first, j = p + second, k = p + (even[p] > 0 ? thirdOfEven : thirdOfOther), b = p + 1, c = p + cols, d = c + 1;
+      const px = f32(x[j] - x[i]), py = f32(y[j] - y[i]), pz = f32(z[j] - z[i]);
+      const qx = f32(x[k] - x[i]), qy = f32(y[k] - y[i]), qz = f32(z[k] - z[i]);
+      const sa = ofA[p], sb = ofB[p], sc = ofC[p], sd = ofD[p];
+      const ux = f32(wx - f32(f32(f32(f32(sa * vx[p]) + f32(sb * vx[b])) + f32(sc * vx[c])) + f32(sd * vx[d])));
+      const uy = f32(wy - f32(f32(f32(f32(sa * vy[p]) + f32(sb * vy[b])) + f32(sc * vy[c])) + f32(sd * vy[d])));
+      const uz = f32(wz - f32(f32(f32(f32(sa * vz[p]) + f32(sb * vz[b])) + f32(sc * vz[c])) + f32(sd * vz[d])));
+      const nx = f32(f32(py * qz) - f32(pz * qy)), ny = f32(f32(pz * qx) - f32(px * qz)), nz = f32(f32(px * qy) - f32(py * qx));
+      const twice = f32(Math.sqrt(f32(f32(f32(f32(nx * nx) + f32(ny * ny)) + f32(nz * nz)) + TINY_NORMAL)));
+      const fastest = f32(most * f32(1 / f32(half * twice)));
+      const length = f32(Math.sqrt(f32(f32(f32(ux * ux) + f32(uy * uy)) + f32(uz * uz)))), speed = fastest < length ? fastest : length;
+      const skin = f32(f32(f32(half * speed) * along) * twice);
+      const through = f32(f32(f32(ux * nx) + f32(uy * ny)) + f32(uz * nz));
+      const face = f32(f32(f32(f32(half * speed) * difference) * through) * f32(1 / twice));
+      fx[p] = f32(face * nx) + f32(skin * ux);
+      fy[p] = f32(face * ny) + f32(skin * uy);
+      fz[p] = f32(face * nz) + f32(skin * uz);
+    }
   }
 
   // Push the particles out of a solid, without inward velocity and with friction; see clothgym/collisions/solids/contact_law.py.
