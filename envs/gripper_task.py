@@ -31,7 +31,7 @@ PHYSICS = replace(draping.PHYSICS, grippers=(Gripper(speed=2 * draping.PHYSICS.a
 LARGE_SILK = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0})
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
 CORNERS = 4
-ACTION_MODES = ("velocity", "pick_place", "pick_particle")
+ACTION_MODES = ("velocity", "pick_place")
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
 
 
@@ -81,7 +81,7 @@ class GripperTask(Task):
 
     Args:
         slip_force: pull at which the cloth slips out of a gripper [N]; None for the grippers' own.
-        action_mode: "velocity", or "pick_place" or "pick_particle", see the module ``pick_place``.
+        action_mode: "velocity", or "pick_place", see the module ``pick_place``.
 
     Attributes:
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
@@ -99,8 +99,7 @@ class GripperTask(Task):
         "slip_force": "pull at which the cloth slips out of a gripper [N]",
         "action_mode": '"velocity", or "pick_place": an action is 60 control steps, and 5 numbers in [-1, 1] for each gripper: '
         "where it picks, x and y, where it places, x and y, in a square about the origin, and how high it lifts, from 0 to 1 side; "
-        "an episode has $picks of these, and $rests in which the sheet settles; or "
-        '"pick_particle", where the first two numbers are a place of the flat sheet, and the particle there is picked',
+        "an episode has $picks of these, and $rests in which the sheet settles",
     }
 
     def __init__(self, num_envs: int, slip_force: float | None = None, action_mode: str = "velocity", **kwargs: Any) -> None:
@@ -148,8 +147,6 @@ class GripperTask(Task):
         return pick_place.commands(self, actions)
 
     def expert(self) -> NDArray:
-        if self.action_mode == "pick_particle":
-            return GripperTask.expert_picks(self)
         return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
 
     def expert_picks(self) -> NDArray:

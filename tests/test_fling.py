@@ -218,7 +218,9 @@ def test_the_expert_s_throw_is_its_own_action():
 
 
 def test_macro_actions_are_refused_and_the_hard_tier_is_larger():
-    with pytest.raises(ValueError, match="action_mode='pick_place': must be 'velocity' or 'throw': picking and placing cannot throw a sheet"):
+    with pytest.raises(
+        ValueError, match="action_mode='pick_place': must be 'velocity' or 'throw': picking and placing cannot throw a sheet"
+    ):
         gym.make(ID, action_mode="pick_place")
     hard = gym.make("clothgym:ClothFling-Hard-v0").unwrapped
     hard.reset(seed=0)

@@ -60,51 +60,6 @@ def test_the_way_is_cut_by_its_length_and_goes_through_pick_and_place():
     assert path.approach[0] < path.approach[1]
 
 
-def test_a_particle_is_picked_wherever_it_lies_and_placed_relative_to_the_middle_of_the_sheet():
-    """Corners of a sheet that is turned and off center: each action names them by 1 and -1, and folds the sheet in half."""
-    env = gym.make_vec("clothgym:ClothFold-v0", num_envs=3, action_mode="pick_particle", autoreset_mode="Disabled")
-    env.reset(seed=1)
-    task = env.task
-    half = task.workspace * task.physics.side
-    stage, flat = task.stages[0], task.physics.mesh.rest_positions
-    x = task.simulation.positions.astype(float)
-    action = np.full((3, 2, 5), -0.2)
-    for k, (taken, goal) in enumerate(stage):
-        action[:, k, :2] = flat[taken, :2] / np.abs(flat[:, :2]).max(axis=0)
-        action[:, k, 2:4] = (x[:, goal, :2] - x[:, :, :2].mean(axis=1)) / half
-    assert (np.abs(action[..., :2]) == 1).all()
-    env.step(action.reshape(3, -1))
-    after = task.simulation.positions
-    for taken, goal in stage:
-        assert np.linalg.norm(after[:, taken, :2] - x[:, goal, :2], axis=1).max() < 0.05
-
-
-def test_the_particle_of_a_place_is_the_nearest_one():
-    flat = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.0, 0.2, 0.0], [0.4, 0.2, 0.0], [0.2, 0.1, 0.0]])
-    places = [[[-1, -1], [1, -1]], [[-0.8, 1], [0.1, 0.2]]]
-    assert pick_place.particles_of(np.array(places), flat).tolist() == [[0, 1], [2, 4]]
-
-
-def test_random_picks_never_carry_two_particles_farther_apart_than_in_the_flat_sheet():
-    rng, count = np.random.default_rng(4), 500
-    pick, place = rng.uniform(-0.3, 0.3, (2, count, 2, 3))
-    pick[..., 2], place[..., 2] = rng.uniform(pick_place.LOWEST, 0.25, (count, 2)), pick_place.LOWEST
-    place *= (3, 3, 1)
-    lift, tips = rng.uniform(0, 0.6, (count, 2)), np.zeros((count, 2, 3))
-    apart = np.linalg.norm(pick[:, 1] - pick[:, 0], axis=1) * rng.uniform(1, 1.5, count)
-    was = place.copy(), lift.copy()
-    pick_place.keep_together(pick, place, lift, apart)
-    path = pick_place.path_of(pick, place, tips, lift)
-    for step in range(pick_place.STEPS):
-        wanted, opened = pick_place.wanted_at(path, step, side=0.6)
-        closed = ~opened.any(axis=1)
-        assert (np.linalg.norm(wanted[:, 1] - wanted[:, 0], axis=1) <= 1.02 * apart)[closed].all()
-    # the middle of both stays, and what was near enough is left alone
-    assert np.allclose(place.mean(axis=1), was[0].mean(axis=1)) and np.allclose(lift.mean(axis=1), was[1].mean(axis=1))
-    alone = (np.linalg.norm(was[0][:, 1] - was[0][:, 0], axis=1) < apart) & (np.abs(was[1][:, 1] - was[1][:, 0]) < 0.02)
-    assert 3 < alone.sum() < count / 2 and np.allclose(place[alone], was[0][alone])
-
-
 def test_rewards_add_up_and_the_sheet_settles_in_further_steps():
     env = batch()
     env.reset(seed=8, options=FLAT)
@@ -142,7 +97,7 @@ def test_a_bad_action_is_refused_before_anything_moves():
     with pytest.raises(ValueError, match="action"):
         env.step(np.zeros(8))
     assert np.array_equal(env.task.simulation.positions, before) and env.task.episode["step"] == 0
-    with pytest.raises(ValueError, match=r"action_mode='throw': must be 'velocity' or 'pick_place' or 'pick_particle'"):
+    with pytest.raises(ValueError, match=r"action_mode='throw': must be 'velocity' or 'pick_place'"):
         gym.make(ID, action_mode="throw")
 
 
@@ -154,9 +109,8 @@ def test_it_is_an_environment_that_gymnasium_accepts_and_truncates_by_actions():
     assert ends == [[False, False], [True, True]]
 
 
-@pytest.mark.parametrize(("env_id", "mode"), [(ID, "pick_place"), ("clothgym:ClothFold-v0", "pick_particle")])
-def test_a_task_without_an_expert_that_picks_raises(env_id, mode):
-    env = gym.make(env_id, action_mode=mode).unwrapped
+def test_a_task_without_an_expert_that_picks_raises():
+    env = gym.make(ID, action_mode="pick_place").unwrapped
     env.reset(seed=0)
-    with pytest.raises(NotImplementedError, match=f"no scripted expert for action_mode='{mode}'"):
+    with pytest.raises(NotImplementedError, match="no scripted expert for action_mode='pick_place'"):
         env.expert_action()
