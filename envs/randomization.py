@@ -1,4 +1,4 @@
-"""``randomize=``: each episode draws its fabric, and how late and how noisy actions and observations are.
+"""``randomize=``: each episode draws its fabric and friction, and how late and how noisy actions and observations are.
 
 Policies meet delay and noise outside of a simulation (Peng et al. 2018, "Sim-to-real transfer of robotic control with dynamics
 randomization").  They are drawn from the environment's own generator, so an episode is the same in any batch.
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from clothgym.envs.task import Task
 
 # the greatest end of each range; the least is 0
-LIMITS = {"action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
+LIMITS = {"friction": 10.0, "action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
 PREFIX = "randomization/"  # of the keys in info
 
 
 class Disturbances:
-    """Delay and noise of the actions, and noise of the observations, of a batch.
+    """Friction of the solids, delay and noise of the actions, and noise of the observations, of a batch.
 
     Attributes:
-        ranges: of those of ``LIMITS`` that are drawn: ``action_delay``, in control steps, and standard deviations of normal noise,
-            ``action_noise``, in each number of an action and control step, and ``observation_noise``, in each number of the
-            state vector, in its unit.
+        ranges: of those of ``LIMITS`` that are drawn: the coefficient ``friction`` of all solids; ``action_delay``, in control
+            steps; and standard deviations of normal noise: ``action_noise``, in each number of an action and control step, and
+            ``observation_noise``, in each number of the state vector, in its unit.
         max_delay: the longest delay that can be drawn, in control steps.
     """
 

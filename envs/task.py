@@ -527,8 +527,12 @@ class Task:
         self.episode["material"][env] = properties
 
     def _place_colliders(self, envs: NDArray) -> None:
-        """Put solids where ``begin`` has drawn them."""
-        each = [self.episode_colliders(env) for env in envs.tolist()]
+        """Put solids where ``begin`` has drawn them, with the friction that was drawn."""
+        each = [dict(self.episode_colliders(env)) for env in envs.tolist()]
+        if "friction" in self.disturbances.ranges:
+            for own, friction in zip(each, self.episode["friction"][envs].tolist()):
+                solids = dict(enumerate(self.simulation.colliders)) | own
+                own |= {index: replace(one, friction=friction) for index, one in solids.items()}
         for index in each[0] if each else ():
             self.simulation.set_collider(index, [own[index] for own in each], envs)
 

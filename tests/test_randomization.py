@@ -44,6 +44,23 @@ def test_action_noise_is_of_the_velocities():
     assert abs(moved.mean()) < 4 * 0.1 / np.sqrt(moved.size) and moved.std() == pytest.approx(0.1, rel=0.05)
 
 
+def test_a_sheet_that_slides_is_slowed_by_the_friction_that_was_drawn():
+    """By mu g (Coulomb), and by a drag c v, of density rho: v = (1 + mu g / b) exp(-b t) - mu g / b with b = c / rho."""
+    env = batch(4, "ClothFold-v0", randomize={"friction": [0.1, 0.6]}, air_density=0.0)
+    _, info = env.reset(seed=2)
+    state = env.get_state()
+    state.simulation.velocities[...] = (1.0, 0.0, 0.0)
+    env.set_state(state)
+    for _ in range(2):
+        env.step(np.zeros((4, 8)))
+    speed = env.task.simulation.velocities[..., 0].mean(axis=1)
+    friction, fabric = info["randomization/friction"], env.task.physics.material
+    b, time = fabric.air_drag / fabric.density, 2 / 30
+    slowing = friction * 9.81 / b
+    assert np.ptp(friction) > 0.1
+    assert speed == pytest.approx((1 + slowing) * np.exp(-b * time) - slowing, rel=0.02)
+
+
 def test_observation_noise_changes_what_is_seen_and_nothing_else():
     noisy, plain = batch(randomize={"observation_noise": [0.02, 0.02]}), batch()
     seen, clear = [noisy.reset(seed=5)[0]], [plain.reset(seed=5)[0]]
@@ -56,7 +73,8 @@ def test_observation_noise_changes_what_is_seen_and_nothing_else():
 
 
 def test_what_was_drawn_is_the_same_in_any_batch_and_within_its_ranges():
-    ranges = {"density": [0.12, 0.2], "action_delay": [0, 4], "action_noise": [0.0, 0.1], "observation_noise": [0.0, 0.05]}
+    ranges = {"density": [0.12, 0.2], "friction": [0.1, 0.9], "action_delay": [0, 4], "action_noise": [0.0, 0.1]}
+    ranges["observation_noise"] = [0.0, 0.05]
     many, one = batch(3, randomize=ranges), batch(1, randomize=ranges)
     seen, info = many.reset(seed=7)
     alone, own = one.reset(seed=9)
@@ -116,7 +134,7 @@ def test_pictures_have_no_noise():
 @pytest.mark.parametrize(
     "ranges, said",
     [
-        ({"friction": [0, 1]}, "no parameter 'friction'"),
+        ({"softness": [0, 1]}, "no parameter 'softness'"),
         ({"action_delay": [0, 1.5]}, "whole control steps"),
         ({"action_delay": [0, 101]}, "from 0 to 100"),
         ({"observation_noise": [0.2, 0.1]}, "must be a range"),
