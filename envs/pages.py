@@ -109,7 +109,7 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "randomize": (
         "``{}``",
-        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, and ``action_delay`` (control '
+        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, ``friction``, ``action_delay`` (control '
         "steps), ``action_noise`` and ``observation_noise`` (standard deviations); info has what was drawn",
     ),
     "wind": (
