@@ -72,16 +72,23 @@ class DirectedTask(Task):
         own[..., first], own[..., first + 1] = turned(state[..., first], state[..., first + 1], cosine, -sine)
         return np.clip(own, -self.state_bound, self.state_bound)
 
-    def _velocities_turned(self, actions: NDArray, back: bool) -> NDArray:
-        """Actions whose velocities are turned from the task's frame to the world's, or back, (num_envs, numbers)."""
-        cosine, sine = self.heading()[..., None].transpose(1, 0, 2)
-        own = actions.reshape(self.num_envs, -1, self.actions_per_attachment).copy()
-        own[..., 0], own[..., 1] = turned(own[..., 0], own[..., 1], cosine, -sine if back else sine)
-        return own.reshape(actions.shape)
-
     def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
-        return super().commands(actions if self.frame == "world" else self._velocities_turned(actions, back=False))
+        return super().commands(self._turned(actions, 1))
+
+    def from_world(self, actions: NDArray) -> NDArray:
+        return self._turned(actions, -1)
 
     def expert(self) -> NDArray:
-        actions = super().expert()
-        return actions if self.frame == "world" else self._velocities_turned(actions, back=True)
+        return self.from_world(super().expert())
+
+    def _turned(self, actions: NDArray, way: int) -> NDArray:
+        """Actions whose velocities are turned from the task's frame to the world's, or back, (num_envs, numbers).
+
+        way: 1, or -1 for back.
+        """
+        if self.frame == "world":
+            return actions
+        cosine, sine = self.heading()[..., None].transpose(1, 0, 2)
+        own = actions.reshape(self.num_envs, -1, self.actions_per_attachment).copy()
+        own[..., 0], own[..., 1] = turned(own[..., 0], own[..., 1], cosine, way * sine)
+        return own.reshape(actions.shape)

@@ -568,6 +568,10 @@ class Task:
         """State vectors as observations have them, of one environment, (numbers,), or of several, (..., numbers)."""
         return state
 
+    def from_world(self, actions: NDArray) -> NDArray:
+        """Actions as an agent gives them, of those whose velocities are along the world's axes, (num_envs, numbers)."""
+        return actions
+
     def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
         """What each control step of a step is given as its action, a function of the control step: by default the same.
 

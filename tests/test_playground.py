@@ -307,6 +307,17 @@ def test_a_dragged_attachment_goes_to_the_visitor(env_id):
     assert np.allclose(stage.places[0], place + (0.0, 0.0, 0.1), atol=0.02)
 
 
+def test_a_dragged_attachment_goes_to_the_visitor_when_the_policy_acts_in_another_frame():
+    still = Learnt(lambda env, x: np.zeros((1, *env.action_space.shape), np.float32), {"frame": "task"})
+    stage = EpisodeStage("ClothFold-v0", {"still": still}, "still")
+    assert abs(stage.env.task.heading()[0, 1]) > 0.1  # the sheet lies turned
+    place = stage.places[0].copy()
+    stage.grab(place)
+    stage.pull(place + (0.1, 0.0, 0.1))
+    advanced(stage, 12)
+    assert np.allclose(stage.places[0], place + (0.1, 0.0, 0.1), atol=0.02)
+
+
 def test_a_learned_policy_acts_in_the_environment_that_it_was_trained_in():
     still = Learnt(lambda env, x: np.zeros((1, *env.action_space.shape), np.float32), {"wind": {"speed": [2.0, 2.0]}})
     stage = EpisodeStage("ClothReach-v0", {"run": still})

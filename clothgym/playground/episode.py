@@ -197,9 +197,12 @@ class EpisodeStage(Stage):
             return action
         task = self.env.task
         moves = action.reshape(task.num_attachments, task.actions_per_attachment).copy()
+        drags = np.zeros(moves.shape)
         for attachment, place in self._dragged.items():
             away = place - task.episode["targets"][0, attachment]
-            moves[attachment, :3] = within_ball(away / (task.physics.attachment_speed * task.physics.time_step))
+            drags[attachment, :3] = within_ball(away / (task.physics.attachment_speed * task.physics.time_step))
+        dragged = list(self._dragged)
+        moves[dragged, :3] = task.from_world(drags.reshape(1, -1)).reshape(moves.shape)[dragged, :3]
         if self._dropped:
             moves[:, 3:] = 1.0
         return moves.ravel().astype(np.float32)
