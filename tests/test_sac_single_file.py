@@ -113,6 +113,19 @@ def test_a_normalizer_knows_the_mean_and_deviation_of_all_that_it_saw(single):
     assert np.array_equal(off(seen[1]).numpy(), seen[1]) and off.numbers() is None
 
 
+def test_nets_see_the_named_observations_and_zero_for_the_others(single):
+    config = {"env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}, "env_kwargs": {}}
+    run = single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["time_left", "way"]))}, None)
+    slices, drawn = run.env.task.observation_slices, np.random.default_rng(0).normal(size=(9, 58)).astype(np.float32)
+    run.normalizer.see(drawn)
+    seen, shown = run.normalizer(drawn).numpy(), np.zeros(58, bool)
+    for name in ("time_left", "way"):
+        shown[slices[name]] = True
+    assert 0 < shown.sum() < 58 and np.array_equal((seen != 0).all(axis=0), shown) and not seen[:, ~shown].any()
+    with pytest.raises(ValueError, match="sees: no observation wind"):
+        single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["wind"]))}, None)
+
+
 def test_a_buffer_draws_from_the_last_transitions(single):
     replay, rng = single.Replay(10, *SIZES), np.random.default_rng(0)
     for first in range(0, 16, 4):
@@ -403,6 +416,8 @@ WRONG = {
     '--options {"cost_limit":true}': "--options: cost_limit True: must be a number",
     '--options {"net_arch":[64,true]}': "--options: net_arch [64, True]: must be a list of counts",
     '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
+    '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
+    '--options {"quantiles":3,"dropped":3}': "--options: dropped 3: must be below quantiles, 3",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",
     "--resume taken": "is a run of ppo, which train.py goes on with",

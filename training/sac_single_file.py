@@ -88,6 +88,7 @@ class Options:
     quantiles: int = 0  # of the reward to come that a critic learns (TQC); 0: its mean (SAC)
     dropped: int = 1  # of these the largest ones, that targets leave out
     normalize: bool = True  # whether observations are normalized
+    sees: tuple[str, ...] = ()  # names of the observations that the nets see; of all by default
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
 
@@ -137,7 +138,7 @@ class Args:
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
         _of_their_types(chosen)
-        free = {"normalize"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        free = {"normalize", "sees"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         if chosen["quantiles"] and chosen["dropped"] >= chosen["quantiles"]:
             raise ValueError(f"--options: dropped {chosen['dropped']}: must be below quantiles, {chosen['quantiles']}")
@@ -154,6 +155,10 @@ class Args:
 def _of_their_types(chosen: dict[str, Any]) -> None:
     """Refuse options of another type than that of their defaults."""
     for name, value in chosen.items():
+        if name == "sees":
+            if type(value) not in (list, tuple) or not all(isinstance(one, str) for one in value):
+                raise ValueError(f"--options: sees {value!r}: must be a list of names")
+            continue
         default = Options.__dataclass_fields__[name].default
         kinds, wanted = {
             bool: ({bool}, "true or false"), int: ({int}, "a count"), tuple: ({list, tuple}, "a list of counts"),
@@ -326,10 +331,14 @@ class Agent:
 
 
 class Normalizer:
-    """Running mean and variance of all observations so far (Chan et al. 1979)."""
+    """Running mean and variance of all observations so far (Chan et al. 1979).
 
-    def __init__(self, size: int, active: bool) -> None:
+    seen: 1 for each number of an observation that the nets see, and 0 for the others, whose normalized value is 0.
+    """
+
+    def __init__(self, size: int, active: bool, seen: NDArray | None = None) -> None:
         self.mean, self.variance, self.count, self.active = np.zeros(size), np.ones(size), 0.0, active
+        self.seen = np.ones(size) if seen is None else seen
 
     def see(self, observation: NDArray) -> None:
         """observation: (any, numbers)."""
@@ -345,7 +354,7 @@ class Normalizer:
         """What is subtracted from observations, and what they are then multiplied by; None where they are left as they are."""
         if not self.active:
             return None
-        return self.mean.astype(np.float32), (1 / np.sqrt(self.variance + 1e-4)).astype(np.float32)
+        return self.mean.astype(np.float32), (self.seen / np.sqrt(self.variance + 1e-4)).astype(np.float32)
 
     def __call__(self, observation: NDArray) -> Any:
         import torch
@@ -421,7 +430,8 @@ class Run:
         self.enter()
         numbers, actions = self.now["observation"].shape[1], self.env.single_action_space.shape[0]
         space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
-        self.agent, self.normalizer = Agent(numbers, actions, self.options, space), Normalizer(numbers, self.options.normalize)
+        self.agent = Agent(numbers, actions, self.options, space)
+        self.normalizer = Normalizer(numbers, self.options.normalize, self.seen_numbers(numbers))
         self.replay = Replay(self.options.buffer_size, numbers, actions, picture)
         if (size := sum(rows.nbytes for rows in self.replay.rows.values())) > files.LARGEST:
             much = f"{size / 2**30:.1f} GiB, and a checkpoint holds {files.LARGEST / 2**30:.0f}"
@@ -432,6 +442,23 @@ class Run:
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
             self.restore(state)
+
+    def seen_numbers(self, count: int) -> NDArray | None:
+        """Which numbers of an observation the nets see, as ``Normalizer`` takes it.
+
+        Raises:
+            ValueError: there is no observation of that name, or observations are not normalized.
+        """
+        if not (names := self.options.sees):
+            return None
+        slices, seen = self.env.task.observation_slices, np.zeros(count)
+        if unknown := set(names) - set(slices):
+            raise ValueError(f"sees: no observation {', '.join(sorted(unknown))} (there are: {', '.join(slices)})")
+        if self.keys or not self.options.normalize:
+            raise ValueError("sees: is for normalized observations that are one array")
+        for name in names:
+            seen[slices[name]] = 1
+        return seen
 
     def seeds(self) -> list[int]:
         """Of the first environment and of torch, others after other numbers of steps."""
