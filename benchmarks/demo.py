@@ -9,6 +9,7 @@ without a GPU, on the processor: its frames a second are a lower bound for a bro
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ DEMO = ROOT / "docs" / "demo"
 sys.path.insert(0, str(DEMO))
 
 RESULT = Path(__file__).parent / "results" / "demo.json"
-CHROMIUM = "/usr/bin/chromium"
 WINDOWS = {"desktop": (1440, 900), "phone": (390, 844)}
 ABOUT = {"scene": "the sheet of docs/demo, hung by its upper corners; semi-implicit Euler; headless Chromium without a GPU"}
 # milliseconds of a step, the median of as many
@@ -48,7 +48,7 @@ def measure(rows: int, fabric: str, window: str) -> Row:
     from sheet import written
 
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
         width, height = WINDOWS[window]
         page = browser.new_page(viewport={"width": width, "height": height})
 

@@ -127,7 +127,7 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
         Observation(GOALS[1], "their goals", (CORNERS, 3), "L", POSITION_BOUND, turns=1),
     )
     goals = GOALS
-    direction = "the edge that is carried, and points are in the order in which they lie along it"
+    direction = "the edge of the carried corners, or from a single one to the next"
     points_relative_to = "the initial center of the sheet"
     evaluation = (("rms_speed", float),)
     accounts: ClassVar[Fields] = (("distance", float), ("distance_max", float), *ManipulationTask.accounts)
@@ -176,6 +176,8 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
 
         A quarter turn of the sheet takes its points to one another.
         """
+        from scipy.spatial import cKDTree  # imported here: it takes longer than all of the task
+
         rest, slices = self.physics.mesh.rest_positions[:, :2], self.observation_slices
         flat = (rest - rest.mean(axis=0)) @ (1, 1j)
         points, corners = flat[self.particles], flat[list(self.physics.mesh.corners)]
@@ -184,7 +186,8 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
             for name, among, groups in (
                 *((name, points, 1) for name in list(slices)[:2]), (WAYS.name, corners, 2), *((name, corners, 1) for name in GOALS),
             ):  # fmt: skip
-                taken = np.argmin(abs(among - 1j**quarters * among[:, None]), axis=1)
+                turned = 1j**quarters * among
+                taken = cKDTree(np.stack([among.real, among.imag], axis=1)).query(np.stack([turned.real, turned.imag], axis=1))[1]
                 numbers = np.arange(slices[name].start, slices[name].stop).reshape(groups, len(among), 3)
                 order[slices[name]] = numbers[:, taken].ravel()
         return orders

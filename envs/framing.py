@@ -12,7 +12,6 @@ from clothgym.checks import one_of
 from clothgym.envs.task import Task
 
 FRAMES = ("world", "task")
-TURNING = {"obs_mode": ("keypoints", "particles"), "action_mode": ("velocity",)}  # modes that another frame can have
 
 
 def turned(x: NDArray, y: NDArray, cosine: NDArray, sine: NDArray) -> tuple[NDArray, NDArray]:
@@ -21,30 +20,28 @@ def turned(x: NDArray, y: NDArray, cosine: NDArray, sine: NDArray) -> tuple[NDAr
 
 
 class DirectedTask(Task):
-    """Base of the tasks whose direction ``heading`` says.
+    """Base of tasks with a direction, ``heading``.
 
     Args:
         frame: "world", or "task": vectors in the returned state vector are turned, so that x is along ``heading``, and points are
-            in ``order``; velocities of actions are turned back.
+            in ``order``; velocities of actions are turned back.  Pictures do not turn.
 
     Attributes:
         direction: description of ``heading``, for the page.
     """
 
     arguments: ClassVar[Mapping[str, str]] = {
-        "frame": '"world", or "task": x and y of observations and of velocities are along $direction, and across it'
+        "frame": '"world", or "task": x of observations and of velocities is along $direction; see docs/actions.md'
     }
 
     direction: ClassVar[str]
 
     def __init__(self, num_envs: int, frame: str = "world", **kwargs: Any) -> None:
         one_of("frame", frame, *FRAMES)
-        if frame != "world":
-            for name, turning in TURNING.items():
-                if (given := kwargs.get(name, turning[0])) not in turning:
-                    raise ValueError(f"frame={frame!r}: must be 'world' with {name}={given!r}, which does not turn")
         self.frame = frame
         super().__init__(num_envs, **kwargs)
+        if frame != "world" and (mode := getattr(self, "action_mode", "velocity")) != "velocity":
+            raise ValueError(f"frame={frame!r}: must be 'world' with action_mode={mode!r}, whose places are the world's")
         # where in the state vector the first number of each vector lies
         points = len(self.particles)
         firsts = [np.arange(0, 6 * points, 3)]
@@ -73,10 +70,12 @@ class DirectedTask(Task):
         return np.clip(own, -self.state_bound, self.state_bound)
 
     def commands(self, actions: NDArray) -> Callable[[int], NDArray]:
-        return super().commands(self._turned(actions, 1))
+        if self.frame != "world" and np.isfinite(actions).all():  # others are refused later
+            actions = self._turned(np.clip(actions, -1, 1), 1)
+        return super().commands(actions)
 
     def from_world(self, actions: NDArray) -> NDArray:
-        return self._turned(actions, -1)
+        return actions if self.frame == "world" else self._turned(actions, -1)
 
     def expert(self) -> NDArray:
         return self.from_world(super().expert())
@@ -86,8 +85,6 @@ class DirectedTask(Task):
 
         way: 1, or -1 for back.
         """
-        if self.frame == "world":
-            return actions
         cosine, sine = self.heading()[..., None].transpose(1, 0, 2)
         own = actions.reshape(self.num_envs, -1, self.actions_per_attachment).copy()
         own[..., 0], own[..., 1] = turned(own[..., 0], own[..., 1], cosine, way * sine)

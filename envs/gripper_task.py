@@ -31,7 +31,6 @@ PHYSICS = replace(draping.PHYSICS, grippers=(Gripper(speed=2 * draping.PHYSICS.a
 LARGE_SILK = replace(PHYSICS, mesh=grid(21, 21, 0.8, 0.8), material=chosen_fabric("silk", MEDIAN), fast={"air_density": 0.0})
 CLOSES, OPENS = -0.5, 0.5  # actions below and above these close and open the fingers; between them they go on with the last
 CORNERS = 4
-ACTION_MODES = ("velocity", "pick_place")
 FINGER, PALM = (90, 95, 110), (60, 65, 80)  # colors
 
 
@@ -87,14 +86,14 @@ class GripperTask(Task):
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
         picks: actions of an episode that picks and places, after which the sheet settles in one more step.
         workspace: half of the square in which these pick and place, in sides.
-        no_picks: why nothing is picked and placed, of tasks in which only velocities make sense.
+        action_modes: those that it has.
     """
 
     actions_per_attachment = 4
     kernels = IN_NUMPY._replace(fingers=close_or_open)
     picks: ClassVar[int] = 4
     workspace: ClassVar[float] = 1.25
-    no_picks: ClassVar[str] = ""
+    action_modes: ClassVar[tuple[str, ...]] = ("velocity", "pick_place")
     arguments: ClassVar = {
         "slip_force": "pull at which the cloth slips out of a gripper [N]",
         "action_mode": '"velocity", or "pick_place": an action is 60 control steps, and 5 numbers in [-1, 1] for each gripper: '
@@ -103,17 +102,15 @@ class GripperTask(Task):
     }
 
     def __init__(self, num_envs: int, slip_force: float | None = None, action_mode: str = "velocity", **kwargs: Any) -> None:
-        one_of("action_mode", action_mode, *ACTION_MODES)
-        if self.no_picks and action_mode != "velocity":
-            raise ValueError(f"action_mode={action_mode!r}: must be 'velocity': {self.no_picks}")
+        one_of("action_mode", action_mode, *self.action_modes)
         self.action_mode = action_mode
         if slip_force is not None:
             grippers = tuple(replace(gripper, slip_force=slip_force) for gripper in self.physics.grippers)
             self.physics = replace(self.physics, grippers=grippers)  # type: ignore[misc]
-        if action_mode != "velocity":
+        if action_mode == "pick_place":
             self.acting_steps = self.picks * pick_place.STEPS  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
-        if action_mode != "velocity":
+        if action_mode == "pick_place":
             self.move_by(action_mode, pick_place.STEPS, pick_place.NUMBERS * self.num_attachments)
             # tips move as fast as the grippers can
             self.rules["reach"] = self.physics.time_step * min(gripper.speed for gripper in self.physics.grippers)
@@ -147,7 +144,7 @@ class GripperTask(Task):
         return pick_place.commands(self, actions)
 
     def expert(self) -> NDArray:
-        return self.expert_actions() if self.action_mode == "velocity" else self.expert_picks()
+        return super().expert() if self.action_mode == "velocity" else self.expert_picks()
 
     def expert_picks(self) -> NDArray:
         """What the scripted expert does with "pick_place", (num_envs, numbers); tasks that have one define it.

@@ -242,8 +242,8 @@ class FromFloorTask(PickingTask, HangingTask):
     """Base of the tasks in which two grippers pick up their corners of a flat or rumpled sheet on the floor."""
 
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {**PickingTask.ranges, **HangingTask.ranges}
-    no_picks = "picking and placing ends on the floor"
-    arguments: ClassVar = {**PickingTask.arguments, "action_mode": f'only "velocity": {no_picks}'}
+    action_modes = ("velocity",)
+    arguments: ClassVar = {**PickingTask.arguments, "action_mode": 'only "velocity": picking and placing ends on the floor'}
 
     def rumpled(self) -> NDArray:
         """Rumpled sheets about the origin [m], (sheets, particles, 3)."""

@@ -285,7 +285,7 @@ class HookingTask(HangingTask):
         "facing": (-1.0, 1.0),
     }  # fmt: skip
     reset_options: ClassVar[tuple[str, ...]] = ("material", "hook")
-    direction = "the horizontal across the arm"
+    direction = "the horizontal at right angles to the arm"
     arguments: ClassVar = {
         **HangingTask.arguments, "rows": "not supported: the sheet has a fixed triangle mesh", "side": "fixed, as for ``rows``",
     }  # fmt: skip

@@ -223,6 +223,8 @@ class Task:
             on_divergence="ignore",  # a step's outcome says so
         )
         check_settling(self)
+        if "friction" in self.disturbances.ranges and not self.simulation.colliders:
+            raise ValueError("randomize: no friction in a task without solids")
         self.num_envs, self.threads = num_envs, self.simulation.threads
         self.num_attachments = len(fixed.held) + len(fixed.grippers)
         self.single_action_space = gym.spaces.Box(-1.0, 1.0, (self.actions_per_attachment * self.num_attachments,), np.float32)

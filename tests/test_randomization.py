@@ -140,6 +140,7 @@ def test_pictures_have_no_noise():
         ({"observation_noise": [0.2, 0.1]}, "must be a range"),
         ({"action_noise": [0, float("nan")]}, "action_noise"),
         ([0, 1], "must be a dict"),
+        ({"friction": [-0.1, 0.5]}, "friction=.* must be a range .low, high. from 0 to 10"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(ranges, said):
@@ -150,3 +151,8 @@ def test_ranges_that_cannot_be_are_refused(ranges, said):
 def test_motions_of_picks_have_no_delay():
     with pytest.raises(ValueError, match="no action_delay with action_mode='pick_place'"):
         batch(env_id="ClothFold-v0", action_mode="pick_place", randomize={"action_delay": [1, 2]})
+
+
+def test_friction_needs_a_solid():
+    with pytest.raises(ValueError, match="randomize: no friction in a task without solids"):
+        gym.make("clothgym:ClothReach-v0", randomize={"friction": [0.1, 0.5]})

@@ -418,6 +418,7 @@ WRONG = {
     '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
     '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
     '--options {"quantiles":3,"dropped":3}': "--options: dropped 3: must be below quantiles, 3",
+    '--options {"dropped":3}': "--options: dropped 3: must be below quantiles, 0",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",
     "--resume taken": "is a run of ppo, which train.py goes on with",

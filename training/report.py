@@ -248,7 +248,7 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
         options, kwargs = row["hyperparameters"], row["env_kwargs"]
         changed = kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"]
         changed += options["normalize"], kwargs.get("frame", "world"), options.get("quantiles", 0)
-        found.setdefault((row["env"], row["timesteps"], *changed), []).append(row)
+        found.setdefault((row["env"], row["timesteps"], *changed, kwargs.get("gamma", 1)), []).append(row)
     return markdown([
         {
             "environment": f"`{env_id}`{_old(all(is_present(row, digests) for row in group))}",
@@ -260,7 +260,7 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
             "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",
             "training": f"{_minutes(group):.1f} min{_collecting(group)}",
         }
-        for (env_id, steps, repeat, batch, updates, gamma, normalize, frame, quantiles), group in sorted(found.items())
+        for (env_id, steps, repeat, batch, updates, gamma, normalize, frame, quantiles, _), group in sorted(found.items())
     ])  # fmt: skip
 
 

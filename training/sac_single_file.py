@@ -140,7 +140,7 @@ class Args:
         _of_their_types(chosen)
         free = {"normalize", "sees"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
-        if chosen["quantiles"] and chosen["dropped"] >= chosen["quantiles"]:
+        if (chosen["quantiles"] or "dropped" in options) and chosen["dropped"] >= chosen["quantiles"]:
             raise ValueError(f"--options: dropped {chosen['dropped']}: must be below quantiles, {chosen['quantiles']}")
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():

@@ -177,7 +177,7 @@ class Cloth {
   }
 
   // On one triangle of each cell, between three particles: to three rows from ``row`` on, with the cells' shares from ``part`` on.
-  // The corners' distances from the cell's own particle are those of the first and second, and of the third in even and other cells.
+  // The offsets are of its corners from particle p of the cell: the first, the second, and the third in even cells and in others.
   blowOn(count, part, row, [first, second, thirdOfEven, thirdOfOther], along, difference, most) {
     const [x, y, z] = this.x, [vx, vy, vz] = this.v, [wx, wy, wz] = this.wind.map(f32), { cols, even } = this, half = 0.5;
     const [ofA, ofB, ofC, ofD] = this.shares.slice(part, part + 4), [fx, fy, fz] = this.airForce.slice(row, row + 3);
