@@ -68,8 +68,9 @@ PATH = {
     ClothEnv: "reset step render turn get_state set_state expert_action __getstate__ get_keys_to_action",
     ClothVectorEnv: "reset step render turn get_state set_state expert_actions __getstate__ call get_attr set_attr",
 }
-OVERRIDDEN = {  # macro actions; where grippers begin; rewards of goals
+OVERRIDDEN = {  # macro actions; where grippers begin; another frame; rewards of goals
     "GripperTask": {"commands", "_drawn"},
+    "DirectedTask": {"commands"},
     "FoldGoalTask": {"advance"},
 }
 
