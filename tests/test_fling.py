@@ -202,6 +202,7 @@ def test_an_action_that_is_a_throw_takes_the_hands_through_its_places():
         assert np.min(away, axis=0) == pytest.approx(np.zeros(3), abs=0.04), place
     first, last = (np.argmin([np.linalg.norm(one - place, axis=1) for one in middles[50:]], axis=0) for place in places[[1, -1]])
     assert np.abs(last - first - sum(lasting[1:])).max() <= 4
+    assert np.abs(50 + last - (60 + sum(lasting))).max() <= 4
     assert np.all(task.info["throws"] == 1) and np.all(task.simulation.grippers.held == 0)
 
 
