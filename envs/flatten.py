@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -22,12 +22,14 @@ from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, neighbors_of, observe_next
+from clothgym.envs.throws import NUMBERS, Throw, throw_of
 from clothgym.mesh import grid
 
 HOLDING = 0.1  # share of the potential for holding the sheet
 HOLD_SCALE = 0.15  # in sides: length scale of that share as a gripper approaches the sheet
 FLAT_ALREADY = 0.99  # coverage from which on a sheet counts as flat
 TORN_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
+FARTHEST = 0.7  # place of a throw from the origin, in sides
 SHORTEST = 1e-9  # least distance of tips in divisions [m]
 
 
@@ -196,6 +198,17 @@ class FlattenTask(SpreadingTask):
     acting_steps = 300
     settling_steps = 40
     picks = 6
+    throws: ClassVar[int] = 2  # actions of an episode that throws
+    # what stands for an expert then: one throw that SAC found
+    throw: ClassVar[Throw] = Throw(
+        (1.2, 5.6, 10.7, 22.6, 27.6), (0.68, -0.45, 0.56, 0.47, -0.51, -0.63), (0.18, 0.2, 0.34, 0.06, 0.96, 0.26)
+    )
+    action_modes: ClassVar[tuple[str, ...]] = ("velocity", "pick_place", "throw")
+    arguments: ClassVar = {
+        **SpreadingTask.arguments,
+        "action_mode": f'{SpreadingTask.arguments["action_mode"]}; or "throw": an action is a throw, of {flatten_expert.THROWN} '
+        f"control steps and {NUMBERS} numbers in [-1, 1], see ``ClothFlatten-v0``",
+    }
     enough = 0.95
     bank: ClassVar[Bank] = CRUMPLED
     entangles: ClassVar[bool] = False  # whether the expert lifts one corner first, and pulls carefully
@@ -221,8 +234,12 @@ class FlattenTask(SpreadingTask):
         Observation("lifted", f"for each gripper whether that is above {LIFTED[0]} L, and above {LIFTED[1]} L", (2, len(LIFTED))),
     )
 
-    def __init__(self, num_envs: int, **kwargs: Any) -> None:
-        super().__init__(num_envs, **kwargs)
+    def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
+        if action_mode == "throw":
+            self.acting_steps = self.throws * flatten_expert.THROWN  # type: ignore[misc]
+        super().__init__(num_envs, action_mode=action_mode, **kwargs)
+        if action_mode == "throw":
+            self.move_by("throw", flatten_expert.THROWN, NUMBERS)
         self.sheets()  # before the first reset needs them
 
     def across(self) -> NDArray:
@@ -255,7 +272,20 @@ class FlattenTask(SpreadingTask):
         return flatten_expert.flatten_actions(self)
 
     def expert_picks(self) -> NDArray:
+        if self.action_mode == "throw":
+            return np.tile(self.throw.action(FARTHEST), (self.num_envs, 1))
         return flatten_expert.flatten_picks(self)
+
+    def motion(self, actions: NDArray) -> Callable[[int], NDArray]:
+        if self.action_mode != "throw":
+            return super().motion(actions)
+        hands = flatten_expert.Hands([throw_of(action, FARTHEST) for action in actions])
+
+        def at(step: int) -> NDArray:
+            hands.step = step
+            return flatten_expert.flatten_actions(self, hands)
+
+        return at
 
 
 class FlattenHardTask(FlattenTask):
@@ -274,6 +304,13 @@ class ClothFlattenEnv(ClothEnv):
     ## Description
     A square sheet, L = 0.6 m, lies crumpled on the floor.  Two grippers can grasp it, including other layers.  After 300 steps they
     open, and the sheet settles for 40 steps, in which actions are ignored; then it is evaluated.
+
+    With ``action_mode="throw"`` an action is a throw, as in ``ClothFling-v0``, of 150 control steps; an episode has two of these,
+    and one more in which the sheet settles, with ``settling="steps"``.  Grippers that hold nothing take what ``next`` shows.  They
+    lift a single corner until the other gripper can take its neighbor, and lift and stretch the edge.  Once it hangs still, they
+    follow a way through five places, both at the same height and the same place along ``out``, and then let go; a way for which the
+    time of the action is too short is left to the next action.  The numbers of an action are those of ``ClothFling-v0``, but for
+    places from -0.7 to 0.7 L from the origin, along ``out``; the edge is lifted to 1.25 L at the first of them.
 
     $physics
 

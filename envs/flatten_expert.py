@@ -6,6 +6,7 @@ gets entangled: it is always lifted by one corner first, and the pull on the clo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,14 @@ from numpy.typing import NDArray
 from clothgym.envs.episode import length
 from clothgym.envs.pick_place import STEPS
 from clothgym.envs.taking import EDGES, FLAT, LIFTED, OPPOSITE, next_takes_of
+from clothgym.envs.throws import Throw, follow_way, rising, taut_length
 
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
+LIFT_AT = 0.5  # where an edge is lifted, from the origin in the direction in which it is laid down, in sides
+THROWN = 150  # control steps of an action that is a throw
+OPENING = 2  # of these in which hands let go
 LIFT, LIFT_ONE = 1.25, 0.95  # height that is aimed at with an edge, and with a corner alone, in sides; LIFTED is enough
 CALM, CALM_ONE = 0.5, 0.7  # rms speed of the particles at which the sheet is laid down, and the other corner taken [m/s]
-TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sheet is laid down [m/s]
 # while the sheet is laid down, the far edge must move away by AHEAD for each meter that the grippers sink.  A deficit of up to
 # NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
@@ -35,7 +39,29 @@ PULLED = 0.98  # share of their distance in the flat sheet to which corners are 
 LIFT_EDGE, LIFT_CORNER = 0.5, 0.2  # in sides
 
 
-def flatten_actions(task: Any) -> NDArray:
+class Hands:
+    """The throws that the hands of each environment make within an action, instead of what the expert does with a lifted edge."""
+
+    def __init__(self, throws: Sequence[Throw]) -> None:
+        self.throws, self.step = throws, 0  # the control step of the action
+        self.begun = np.full(len(throws), -1)  # the one at which each throw began, or -1
+
+    def velocity(self, env: int, middle: Any, out: Any, side: float) -> Any:
+        """Of the middle of both hands [m/s], (3,), or None as they let go; out: the direction of the throw."""
+        times, places = self.throws[env].way()
+        if self.begun[env] < 0:
+            # a way for which the time is too short waits for the next action
+            if self.step + times[-1] + OPENING > THROWN:
+                return np.zeros(3)
+            self.begun[env] = self.step
+        now = self.step - self.begun[env]
+        if now > times[-1] - 1:
+            return None
+        there, up = follow_way((times, places), now, np.array([middle @ out, middle[2]]), side)
+        return there * out + (0, 0, up)
+
+
+def flatten_actions(task: Any, hands: Hands | None = None) -> NDArray:
     """Actions of all environments, (num_envs, 8)."""
     side, grippers, across = task.physics.side, task.simulation.grippers, task.across()
     corners, rest = task.corners, task.physics.mesh.rest_positions
@@ -56,7 +82,7 @@ def flatten_actions(task: Any) -> NDArray:
             # nothing is held by mistake
             move[e, :, 2], grip[e] = 0.3, [1.0 if corner[k] < 0 else -1.0 for k in range(2)]
         elif corner[0] >= 0 and corner[1] >= 0:
-            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, (side, across), own, speed[e], v[e])
+            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, (side, across), own, speed[e], v[e], hands, e)
             # entangled cloth is pulled slowly, and released before it tears
             strain = _strain(task, e, holder[e], x[e])
             move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
@@ -162,11 +188,13 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
     return move, grip
 
 
-def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, sizes: Any, own: Any, speed: float, v: Any) -> Any:
-    """Lift the edge, stretch it, lay the sheet down behind its far edge, and let go."""
+def _spread(
+    x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, sizes: Any, own: Any, speed: float, v: Any,
+    hands: Hands | None, env: int,
+) -> Any:  # fmt: skip
+    """Lift the edge, stretch it, lay the sheet down behind its far edge, or along the way of a throw, and let go."""
     ends = corners[corner]
-    between = rest[held[0]][:, None] - rest[held[1]]
-    taut = TAUT * np.linalg.norm(between, axis=2).min()
+    taut = taut_length(rest, held)
     edge = next((i for i in range(4) if set(EDGES[i]) == set(corner)), -1)
     if edge < 0:  # a diagonal
         return np.zeros((2, 3)), np.array([-1.0, 1.0])
@@ -181,25 +209,20 @@ def _spread(x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, 
     apart = np.stack([-along, along]) * taut / 2
     low = x[ends, 2].min()
     far = x[corners[OPPOSITE[edge]]].mean(axis=0)
-    lifted = own["raised"].min() > LIFTED[1] * side
-    if not lifted:
-        goal = 0.5 * side * out + (0, 0, LIFT * side)
-        move = _to(goal + apart, tips)
-        # upward before aside
-        move[:, :2] *= 0.6
-        move /= np.maximum(length(move) / SPEED, 1)[:, None]
-        # never farther apart than the cloth between them is long
-        way = tips[1] + move[1] / 30 - tips[0] - move[0] / 30
-        beyond = max(np.linalg.norm(way) - max(taut, 0.01), 0.0)
-        pull = 15 * beyond * way / max(np.linalg.norm(way), 1e-9)
-        return move + np.stack([pull, -pull]), -np.ones(2)
+    if own["raised"].min() <= LIFTED[1] * side:
+        first = LIFT_AT if hands is None else hands.throws[env].along[0]
+        return rising(_to(first * side * out + (0, 0, LIFT * side) + apart, tips), tips, taut, SPEED), -np.ones(2)
     # the tips keep the edge taut
     keep = (middle + apart - tips) * 10
     # begin as the far edge swings outward, or hangs still
     swing, reach = float(v[corners[OPPOSITE[edge]]].mean(axis=0) @ out), float((far - middle) @ out)
     sways = speed > CALM or (speed > 0.2 and (swing < 0 or reach < -0.02))
-    if middle[2] > LIFTED[1] * side - 0.01 and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
+    waits = middle[2] > LIFTED[1] * side - 0.01 if hands is None else hands.begun[env] < 0
+    if waits and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
         return keep, -np.ones(2)
+    if hands is not None:
+        way = hands.velocity(env, middle, out, side)
+        return (np.zeros((2, 3)), np.ones(2)) if way is None else (keep + way, -np.ones(2))
     height = x[ends, 2].mean()
     if low < 0.012 and (reach > 0.96 * deep or -middle @ out > 1.3 * side):
         return np.zeros((2, 3)), np.ones(2)

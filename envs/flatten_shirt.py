@@ -50,6 +50,7 @@ class FlattenShirtTask(FlattenTask):
     physics = FoldShirtTask.physics
     kernels = FlattenTask.kernels._replace(evaluate=_evaluate)
     acting_steps = 450
+    throws = 3
     enough = 0.9
     entangles = True
     bank = CRUMPLED_SHIRTS
@@ -93,7 +94,7 @@ class FlattenShirtTask(FlattenTask):
         return super().mirrored(x)[SHIRT.mirror]
 
     def expert_picks(self) -> NDArray:
-        return GripperTask.expert_picks(self)
+        return super().expert_picks() if self.action_mode == "throw" else GripperTask.expert_picks(self)
 
 
 class ClothFlattenShirtEnv(ClothEnv):

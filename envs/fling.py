@@ -21,7 +21,7 @@ from clothgym.envs.flatten import (
     observe_spread,
     spread_potential,
 )
-from clothgym.envs.fling_expert import NUMBERS, STEPS, Throw, fling_actions, throw_of
+from clothgym.envs.fling_expert import SETS_OUT, fling_actions
 from clothgym.envs.gripper_task import PHYSICS, REACH, GripperTask, close_or_open
 from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import chosen_fabric
@@ -31,6 +31,7 @@ from clothgym.envs.scoring import follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import CLEAR, EDGES, NEXT, corner_neighbors, observe_next, places_to_take
+from clothgym.envs.throws import NUMBERS, STEPS, Throw, throw_of
 from clothgym.mesh import grid
 
 SPEED = 2.0  # of the grippers [m/s]
@@ -156,9 +157,9 @@ class FlingTask(SpreadingTask):
     )  # fmt: skip
     seen_from = View((1.25, -0.9, 0.85), (0.0, 0.06, 0.31), 38.0, scales_from=0.6)
     acting_steps = 300
-    # the expert's, see ``fling_expert``
+    # the expert's throw, and the steps at which it begins, see ``fling_expert``
+    starts: ClassVar[tuple[int, ...]] = (95, 200, 266)
     throw: ClassVar[Throw] = Throw(
-        (95, 200, 266),
         (10.7, 20.0, 21.8, 29.2, 33.7),
         (0.05, -0.29, 0.29, 0.254, -0.108, -0.17),
         (1.2, 1.212, 1.064, 1.24, 0.515, 0.02),
@@ -254,14 +255,15 @@ class FlingTask(SpreadingTask):
         wanted[block, :, lane] = ordered
 
     def motion(self, actions: NDArray) -> Callable[[int], NDArray]:
-        throws = [throw_of(action, step) for action, step in zip(actions, self.episode["step"].tolist())]
-        return lambda step: fling_actions(self, throws)
+        throws = [throw_of(action, BOX[1]) for action in actions]
+        starts = [(step + SETS_OUT,) for step in self.episode["step"].tolist()]
+        return lambda step: fling_actions(self, throws, starts)
 
     def expert_actions(self) -> NDArray:
-        return fling_actions(self, [self.throw] * self.num_envs)
+        return fling_actions(self, [self.throw] * self.num_envs, [self.starts] * self.num_envs)
 
     def expert_picks(self) -> NDArray:
-        return np.tile(self.throw.action(), (self.num_envs, 1))
+        return np.tile(self.throw.action(BOX[1]), (self.num_envs, 1))
 
 
 class FlingHardTask(FlingTask):
@@ -273,8 +275,8 @@ class FlingHardTask(FlingTask):
     acting_steps = 320
     action_modes = ("velocity",)
     arguments: ClassVar = {**GripperTask.arguments, "action_mode": 'only "velocity"'}
+    starts = (84, 200, 275)
     throw = Throw(
-        (84, 200, 275),
         (11.9, 22.8, 25.6, 35.7, 41.7),
         (0.05, -0.29, 0.29, 0.278, -0.13, -0.2),
         (1.2, 1.231, 1.01, 1.24, 0.514, 0.02),

@@ -254,3 +254,47 @@ def test_the_hard_tier_is_larger_and_of_another_fabric():
     # 162.9 g/m^2 and 6.57 uN m of rigidity, as Matsudaira and others measured their tropical wool
     properties = dict(zip(PROPERTIES, hard.task.episode["material"][0]))
     assert properties["density"] == 0.1629 and properties["bend_rigidity"] == 6.57e-6
+
+
+def test_a_throw_takes_the_hands_along_out_through_its_places_once_the_edge_hangs_still():
+    env = gym.make_vec(ID, num_envs=3, action_mode="throw", autoreset_mode="Disabled").unwrapped
+    env.reset(seed=1_000_000)
+    task = env.task
+    assert task.single_action_space.shape == (17,) and task.control_steps == 150 and task.acting_steps == 300
+    # slow: five places that lower the sheet a little
+    lasting, along, above = [8, 7, 8, 7, 5], [0.3, 0.35, 0.2, 0.05, -0.1, 0.0], [1.2, 1.1, 1.2, 1.1, 0.9, 0.8]
+    action = np.concatenate([(np.array(lasting) - 7) / 6, np.array(along) / 0.7, (np.array(above) - 0.635) / 0.615])
+    noted, inner = [], task._control_step
+
+    def step(actions):
+        ways = task.seen["out"].copy()
+        inner(actions)
+        middle = task.simulation.grippers.positions.astype(float).mean(axis=1) / SIDE
+        both = (task.simulation.grippers.held > 0).all(axis=1) & (np.linalg.norm(ways, axis=1) > 0.5)
+        noted.append(np.where(both[:, None], np.stack([(middle[:, :2] * ways).sum(axis=1), middle[:, 2]], axis=1), np.nan))
+
+    task._control_step = step
+    task.step(np.tile(action, (3, 1)))
+    assert len(noted) == 150
+    middles = np.array(noted)  # (steps, envs, 2)
+    passed = []
+    for place in np.stack([along, above], axis=1)[1:]:
+        away = np.linalg.norm(middles - place, axis=2)
+        assert np.nanmin(away, axis=0) == pytest.approx(np.zeros(3), abs=0.05), place
+        passed.append(np.nanargmin(away, axis=0))
+    # from the second place to the last, in the time that the action asks for; before it the edge was lifted, after it let go of
+    assert np.abs(passed[-1] - passed[0] - sum(lasting[1:])).max() <= 4
+    assert np.nanmax(middles[..., 1], axis=0).min() > 1.17 and np.isnan(middles[passed[-1] + 6, range(3)]).all()
+
+
+def test_a_way_for_which_the_time_is_too_short_waits_for_the_next_action():
+    env = gym.make_vec(ID, num_envs=1, action_mode="throw", autoreset_mode="Disabled").unwrapped
+    env.reset(seed=1_000_005)
+    task = env.task
+    # 65 steps, of which none moves the hands; one corner lies free at the start, so the edge is lifted after more than 150 - 65
+    slow = np.concatenate([np.ones(5), np.zeros(6), np.full(6, (1.2 - 0.635) / 0.615)])[None]
+    held = []
+    for _ in range(2):
+        task.step(slow)
+        held.append((task.simulation.grippers.held[0] > 0).tolist())
+    assert held == [[True, True], [False, False]]

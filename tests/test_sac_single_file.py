@@ -203,36 +203,21 @@ def test_a_policy_pays_the_price_of_its_costs(single):
         assert (reward, cost) == pytest.approx((0.5, 0.25), abs=0.05)
 
 
-def test_quantiles_of_errors_in_the_square_part_of_the_loss_are_expectiles(single):
-    """Rewards are drawn evenly from 0 to 1; nothing follows.  The expectile at the level t is sqrt(t) / (sqrt(t) + sqrt(1-t))."""
+def test_targets_take_the_least_of_two_critics_and_the_policy_the_mean(single):
     import torch
 
     torch.manual_seed(0)
-    torch.set_num_threads(1)
-    agent, rate = single.Agent(1, 1, options(single, quantiles=5)), 0.005
-    for left in range(500, 0, -1):
-        agent.set_rate(rate * left / 500)
-        seen, drawn = torch.zeros(256, 1), torch.rand(2, 256)
-        batch = {"observation": seen, "following": seen, "action": drawn[:1].T, "reward": drawn[1], "goes_on": torch.zeros(256)}
-        agent.update(batch, with_policy=False)
-    level = np.array([0.1, 0.3, 0.5, 0.7, 0.9])
-    for said in agent.said(agent.critics, torch.zeros(1, 1), torch.tensor([[0.5]])):
-        assert said.detach().numpy()[0] == pytest.approx(np.sqrt(level) / (np.sqrt(level) + np.sqrt(1 - level)), abs=0.03)
-
-
-def test_targets_leave_out_the_largest_quantiles_of_both(single):
-    import torch
-
-    agent = single.Agent(1, 1, options(single, quantiles=3, dropped=1, gamma=0.5))
-    said = [[0.0, 4.0, 9.0], [1.0, 2.0, 3.0]]
-    for target, values in zip(agent.targets, said):
+    agent = single.Agent(1, 1, options(single, critics=3, gamma=0.5))
+    for target, value in zip(agent.targets, (0.0, 9.0, 4.0)):
         target[-1].weight.data.zero_()
-        target[-1].bias.data = torch.tensor(values)
+        target[-1].bias.data.fill_(value)
     batch = {"following": torch.zeros(2, 1), "reward": torch.tensor([10.0, 20.0]), "goes_on": torch.tensor([1.0, 0.0])}
-    wanted = agent.wanted(batch, alpha=0.0)
-    assert len(wanted) == 2 and all(one.tolist() == [[10, 10.5, 11, 11.5], [20, 20, 20, 20]] for one in wanted)
-    # the policy looks at all of them
-    assert agent.values([torch.tensor([values]) for values in said])[0].tolist() == pytest.approx([19 / 6])
+    drawn = [agent.wanted(batch, alpha=0.0) for _ in range(300)]
+    assert all(len(wanted) == 3 and all(torch.equal(wanted[0], one) for one in wanted) for wanted in drawn)
+    # the least of three pairs is 0, 0 and 4; nothing follows an episode's end
+    first, second = torch.stack([wanted[0] for wanted in drawn]).T.tolist()
+    assert set(first) == {10.0, 12.0} and set(second) == {20.0} and first.count(12.0) == pytest.approx(100, abs=25)
+    assert agent.values(torch.tensor([[0.0], [9.0], [5.0]]))[0].tolist() == pytest.approx([14 / 3])
 
 
 def test_the_price_follows_the_costs_of_the_last_episodes(single):
@@ -417,8 +402,7 @@ WRONG = {
     '--options {"net_arch":[64,true]}': "--options: net_arch [64, True]: must be a list of counts",
     '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
     '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
-    '--options {"quantiles":3,"dropped":3}': "--options: dropped 3: must be below quantiles, 3",
-    '--options {"dropped":3}': "--options: dropped 3: must be below quantiles, 0",
+    '--options {"critics":1}': "--options: critics 1: must be from 2 to 100",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",
     "--resume taken": "is a run of ppo, which train.py goes on with",

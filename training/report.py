@@ -247,20 +247,20 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
     for row in rows:
         options, kwargs = row["hyperparameters"], row["env_kwargs"]
         changed = kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"]
-        changed += options["normalize"], kwargs.get("frame", "world"), options.get("quantiles", 0)
+        changed += options["normalize"], kwargs.get("frame", "world"), options.get("critics", 2)
         found.setdefault((row["env"], row["timesteps"], *changed, kwargs.get("gamma", 1)), []).append(row)
     return markdown([
         {
             "environment": f"`{env_id}`{_old(all(is_present(row, digests) for row in group))}",
             "control steps": f"{steps / 1e6:.2f} M", "`action_repeat`": str(repeat), "batch": str(batch), "updates": str(updates),
             "discount": f"{gamma:.3g}",
-            "normalized": "yes" if normalize else "no", "`frame`": frame, "`quantiles`": str(quantiles), "seeds": str(len(group)),
+            "normalized": "yes" if normalize else "no", "`frame`": frame, "critics": str(critics), "seeds": str(len(group)),
             "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
             "with noise": f"{interquartile_mean(row['with_noise']['success_rate'] for row in group):.3f}",
             "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",
             "training": f"{_minutes(group):.1f} min{_collecting(group)}",
         }
-        for (env_id, steps, repeat, batch, updates, gamma, normalize, frame, quantiles, _), group in sorted(found.items())
+        for (env_id, steps, repeat, batch, updates, gamma, normalize, frame, critics, _), group in sorted(found.items())
     ])  # fmt: skip
 
 

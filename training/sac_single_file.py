@@ -6,8 +6,8 @@
 Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), with the temperature of its section 5.  Three changes make
 it learn on 32 and more environments at once: several updates go with each step of the batch, critics have layer normalization (Ba
 et al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
-With ``quantiles`` critics learn the distribution of returns, and targets leave out its upper end (TQC; Kuznetsov et al.,
-"Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile Critics", 2020).
+With more than two ``critics`` targets take the least of two that are drawn at random, and the policy climbs the mean of all (REDQ;
+Chen et al., "Randomized Ensembled Double Q-Learning: Learning Fast Without a Model", 2021).
 Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
 Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
 alone, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", 2018).
@@ -58,8 +58,8 @@ LIMITS = {
     "policy_delay": (1, 10**4), "batch_size": (1, 10**6), "buffer_size": (1, 10**8), "learning_rate": (0, 1), "gamma": (0, 1),
     "tau": (0, 1), "first_log_std": LOG_STD, "first_alpha": (1e-6, 10), "target_entropy": (-100, 0), "reward_scale": (1e-6, 1e6),
     "least_reward": (-1e6, 0), "bounded_for": (0, 1), "cost_limit": (0, 1e6), "multiplier_rate": (0, 1), "net_arch": (1, 10**4),
-    "quantiles": (0, 1000), "dropped": (0, 999),
-    "seed": (0, 2**32 - 1), "evaluations": (1, 10**4), "eval_episodes": (1, 10**6), "final_episodes": (1, 10**6),
+    "critics": (2, 100), "seed": (0, 2**32 - 1), "evaluations": (1, 10**4), "eval_episodes": (1, 10**6),
+    "final_episodes": (1, 10**6),
 }  # fmt: skip
 
 
@@ -85,8 +85,7 @@ class Options:
     bounded_for: float = 1.0  # share of the control steps for which least_reward holds
     cost_limit: float | None = None  # the mean cost of an episode that is allowed
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
-    quantiles: int = 0  # of the reward to come that a critic learns (TQC); 0: its mean (SAC)
-    dropped: int = 1  # of these the largest ones, that targets leave out
+    critics: int = 2  # of the reward to come; more than two (REDQ) where decisions are few and updates many
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see; of all by default
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
@@ -140,8 +139,6 @@ class Args:
         _of_their_types(chosen)
         free = {"normalize", "sees"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
-        if (chosen["quantiles"] or "dropped" in options) and chosen["dropped"] >= chosen["quantiles"]:
-            raise ValueError(f"--options: dropped {chosen['dropped']}: must be below quantiles, {chosen['quantiles']}")
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
             raise ValueError(f"{self.folder} holds a run already: go on with --resume {self.folder}, or choose another with --run")
@@ -182,7 +179,7 @@ def _within_limits(prefix: str, numbers: dict[str, Any]) -> None:
 class Agent:
     """A policy, its critics and their slow copies, the targets; and the temperature, which a policy of less entropy lowers.
 
-    critics: two of the reward; where costs are limited, two of the cost follow.  multiplier: price of a cost, in scaled rewards.
+    critics: of the reward; where costs are limited, two of the cost follow.  multiplier: price of a cost, in scaled rewards.
     """
 
     def __init__(self, observations: int, actions: int, options: Options, pictures: Any = None) -> None:
@@ -206,9 +203,9 @@ class Agent:
             encoder = DepthEncoder(pictures)
             self.policy = nn.Sequential(encoder, *net(encoder.features_dim, 2 * actions, normalized=False))
         nn.init.constant_(self.policy[-1].bias[actions:], options.first_log_std)
-        outputs = [max(options.quantiles, 1)] * 2 + ([] if options.cost_limit is None else [1, 1])
+        count = options.critics + (0 if options.cost_limit is None else 2)
         self.critics, self.targets = (
-            nn.ModuleList(net(observations + actions, count, normalized=True) for count in outputs) for _ in range(2)
+            nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(count)) for _ in range(2)
         )
         self.targets.load_state_dict(self.critics.state_dict())
         self.log_alpha = torch.tensor(math.log(options.first_alpha), requires_grad=True)
@@ -230,52 +227,36 @@ class Agent:
         density = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi) - 2 * (math.log(2) - u - softplus(-2 * u))
         return torch.tanh(u), density.sum(-1)
 
-    def said(self, critics: Any, observation: Any, action: Any) -> list[Any]:
-        """What each critic says: the quantiles or the mean of the reward to come, (batch, any), and of costs, (batch, 1)."""
+    def said(self, critics: Any, observation: Any, action: Any) -> Any:
+        """What each critic says of the reward, or cost, to come, (critics, batch)."""
         import torch
 
         pair = torch.cat([observation, action], dim=-1)
-        return [critic(pair) for critic in critics]
+        return torch.stack([critic(pair).squeeze(-1) for critic in critics])
 
-    def values(self, said: list[Any]) -> list[Any]:
-        """From what critics say: the reward to come, at least, and the cost to come, at most, each (batch,).
+    def values(self, said: Any, wanted: bool = False) -> list[Any]:
+        """From what critics say: the reward to come, and the cost to come, at most, each (batch,).
 
-        With quantiles: the mean of all.
+        The reward is the least that two say.  Of more than two critics it is the mean; wanted: the least of two of them.
         """
         import torch
 
-        one, other, *costs = said
-        reward = torch.cat([one, other], -1).mean(-1) if self.options.quantiles else torch.minimum(one, other).squeeze(-1)
-        return [reward, *([torch.maximum(*costs).squeeze(-1)] if costs else [])]
+        count = self.options.critics
+        rewards, costs = said[:count], said[count:]
+        if count == 2:
+            reward = rewards.amin(0)
+        else:
+            reward = rewards[torch.randperm(count)[:2]].amin(0) if wanted else rewards.mean(0)
+        return [reward, *([costs.amax(0)] if len(costs) else [])]
 
     def wanted(self, batch: dict[str, Any], alpha: Any) -> list[Any]:
-        """What each critic should say: what was earned, or what it cost, and what the targets say of what follows; to the reward
-        the worth of entropy is added.
-
-        With quantiles: of those of both targets, (batch, 2 quantiles - 2 dropped), without the largest ones.
-        """
-        import torch
-
+        """What critics should say, each (batch,): what was earned, or what it cost, and what the targets say of what follows; to
+        the reward the worth of entropy is added."""
         following, density = self.act(batch.get(FOLLOWING["picture"], batch["following"]))
-        said = self.said(self.targets, batch["following"], following)
-        reward, *cost = (value[:, None] for value in self.values(said))
-        if self.options.quantiles:
-            reward = torch.cat(said[:2], -1).sort(-1).values[:, : 2 * (self.options.quantiles - self.options.dropped)]
-        later = self.options.gamma * batch["goes_on"][:, None]
-        wanted = batch["reward"][:, None] + later * (reward - (alpha * density)[:, None])
-        return [wanted] * 2 + [batch["cost"][:, None] + later * one for one in cost] * 2
-
-    def loss(self, said: Any, wanted: Any) -> Any:
-        """Of a critic: half the mean square of the error; of quantiles, at the levels ``(i + 1/2) / quantiles``, the Huber loss of
-        quantile regression (Dabney et al., "Distributional Reinforcement Learning with Quantile Regression", 2018)."""
-        import torch
-
-        if (count := said.shape[-1]) == 1:
-            return 0.5 * (said - wanted).square().mean()
-        error = wanted[:, None, :] - said[:, :, None]
-        size, level = error.abs(), ((torch.arange(count) + 0.5) / count)[:, None]
-        huber = torch.where(size > 1, size - 0.5, 0.5 * size.square())
-        return ((level - (error < 0).float()).abs() * huber).mean((0, 2)).sum()
+        reward, *cost = self.values(self.said(self.targets, batch["following"], following), wanted=True)
+        later = self.options.gamma * batch["goes_on"]
+        wanted = batch["reward"] + later * (reward - alpha * density)
+        return [wanted] * self.options.critics + [batch["cost"] + later * one for one in cost] * 2
 
     def update(self, batch: dict[str, Any], with_policy: bool) -> None:
         """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end.
@@ -294,7 +275,8 @@ class Agent:
         with torch.no_grad():
             wanted = self.wanted(batch, alpha)
         said = self.said(self.critics, batch["observation"], batch["action"])
-        self._step("critics", sum(map(self.loss, said, wanted)), list(self.critics.parameters()))
+        errors = [0.5 * (one - other).square().mean() for one, other in zip(said, wanted)]
+        self._step("critics", sum(errors), list(self.critics.parameters()))
         # the policy: towards actions that the critics value, at the price of their costs, and towards entropy; the division keeps
         # the size of gradients
         if with_policy:
