@@ -87,7 +87,7 @@ class Options:
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
     critics: int = 2  # of the reward to come; more than two (REDQ) where decisions are few and updates many
     normalize: bool = True  # whether observations are normalized
-    sees: tuple[str, ...] = ()  # names of the observations that the nets see; of all by default
+    sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
 
@@ -436,8 +436,8 @@ class Run:
         slices, seen = self.env.task.observation_slices, np.zeros(count)
         if unknown := set(names) - set(slices):
             raise ValueError(f"sees: no observation {', '.join(sorted(unknown))} (there are: {', '.join(slices)})")
-        if self.keys or not self.options.normalize:
-            raise ValueError("sees: is for normalized observations that are one array")
+        if (self.keys and not self.pictured) or not self.options.normalize:
+            raise ValueError("sees: is for normalized observations without goals")
         for name in names:
             seen[slices[name]] = 1
         return seen

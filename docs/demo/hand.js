@@ -4,12 +4,12 @@
 const HELD_UP = 1.25, SWUNG_OUT = 0.12; // height of the upper hem [m], and its start
 const GATHERED = 0.26, GATHERS = 1.2; // how much closer the pins come than the sheet is wide, in sides, so that it falls in folds; in which time [s]
 const RIPPLE = 0.004; // of the start: what is flat to the bit folds nowhere [m]
-const DROPPED_FROM = 0.85; // height above the floor [m]
+const DROPPED_FROM = 0.72; // height above the floor [m]
 const WIND = [0, 3.5, 0.4], GUSTS = 2.5; // [m/s], and the time of one [s]
 const HEAVY = 9.81; // [m/s^2]
 const MOST_STEPS = 3; // in a frame: what is slower than that runs in slow motion
 const SLOW_STEPS = 2; // substeps in a frame of explicit Euler, whose end would be over in one otherwise
-const SHOWN = { hang: [[-0.55, -0.4, 0], [0.55, 0.4, 1.3]], drop: [[-0.45, -0.45, 0], [0.45, 0.45, 0.9]] }; // what the picture has to show [m]
+const SHOWN = { hang: [[-0.55, -0.4, 0], [0.55, 0.4, 1.3]], drop: [[-0.4, -0.4, 0], [0.4, 0.4, 0.74]] }; // what the picture has to show [m]
 const AGAIN_AFTER = 2.5; // a burst [s]
 
 class Hand {
