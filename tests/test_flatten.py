@@ -298,3 +298,23 @@ def test_a_way_for_which_the_time_is_too_short_waits_for_the_next_action():
     assert np.all(task.simulation.grippers.held > 0) and np.all(task.simulation.grippers.positions[..., 2] > 1.15 * SIDE)
     task.step(slow)
     assert np.all(task.simulation.grippers.held == 0)
+
+
+def test_throws_have_the_same_bits_alone_in_a_batch_and_from_a_restored_state():
+    actions, seeds = np.random.default_rng(0).uniform(-1, 1, (2, 2, 17)), [5, 6]
+
+    def made(count):
+        return gym.make_vec(ID, num_envs=count, action_mode="throw", autoreset_mode="Disabled").unwrapped
+
+    both, alone, restored = made(2), made(1), made(2)
+    both.reset(seed=seeds)
+    alone.reset(seed=seeds[1:])
+    restored.reset(seed=[8, 9])
+    for step, action in enumerate(actions):
+        if step:
+            restored.set_state(both.get_state())
+        seen, reward, *_ = both.step(action)
+        one, its, *_ = alone.step(action[1:])
+        assert np.array_equal(seen[1], one[0]) and reward[1] == its[0]
+    again, its, *_ = restored.step(actions[1])
+    assert np.array_equal(seen, again) and np.array_equal(reward, its)
