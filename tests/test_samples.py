@@ -92,7 +92,7 @@ def test_a_block_runs_by_itself(page, number, tmp_path, monkeypatch, capsys):
         if number == 0:
             assert names["terminated"] and names["info"]["normalized_performance"] > 0.5  # the expert's
         if number == 1:
-            assert (tmp_path / "reach.zip").exists() and "return, mean and deviation" in capsys.readouterr().out
+            assert (tmp_path / "reach.zip").exists() and "return, mean and standard deviation" in capsys.readouterr().out
         if number == 2:
             assert names["images"].shape[1:] == (48, 48, 1) and names["state"].shape[1:] == (68,)
 
