@@ -116,6 +116,8 @@ def _facts(env_id: str) -> str:
 def _from_scratch(env_id: str) -> list[tuple[str, str]]:
     """How the task is learned without an expert by SAC, and the median success of the committed runs; nothing if there are none."""
     runs = [row for row in results.learned() if row["env"] == env_id and row["learner"] == "sac_scratch"]
+    # with the arguments of the printed command
+    runs = [row for row in runs if "obs_mode" not in row["env_kwargs"]]
     if not runs:
         return []
     config = results.read_config(results.RUNS / runs[0]["run"], begun=False)

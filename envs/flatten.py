@@ -29,7 +29,7 @@ HOLDING = 0.1  # share of the potential for holding the sheet
 HOLD_SCALE = 0.15  # in sides: length scale of that share as a gripper approaches the sheet
 FLAT_ALREADY = 0.99  # coverage from which on a sheet counts as flat
 TORN_STRETCH2 = 4.0  # squared stretch at which a sheet is torn
-FARTHEST = 0.7  # place of a throw from the origin, in sides
+FARTHEST = 0.7  # place of a throw along ``out``, from the origin, in sides
 SHORTEST = 1e-9  # least distance of tips in divisions [m]
 
 
@@ -207,7 +207,7 @@ class FlattenTask(SpreadingTask):
     arguments: ClassVar = {
         **SpreadingTask.arguments,
         "action_mode": f'{SpreadingTask.arguments["action_mode"]}; or "throw": an action is a throw, of {flatten_expert.THROWN} '
-        f"control steps and {NUMBERS} numbers in [-1, 1], see ``ClothFlatten-v0``",
+        f"control steps and {NUMBERS} numbers in [-1, 1], see ``ClothFlatten-v0``, and an episode has $throws of these",
     }
     enough = 0.95
     bank: ClassVar[Bank] = CRUMPLED
@@ -307,10 +307,13 @@ class ClothFlattenEnv(ClothEnv):
 
     With ``action_mode="throw"`` an action is a throw, as in ``ClothFling-v0``, of 150 control steps; an episode has two of these,
     and one more in which the sheet settles, with ``settling="steps"``.  Grippers that hold nothing take what ``next`` shows.  They
-    lift a single corner until the other gripper can take its neighbor, and lift and stretch the edge.  Once it hangs still, they
-    follow a way through five places, both at the same height and the same place along ``out``, and then let go; a way for which the
-    time of the action is too short is left to the next action.  The numbers of an action are those of ``ClothFling-v0``, but for
-    places from -0.7 to 0.7 L from the origin, along ``out``; the edge is lifted to 1.25 L at the first of them.
+    lift a single corner until the other gripper can take its neighbor, and lift the edge above 1.17 L, toward the first place, and
+    stretch it.  Once it hangs still, or swings outward at less than 0.5 m/s rms, they follow a way through five places, both at the
+    same height and the same place along ``out``, and then let go.  They move at 0.9 m/s at most, and more slowly while the sheet is
+    strained: where the way asks for more, they fall behind it, and its time goes on.  A way for which the time of the action is too
+    short is left to the next action; what is held at the end of the last one is released.  There is one throw in an action: an edge
+    that is taken again in it is lifted and released.  Nothing is taken in the last 95 control steps, nor at a coverage of 0.955 or
+    more.  The numbers of an action are those of ``ClothFling-v0``, but for places along ``out`` from -0.7 to 0.7 L from the origin.
 
     $physics
 

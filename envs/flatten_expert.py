@@ -1,6 +1,7 @@
 """The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
 
-It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  A garment
+It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  With
+``action_mode="throw"`` it takes and lifts an edge for an agent, whose throw follows, see ``Hands``.  A garment
 gets entangled: it is always lifted by one corner first, and the pull on the cloth that is held is limited.
 """
 
@@ -62,7 +63,7 @@ class Hands:
 
 
 def flatten_actions(task: Any, hands: Hands | None = None) -> NDArray:
-    """Actions of all environments, (num_envs, 8)."""
+    """Actions of all environments, (num_envs, 8); hands: those that throw instead of laying a sheet down."""
     side, grippers, across = task.physics.side, task.simulation.grippers, task.across()
     corners, rest = task.corners, task.physics.mesh.rest_positions
     x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)

@@ -21,7 +21,7 @@ from clothgym.envs.flatten import (
     observe_spread,
     spread_potential,
 )
-from clothgym.envs.fling_expert import SETS_OUT, fling_actions
+from clothgym.envs.fling_expert import SETS_OUT, THROWN, fling_actions
 from clothgym.envs.gripper_task import PHYSICS, REACH, GripperTask, close_or_open
 from clothgym.envs.observing import Observation, View
 from clothgym.envs.physics import chosen_fabric
@@ -31,7 +31,7 @@ from clothgym.envs.scoring import follow
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import CLEAR, EDGES, NEXT, corner_neighbors, observe_next, places_to_take
-from clothgym.envs.throws import NUMBERS, STEPS, Throw, throw_of
+from clothgym.envs.throws import NUMBERS, Throw, throw_of
 from clothgym.mesh import grid
 
 SPEED = 2.0  # of the grippers [m/s]
@@ -186,14 +186,14 @@ class FlingTask(SpreadingTask):
     action_modes: ClassVar[tuple[str, ...]] = ("velocity", "throw")
     arguments: ClassVar = {
         **GripperTask.arguments,
-        "action_mode": f'"velocity", or "throw": an action is a throw, of {STEPS} control steps and {NUMBERS} numbers in [-1, 1]; '
+        "action_mode": f'"velocity", or "throw": an action is a throw, of {THROWN} control steps and {NUMBERS} numbers in [-1, 1]; '
         "see the description",
     }
 
     def __init__(self, num_envs: int, action_mode: str = "velocity", **kwargs: Any) -> None:
         super().__init__(num_envs, action_mode=action_mode, **kwargs)
         if action_mode == "throw":
-            self.move_by("throw", STEPS, NUMBERS)
+            self.move_by("throw", THROWN, NUMBERS)
         # the sheets of this resolution, before the first reset needs them
         held_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
 from clothgym.envs.taking import FLAT, next_edges_of, next_takes_of
-from clothgym.envs.throws import Throw, follow_way, rising, taut_length
+from clothgym.envs.throws import RATE, Throw, follow_way, rising, taut_length
 
 LIFTING = 1.2  # speed of a tip on its way up, and to a corner [m/s]
 TEARING = 0.5  # strain at which it lets go
@@ -26,7 +26,7 @@ TIMED = 0.01  # weight of a step's time difference relative to the distance from
 ASTRAY = 0.2  # distance from the way at which there is no throw, in sides
 AGAIN = 52  # steps before a throw at which it still takes what lies there
 FETCHING, CARRIED = 0.5, 0.04  # speed with which it fetches a sheet whose corners are out of reach, and the tips' height [m/s], [m]
-SETS_OUT = 60  # control steps of an action that is a throw after which the hands set out
+THROWN, SETS_OUT = 100, 60  # control steps of an action that is a throw; and after how many of these the hands set out
 
 
 def fling_actions(task: Any, throws: Sequence[Throw], starts: Sequence[Sequence[int]]) -> NDArray:
@@ -114,5 +114,5 @@ def _throw(throw: Throw, starts: Any, tips: Any, rest: Any, held: Any, side: flo
     apart = np.array([[-taut / 2, 0, 0], [taut / 2, 0, 0]])
     goal = apart + (aside, throw.along[0] * side, throw.above[0] * side)
     if np.abs(goal - tips).max() < 0.005:
-        return 30 * (goal - tips), grip
+        return RATE * (goal - tips), grip
     return rising(12 * (goal - tips), tips, taut, LIFTING) * np.clip(1.3 - 2 * strain, 0, 1), grip

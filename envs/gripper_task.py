@@ -80,7 +80,7 @@ class GripperTask(Task):
 
     Args:
         slip_force: pull at which the cloth slips out of a gripper [N]; None for the grippers' own.
-        action_mode: "velocity", or "pick_place", see the module ``pick_place``.
+        action_mode: "velocity", "pick_place", see the module ``pick_place``, or "throw", see ``throws``.
 
     Attributes:
         gripper_starts: where the grippers are as an episode begins [m], (num_envs, grippers, 3); ``begin`` may write it.
@@ -147,7 +147,7 @@ class GripperTask(Task):
         return super().expert() if self.action_mode == "velocity" else self.expert_picks()
 
     def expert_picks(self) -> NDArray:
-        """What the scripted expert does with "pick_place", (num_envs, numbers); tasks that have one define it.
+        """What the scripted expert does where an action is a whole motion, (num_envs, numbers); tasks that have one define it.
 
         Raises:
             NotImplementedError: this task has none.

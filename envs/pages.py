@@ -225,6 +225,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
         "$direction": getattr(task_class, "direction", ""),
         "$picks": str(getattr(task_class, "picks", "")),
+        "$throws": str(getattr(task_class, "throws", "")),
         "$rests": str(-(-task_class.settling_steps // STEPS)),
     }
     inherited = keywords_of(Task)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from clothgym.envs.episode import length
 
-# control steps of an action; the places of a way after the first; and the numbers of an action
-STEPS, PLACES = 100, 5
+# the places of a way after the first; and the numbers of an action
+PLACES = 5
 NUMBERS = PLACES + 2 * (1 + PLACES)
 # the least and the largest control steps from one place to the next, and heights of places, in sides
 LASTING, ABOVE = (1.0, 13.0), (0.02, 1.25)

@@ -256,7 +256,7 @@ def test_the_hard_tier_is_larger_and_of_another_fabric():
     assert properties["density"] == 0.1629 and properties["bend_rigidity"] == 6.57e-6
 
 
-def test_a_throw_takes_the_hands_along_out_through_its_places_once_the_edge_hangs_still():
+def test_a_throw_takes_the_hands_along_out_through_its_places():
     env = gym.make_vec(ID, num_envs=3, action_mode="throw", autoreset_mode="Disabled").unwrapped
     env.reset(seed=1_000_000)
     task = env.task
@@ -296,8 +296,17 @@ def test_a_way_for_which_the_time_is_too_short_waits_for_the_next_action():
     slow = np.concatenate([np.ones(5), np.zeros(6), (above - 0.635) / 0.615])[None]
     task.step(slow)
     assert np.all(task.simulation.grippers.held > 0) and np.all(task.simulation.grippers.positions[..., 2] > 1.15 * SIDE)
+    # it is followed from there, down to where they let go, in 65 steps
+    heights, inner = [], task._control_step
+
+    def step(actions):
+        inner(actions)
+        if np.all(task.simulation.grippers.held > 0):
+            heights.append(task.simulation.grippers.positions[0, :, 2].astype(float) / SIDE)
+
+    task._control_step = step
     task.step(slow)
-    assert np.all(task.simulation.grippers.held == 0)
+    assert np.all(task.simulation.grippers.held == 0) and heights[64] == pytest.approx(np.full(2, 0.5), abs=0.05)
 
 
 def test_throws_have_the_same_bits_alone_in_a_batch_and_from_a_restored_state():

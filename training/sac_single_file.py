@@ -234,29 +234,25 @@ class Agent:
         pair = torch.cat([observation, action], dim=-1)
         return torch.stack([critic(pair).squeeze(-1) for critic in critics])
 
-    def values(self, said: Any, wanted: bool = False) -> list[Any]:
-        """From what critics say: the reward to come, and the cost to come, at most, each (batch,).
-
-        The reward is the least that two say.  Of more than two critics it is the mean; wanted: the least of two of them.
-        """
-        import torch
-
+    def values(self, said: Any) -> list[Any]:
+        """From what critics say: the reward to come, the least of two or the mean of more, and the cost to come, at most, each
+        (batch,)."""
         count = self.options.critics
         rewards, costs = said[:count], said[count:]
-        if count == 2:
-            reward = rewards.amin(0)
-        else:
-            reward = rewards[torch.randperm(count)[:2]].amin(0) if wanted else rewards.mean(0)
-        return [reward, *([costs.amax(0)] if len(costs) else [])]
+        return [rewards.amin(0) if count == 2 else rewards.mean(0), *([costs.amax(0)] if len(costs) else [])]
 
     def wanted(self, batch: dict[str, Any], alpha: Any) -> list[Any]:
-        """What critics should say, each (batch,): what was earned, or what it cost, and what the targets say of what follows; to
-        the reward the worth of entropy is added."""
+        """What critics should say, each (batch,): what was earned, or what it cost, and what the targets say of what follows, of
+        the reward the least of two, which are drawn where there are more; to the reward the worth of entropy is added."""
+        import torch
+
         following, density = self.act(batch.get(FOLLOWING["picture"], batch["following"]))
-        reward, *cost = self.values(self.said(self.targets, batch["following"], following), wanted=True)
+        count, targets = self.options.critics, list(self.targets)
+        drawn = [0, 1] if count == 2 else torch.randperm(count)[:2].tolist()
+        said = self.said([targets[i] for i in drawn] + targets[count:], batch["following"], following)
         later = self.options.gamma * batch["goes_on"]
-        wanted = batch["reward"] + later * (reward - alpha * density)
-        return [wanted] * self.options.critics + [batch["cost"] + later * one for one in cost] * 2
+        wanted = batch["reward"] + later * (said[:2].amin(0) - alpha * density)
+        return [wanted] * count + ([batch["cost"] + later * said[2:].amax(0)] * 2 if len(said) > 2 else [])
 
     def update(self, batch: dict[str, Any], with_policy: bool) -> None:
         """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end.
@@ -429,7 +425,7 @@ class Run:
         """Which numbers of an observation the nets see, as ``Normalizer`` takes it.
 
         Raises:
-            ValueError: there is no observation of that name, or observations are not normalized.
+            ValueError: there is no observation of that name, observations are not normalized, or they have goals.
         """
         if not (names := self.options.sees):
             return None

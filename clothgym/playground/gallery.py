@@ -106,7 +106,7 @@ def policies_of(names: Sequence[str], start: str) -> tuple[str, dict[str, dict[s
 
 @cache
 def committed_policies(env_id: str) -> dict[str, Policy]:
-    """The policies that come with the project, by name; without those that pick and place, in steps too long to watch."""
+    """The policies that come with the project, by name; without those whose steps are too long to watch."""
     found: dict[str, Policy] = {}
     for learner in policies.available().get(env_id, []):
         policy = policies.load(env_id, learner)
