@@ -218,6 +218,14 @@ def test_targets_take_the_least_of_two_critics_and_the_policy_the_mean(single):
     first, second = torch.stack([wanted[0] for wanted in drawn]).T.tolist()
     assert set(first) == {10.0, 12.0} and set(second) == {20.0} and first.count(12.0) == pytest.approx(100, abs=25)
     assert agent.values(torch.tensor([[0.0], [9.0], [5.0]]))[0].tolist() == pytest.approx([14 / 3])
+    # where costs are limited, the last two critics are of the cost, of which the most counts
+    agent = single.Agent(1, 1, options(single, critics=3, gamma=0.5, cost_limit=1.0))
+    for target, value in zip(agent.targets, (0.0, 9.0, 4.0, 6.0, 8.0)):
+        target[-1].weight.data.zero_()
+        target[-1].bias.data.fill_(value)
+    wanted = agent.wanted(batch | {"cost": torch.tensor([1.0, 2.0])}, alpha=0.0)
+    assert len(wanted) == 5 and all(one.tolist() == [5.0, 2.0] for one in wanted[3:])
+    assert [one.tolist() for one in agent.values(torch.tensor([[0.0], [9.0], [3.0], [6.0], [8.0]]))] == [[4.0], [8.0]]
 
 
 def test_the_price_follows_the_costs_of_the_last_episodes(single):

@@ -6,7 +6,7 @@
 Haarnoja et al., "Soft Actor-Critic Algorithms and Applications" (2018), with the temperature of its section 5.  Three changes make
 it learn on 32 and more environments at once: several updates go with each step of the batch, critics have layer normalization (Ba
 et al. 2016), as in CrossQ's and DroQ's line of work (Hiraoka et al. 2022), and observations are normalized by running statistics.
-With more than two ``critics`` targets take the least of two that are drawn at random, and the policy climbs the mean of all (REDQ;
+With more than two ``critics`` targets take the least of two that are drawn at random, and the policy maximizes the mean (REDQ;
 Chen et al., "Randomized Ensembled Double Q-Learning: Learning Fast Without a Model", 2021).
 Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
 Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
