@@ -4,6 +4,7 @@ if __name__ != "clothgym.envs":
     # with the repository's root on sys.path a bare `import envs` would make a second copy of every class
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
+from clothgym.envs.canonicalize import ClothCanonicalizeEnv
 from clothgym.envs.drape import ClothDrapeEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv
 from clothgym.envs.episode import TaskState
@@ -25,6 +26,7 @@ from clothgym.envs.strain import ClothStrainEnv, ClothStrainVectorEnv
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv, batched
 
+ClothCanonicalizeVectorEnv = batched(ClothCanonicalizeEnv)
 ClothDrapeGripperVectorEnv = batched(ClothDrapeGripperEnv)
 ClothDrapeVectorEnv = batched(ClothDrapeEnv)
 ClothFlattenHardVectorEnv = batched(ClothFlattenHardEnv)
@@ -44,6 +46,7 @@ ClothHookVectorEnv = batched(ClothHookEnv)
 ClothReachVectorEnv = batched(ClothReachEnv)
 
 __all__ = [
+    "ClothCanonicalizeEnv", "ClothCanonicalizeVectorEnv",
     "ClothDrapeEnv", "ClothDrapeGripperEnv", "ClothDrapeGripperVectorEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothFlattenEnv",
     "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenShirtEnv", "ClothFlattenShirtVectorEnv",
     "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv", "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv",

@@ -22,7 +22,7 @@ from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, neighbors_of, observe_next
-from clothgym.envs.throws import NUMBERS, Throw, throw_of
+from clothgym.envs.throws import NUMBERS, Hands, throw_of
 from clothgym.mesh import grid
 
 HOLDING = 0.1  # share of the potential for holding the sheet
@@ -45,16 +45,32 @@ def improvement(coverage, start):
 
 
 @inlined
-def measure_coverage(own, rules, sheet):
-    """Largest height of each gripper since its grasp; and the coverage, on the coarser grid except at the start."""
+def measure_raised(own, sheet):
+    """Largest height of each gripper since its grasp."""
     for k in range(sheet.holds.shape[0]):
         own.raised[k] = max(own.raised[k], sheet.attachments[k, 2]) if sheet.holds[k] > 0 else 0.0
-    # a sheet that has failed keeps the last one
-    if sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= TORN_STRETCH2 and not own.over:
-        cell = FINE_CELL if own.step == 0 else CELL
-        own.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, cell) / rules.flat_area, 1.0)
-        if own.step == 0:
-            own.coverage_start = own.coverage
+
+
+@inlined
+def is_measured(own, sheet):
+    """Whether there is a coverage to measure: a sheet that has failed keeps the last one."""
+    return sheet.summary[FINITE] > 0 and sheet.summary[STRETCH2] <= TORN_STRETCH2 and not own.over
+
+
+@inlined
+def note_coverage(own, rules, area):
+    """Write the coverage by an area, and at the start that of the start."""
+    own.coverage = min(area / rules.flat_area, 1.0)
+    if own.step == 0:
+        own.coverage_start = own.coverage
+
+
+@inlined
+def measure_coverage(own, rules, sheet):
+    """Heights of grippers, and the coverage, on the coarser grid except at the start."""
+    measure_raised(own, sheet)
+    if is_measured(own, sheet):
+        note_coverage(own, rules, covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL))
 
 
 @inlined
@@ -173,6 +189,10 @@ class SpreadingTask(ManipulationTask):
         """Largest distance of neighboring particles at rest [m]."""
         return max(self.physics.mesh.spacing)
 
+    def dear(self) -> NDArray[np.float64]:
+        """Cost of the edge between each two of the corners, beside that of the cloth there, (4, 4), see ``taking.next_takes``."""
+        return np.zeros((CORNERS, CORNERS))
+
     def flat_areas(self) -> tuple[float, float]:
         """Area that the flat sheet covers, and that by SoftGym's measure [m^2]."""
         width, height = self.physics.mesh.size
@@ -183,7 +203,7 @@ class SpreadingTask(ManipulationTask):
         own = {"particle_radius": self.spacing, "enough": self.enough}
         areas = dict(zip(("flat_area", "softgym_area"), self.flat_areas()))
         neighbors = neighbors_of(mesh, self.corners, self.spacing)
-        taken = {"corners": self.corners, "corner_neighbors": neighbors, "columns": (mesh.shape or (0, 0))[1]}
+        taken = {"corners": self.corners, "corner_neighbors": neighbors, "columns": (mesh.shape or (0, 0))[1], "dear": self.dear()}
         return super().constants() | own | areas | taken
 
 
@@ -199,10 +219,6 @@ class FlattenTask(SpreadingTask):
     settling_steps = 40
     picks = 6
     throws: ClassVar[int] = 2  # actions of an episode that throws
-    # what stands for an expert then: one throw that SAC found
-    throw: ClassVar[Throw] = Throw(
-        (1.2, 5.6, 10.7, 22.6, 27.6), (0.68, -0.45, 0.56, 0.47, -0.51, -0.63), (0.18, 0.2, 0.34, 0.06, 0.96, 0.26)
-    )
     action_modes: ClassVar[tuple[str, ...]] = ("velocity", "pick_place", "throw")
     arguments: ClassVar = {
         **SpreadingTask.arguments,
@@ -246,6 +262,10 @@ class FlattenTask(SpreadingTask):
         """Distance at rest from each of ``EDGES`` to the opposite one [m], (4,)."""
         return np.full(len(EDGES), self.physics.side)
 
+    def pose(self) -> NDArray | None:
+        """Where the corners should lie [m], (4, 2), or None, if the sheet may lie anywhere."""
+        return None
+
     def sheets(self) -> NDArray:
         """The sheets with which episodes begin [m], (sheets, particles, 3)."""
         return rumpled_sheets(*self.physics.mesh.grid_shape, self.physics.side, self.bank)
@@ -272,20 +292,13 @@ class FlattenTask(SpreadingTask):
         return flatten_expert.flatten_actions(self)
 
     def expert_picks(self) -> NDArray:
-        if self.action_mode == "throw":
-            return np.tile(self.throw.action(FARTHEST), (self.num_envs, 1))
-        return flatten_expert.flatten_picks(self)
+        return flatten_expert.flatten_picks(self) if self.action_mode == "pick_place" else super().expert_picks()
 
     def motion(self, actions: NDArray) -> Callable[[int], NDArray]:
         if self.action_mode != "throw":
             return super().motion(actions)
-        hands = flatten_expert.Hands([throw_of(action, FARTHEST) for action in actions])
-
-        def at(step: int) -> NDArray:
-            hands.step = step
-            return flatten_expert.flatten_actions(self, hands)
-
-        return at
+        hands = [Hands(throw_of(action, FARTHEST)) for action in actions]
+        return lambda step: flatten_expert.flatten_actions(self, hands)
 
 
 class FlattenHardTask(FlattenTask):
@@ -307,13 +320,13 @@ class ClothFlattenEnv(ClothEnv):
 
     With ``action_mode="throw"`` an action is a throw, as in ``ClothFling-v0``, of 150 control steps; an episode has two of these,
     and one more in which the sheet settles, with ``settling="steps"``.  Grippers that hold nothing take what ``next`` shows.  They
-    lift a single corner until the other gripper can take its neighbor, and lift the edge above 1.17 L, toward the first place, and
-    stretch it.  Once it hangs still, or swings outward at less than 0.5 m/s rms, they follow a way through five places, both at the
-    same height and the same place along ``out``, and then let go.  They move at 0.9 m/s at most, and more slowly while the sheet is
-    strained: where the way asks for more, they fall behind it, and its time goes on.  A way for which the time of the action is too
-    short is left to the next action; what is held at the end of the last one is released.  There is one throw in an action: an edge
-    that is taken again in it is lifted and released.  Nothing is taken in the last 95 control steps, nor at a coverage of 0.955 or
-    more.  The numbers of an action are those of ``ClothFling-v0``, but for places along ``out`` from -0.7 to 0.7 L from the origin.
+    lift a single corner until the other gripper can take its neighbor, lift the edge above 1.17 L, toward the first place, and
+    stretch it.  Once it hangs still, or swings outward at less than 0.5 m/s rms, they move to the first place and through the five
+    others, both at the same height and the same place along ``out``.  Then they let go, and rise until the action ends.  They move
+    at 0.9 m/s at most, and more slowly while the sheet is strained; the time of the way stands still while they are farther than
+    0.1 L from it.  If the action ends before the way does, they keep the edge, and the next action starts a new way; what is held
+    at the end of the last action is released.  Nothing is taken in the last 95 control steps, nor at a coverage of 0.955 or more.
+    The numbers of an action are those of ``ClothFling-v0``, but for places along ``out`` from -0.7 to 0.7 L from the origin.
 
     $physics
 

@@ -1,14 +1,14 @@
 """The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
 
 It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  With
-``action_mode="throw"`` it takes and lifts an edge for an agent, whose throw follows, see ``Hands``.  A garment
-gets entangled: it is always lifted by one corner first, and the pull on the cloth that is held is limited.
+``action_mode="throw"`` it takes and lifts an edge for an agent, whose throw follows.  A garment gets entangled: it is always lifted
+by one corner first, and the pull on the cloth that is held is limited.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,22 +16,23 @@ from numpy.typing import NDArray
 from clothgym.envs.episode import length
 from clothgym.envs.pick_place import STEPS
 from clothgym.envs.taking import EDGES, FLAT, LIFTED, OPPOSITE, next_takes_of
-from clothgym.envs.throws import Throw, follow_way, rising, taut_length
+from clothgym.envs.throws import Hands, rising, taut_length
 
 NEAR = 0.006  # of a tip from its place, when the fingers close [m]
 LIFT_AT = 0.5  # where an edge is lifted, from the origin in the direction in which it is laid down, in sides
 THROWN = 150  # control steps of an action that is a throw
-OPENING = 2  # of these in which hands let go
 LIFT, LIFT_ONE = 1.25, 0.95  # height that is aimed at with an edge, and with a corner alone, in sides; LIFTED is enough
 CALM, CALM_ONE = 0.5, 0.7  # rms speed of the particles at which the sheet is laid down, and the other corner taken [m/s]
 SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sheet is laid down [m/s]
 # while the sheet is laid down, the far edge must move away by AHEAD for each meter that the grippers sink.  A deficit of up to
 # NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
 AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
-TEARING = 0.5  # strain at which it lets go
-# of garments: strain of held cloth from which it pulls more slowly, and at which a gripper lets go, of two the lower one; strain
-# anywhere from which that counts instead; and after so many steps the other end of an edge is lifted first
-PULLING, LETTING, ALMOST_TORN, OTHER_END = 0.25, 0.35, 0.85, 50
+# share of its speed that strain leaves, ``first - second strain``, at most 1, and the strain at which both hands let go
+SHEETS, GARMENTS = (1.3, 2.0, 0.5), (1.6, 4.0, 0.35)
+ALMOST_TORN, OTHER_END = 0.85, 50  # of garments: strain anywhere that counts; steps after which an edge's other end is lifted first
+# of a sheet that has to lie in one pose: how far it turns at once, and at most is askew [rad], and where it hangs before it is
+# laid down, from the middle of the far edge [m]
+TURNING, ASKEW, HUNG = 0.1, 0.05, 0.32
 AGAIN = 95  # steps that another try takes
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
 PULLS = ((0, 1, 2, 3), (2, 3, 0, 1), (0, 3, 1, 2), (1, 2, 0, 3), (0, 3, 1, 2), (1, 2, 0, 3))
@@ -40,64 +41,41 @@ PULLED = 0.98  # share of their distance in the flat sheet to which corners are 
 LIFT_EDGE, LIFT_CORNER = 0.5, 0.2  # in sides
 
 
-class Hands:
-    """The throws that the hands of each environment make within an action, instead of what the expert does with a lifted edge."""
-
-    def __init__(self, throws: Sequence[Throw]) -> None:
-        self.throws, self.step = throws, 0  # the control step of the action
-        self.begun = np.full(len(throws), -1)  # the one at which each throw began, or -1
-
-    def velocity(self, env: int, middle: Any, out: Any, side: float) -> Any:
-        """Of the middle of both hands [m/s], (3,), or None as they let go; out: the direction of the throw."""
-        times, places = self.throws[env].way()
-        if self.begun[env] < 0:
-            # a way for which the time is too short waits for the next action
-            if self.step + times[-1] + OPENING > THROWN:
-                return np.zeros(3)
-            self.begun[env] = self.step
-        now = self.step - self.begun[env]
-        if now > times[-1] - 1:
-            return None
-        there, up = follow_way((times, places), now, np.array([middle @ out, middle[2]]), side)
-        return there * out + (0, 0, up)
-
-
-def flatten_actions(task: Any, hands: Hands | None = None) -> NDArray:
-    """Actions of all environments, (num_envs, 8); hands: those that throw instead of laying a sheet down."""
-    side, grippers, across = task.physics.side, task.simulation.grippers, task.across()
-    corners, rest = task.corners, task.physics.mesh.rest_positions
-    x, tips = task.simulation.positions.astype(np.float64), grippers.positions.astype(np.float64)
-    v = task.simulation.velocities.astype(np.float64)
-    speed = np.sqrt((v**2).sum(axis=2).mean(axis=1))
+def flatten_actions(task: Any, hands: Sequence[Hands] | None = None) -> NDArray:
+    """Actions of all environments, (num_envs, 8); hands: of each of them, which throw instead of laying a sheet down."""
+    side, grippers, corners = task.physics.side, task.simulation.grippers, task.corners
+    tips = grippers.positions.astype(np.float64)
+    speed = np.sqrt((task.simulation.velocities.astype(np.float64) ** 2).sum(axis=2).mean(axis=1))
     holder, n = grippers.holder, task.num_envs
     goals, others = next_takes_of(task)
     move, grip = np.zeros((n, 2, 3)), np.ones((n, 2))
     for e in range(n):
-        own = task.episode[e]
+        own, throwing = task.episode[e], hands[e] if hands is not None else None
         held = [np.flatnonzero(holder[e] == k) for k in range(2)]
         corner = [next((i for i in range(4) if holder[e, corners[i]] == k), -1) for k in range(2)]
         laid = own["raised"].max() > LIFTED[1] * side and max(tips[e, k, 2] for k in range(2)) < 0.06
-        if laid and min(corner) < 0:
+        if throwing is not None and (throwing.done or (throwing.begun and min(corner) < 0)):
+            # one throw in an action: the rest of its time the sheet comes to rest
+            throwing.done = True
+            move[e] = _up(tips[e])
+        elif laid and min(corner) < 0:
             pass  # what has been laid down is let go of
         elif any(len(held[k]) and corner[k] < 0 for k in range(2)):
             # nothing is held by mistake
             move[e, :, 2], grip[e] = 0.3, [1.0 if corner[k] < 0 else -1.0 for k in range(2)]
-        elif corner[0] >= 0 and corner[1] >= 0:
-            move[e], grip[e] = _spread(x[e], tips[e], held, corner, corners, rest, (side, across), own, speed[e], v[e], hands, e)
+        elif max(corner) >= 0:
+            both = min(corner) >= 0
+            if both:
+                move[e], grip[e] = _spread(task, e, tips[e], held, corner, speed[e], throwing)
+            else:
+                move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
             # entangled cloth is pulled slowly, and released before it tears
-            strain = _strain(task, e, holder[e], x[e])
-            move[e] *= np.clip(1.3 - 2 * strain, 0.0, 1.0)
-            if task.entangles and strain > LETTING:
-                grip[e, tips[e, :, 2].argmin()] = 1
-            elif strain > TEARING:
-                grip[e] = 1
-        elif corner[0] >= 0 or corner[1] >= 0:
-            move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
-            if task.entangles and (strain := _strain(task, e, holder[e], x[e])) > PULLING:
-                move[e] *= np.clip(1.6 - 4 * strain, 0.0, 1.0)
-                grip[e] = 1 if strain > LETTING else grip[e]
+            if both or task.entangles:
+                strain, (one, less, most) = _strain(task, e), GARMENTS if task.entangles else SHEETS
+                move[e] *= np.clip(one - less * strain, 0.0, 1.0)
+                grip[e] = 1 if strain > most else grip[e]
         elif own["coverage"] >= task.enough + FLAT or own["step"] > task.acting_steps - AGAIN:
-            move[e, :, 2] = np.where(tips[e, :, 2] < 0.3, 0.5, 0)
+            move[e] = _up(tips[e])
         else:
             if task.entangles and others[e].min() >= 0:
                 others[e, own["step"] // OTHER_END % 2] = -1
@@ -144,13 +122,19 @@ def _to(goal: NDArray, tip: NDArray) -> NDArray:
     return (goal - tip) * 15
 
 
-def _strain(task: Any, e: int, holder: NDArray, x: NDArray) -> float:
+def _up(tips: NDArray) -> NDArray:
+    """Velocities with which empty hands get out of the way [m/s]."""
+    return np.where(tips[:, 2:] < 0.3, 0.5, 0) * (0, 0, 1)
+
+
+def _strain(task: Any, e: int) -> float:
     """Largest strain of an environment's sheet; of a garment that of the cloth that is held, unless it almost tears elsewhere."""
     largest = float(task.info["strain_max"][e])
     if not task.entangles or largest > ALMOST_TORN:
         return largest
     ends, rest, *_ = task.physics.mesh.springs
-    pulled = (holder[ends] >= 0).any(axis=1)
+    x = task.simulation.positions[e].astype(np.float64)
+    pulled = (task.simulation.grippers.holder[e][ends] >= 0).any(axis=1)
     return float((length(x[ends[pulled, 1]] - x[ends[pulled, 0]]) / rest[pulled]).max()) - 1
 
 
@@ -189,17 +173,39 @@ def _take_other(tips: Any, goals: Any, others: Any, corner: Any, side: float, ow
     return move, grip
 
 
-def _spread(
-    x: Any, tips: Any, held: Any, corner: Any, corners: Any, rest: Any, sizes: Any, own: Any, speed: float, v: Any,
-    hands: Hands | None, env: int,
-) -> Any:  # fmt: skip
-    """Lift the edge, stretch it, lay the sheet down behind its far edge, or along the way of a throw, and let go."""
+class Aim(NamedTuple):
+    """Where a held edge should lie: the yaw that it still has to turn, and the middle of it and of the far edge [m], (3,)."""
+
+    angle: float
+    near: NDArray
+    far: NDArray
+
+
+def _aim(task: Any, corner: Any, edge: int, along: NDArray) -> Aim | None:
+    """Of a task whose sheets have to lie in one pose; corner: numbers of the held corners, edge: of their edge."""
+    pose = task.pose()
+    if pose is None:
+        return None
+    wanted = pose[corner[1]] - pose[corner[0]]
+    angle = np.arctan2(along[0] * wanted[1] - along[1] * wanted[0], along[:2] @ wanted)
+    return Aim(float(angle), *(np.append(pose[of].mean(axis=0), 0.0) for of in (EDGES[edge], OPPOSITE[edge])))
+
+
+def _turned(x: NDArray, angle: float) -> NDArray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * x[0] - s * x[1], s * x[0] + c * x[1], x[2]])
+
+
+def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, throwing: Hands | None) -> Any:
+    """Lift the edge, stretch it, lay the sheet down behind its far edge, or follow the way of a throw, and let go."""
+    corners, rest, side, own = task.corners, task.physics.mesh.rest_positions, task.physics.side, task.episode[e]
+    x, v = (of[e].astype(np.float64) for of in (task.simulation.positions, task.simulation.velocities))
     ends = corners[corner]
     taut = taut_length(rest, held)
     edge = next((i for i in range(4) if set(EDGES[i]) == set(corner)), -1)
     if edge < 0:  # a diagonal
         return np.zeros((2, 3)), np.array([-1.0, 1.0])
-    side, deep = sizes[0], sizes[1][edge]
+    deep = task.across()[edge]
     # along the edge, and to the far edge, its front up
     along = (tips[1] - tips[0]) * (1, 1, 0)
     along /= max(np.linalg.norm(along), 1e-9)
@@ -207,25 +213,40 @@ def _spread(
     turn = np.cross(rest[ends[1]] - rest[ends[0]], far_rest)[2]
     out = np.array([-along[1], along[0], 0.0]) * np.sign(turn)
     middle = tips.mean(axis=0)
-    apart = np.stack([-along, along]) * taut / 2
+    aim = _aim(task, corner, edge, along)
+    ahead = along if aim is None else _turned(along, np.clip(aim.angle, -TURNING, TURNING))
+    apart = np.stack([-ahead, ahead]) * taut / 2
     low = x[ends, 2].min()
     far = x[corners[OPPOSITE[edge]]].mean(axis=0)
     if own["raised"].min() <= LIFTED[1] * side:
-        first = LIFT_AT if hands is None else hands.throws[env].along[0]
+        first = LIFT_AT if throwing is None else throwing.throw.along[0]
         return rising(_to(first * side * out + (0, 0, LIFT * side) + apart, tips), tips, taut, SPEED), -np.ones(2)
     # the tips keep the edge taut
     keep = (middle + apart - tips) * 10
     # begin as the far edge swings outward, or hangs still
     swing, reach = float(v[corners[OPPOSITE[edge]]].mean(axis=0) @ out), float((far - middle) @ out)
     sways = speed > CALM or (speed > 0.2 and (swing < 0 or reach < -0.02))
-    waits = middle[2] > LIFTED[1] * side - 0.01 if hands is None else hands.begun[env] < 0
+    waits = middle[2] > LIFTED[1] * side - 0.01 if throwing is None else not throwing.begun
+    if waits and aim is not None:
+        # first to where it is laid down from, turned as it should lie
+        way = (aim.far + HUNG * out - middle) * (1, 1, 0) if throwing is None else np.zeros(3)
+        if abs(aim.angle) > ASKEW or length(way) > 0.03:
+            return keep + 4 * way, -np.ones(2)
     if waits and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
         return keep, -np.ones(2)
-    if hands is not None:
-        way = hands.velocity(env, middle, out, side)
-        return (np.zeros((2, 3)), np.ones(2)) if way is None else (keep + way, -np.ones(2))
+    if throwing is not None:
+        way = throwing.velocity(np.array([middle @ out, middle[2]]), side)
+        return (np.zeros((2, 3)), np.ones(2)) if way is None else (keep + way[0] * out + (0, 0, way[1]), -np.ones(2))
     height = x[ends, 2].mean()
-    if low < 0.012 and (reach > 0.96 * deep or -middle @ out > 1.3 * side):
+    there = reach > 0.96 * deep or -middle @ out > 1.3 * side
+    if aim is not None:
+        # sideways to where the edge should lie, and at the end backward
+        left = aim.near - middle
+        keep = keep + 4 * (left @ along) * along
+        if low < 0.012 and reach > 0.96 * deep and left @ out < -0.01:
+            return keep + np.clip(4 * (left @ out), -0.3, 0) * out, -np.ones(2)
+        there = left @ out > -0.01
+    if low < 0.012 and there:
         return np.zeros((2, 3)), np.ones(2)
     # down behind the far edge, backward when it touches the floor; at the end slowly enough that cloth off the floor does not fold
     touching = far[2] < 0.03 or height < 0.5 * deep

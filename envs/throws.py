@@ -20,6 +20,7 @@ LASTING, ABOVE = (1.0, 13.0), (0.02, 1.25)
 STEP = 0.25  # of ``way``, in control steps
 BACK = 20.0  # speed toward the way, for each meter from it [1/s]
 RATE = 30.0  # control steps in a second
+BEHIND = 0.1  # distance of hands from their way at which its time stands still, in sides
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 
 
@@ -71,6 +72,34 @@ def follow_way(way: tuple[NDArray, NDArray], now: float, at: NDArray, side: floa
     times, places = way
     here, ahead = (side * np.array([np.interp(t, times, places[:, c]) for c in range(2)]) for t in (now, now + 1))
     return RATE * (ahead - here) + BACK * (here - at)
+
+
+class Hands:
+    """The hands of an environment on the way of a throw, within an action.
+
+    Attributes:
+        begun: whether they have set out.  done: whether they have let go.
+    """
+
+    def __init__(self, throw: Throw) -> None:
+        self.throw, self.way = throw, throw.way()
+        self.now, self.begun, self.done = 0.0, False, False
+
+    def velocity(self, at: NDArray, side: float) -> NDArray | None:
+        """Of hands that are there, along and above [m/s], (2,), or None as they let go; at: [m], (2,).
+
+        Time stands still while they are farther from the way than BEHIND, as on the way to its beginning.
+        """
+        times, places = self.way
+        self.begun = True
+        if self.now > times[-1] - 1:
+            self.done = True
+            return None
+        here = side * np.array([np.interp(self.now, times, places[:, c]) for c in range(2)])
+        if np.linalg.norm(here - at) > BEHIND * side:
+            return BACK * (here - at)
+        self.now += 1
+        return follow_way(self.way, self.now - 1, at, side)
 
 
 def taut_length(rest: NDArray, held: Any) -> float:

@@ -7,6 +7,7 @@ import pytest
 from clothgym import grid
 from clothgym.envs.coverage import CELL, FINE_CELL, covered_area, softgym_area
 from clothgym.envs.rumpled import CRUMPLED, CRUMPLED_LARGE, resampled, rumpled_sheets
+from clothgym.envs.throws import Hands, Throw
 from clothgym.geometry.intersections import find_intersections
 from clothgym.parameters import PROPERTIES
 
@@ -287,7 +288,7 @@ def test_a_throw_takes_the_hands_along_out_through_its_places():
     assert np.nanmax(middles[..., 1], axis=0).min() > 1.17 and np.isnan(middles[passed[-1] + 6, range(3)]).all()
 
 
-def test_a_way_for_which_the_time_is_too_short_waits_for_the_next_action():
+def test_one_throw_in_an_action_and_a_way_that_it_cuts_short_leaves_the_edge_held():
     env = gym.make_vec(ID, num_envs=1, action_mode="throw", autoreset_mode="Disabled").unwrapped
     env.reset(seed=1_000_005)
     task = env.task
@@ -295,18 +296,36 @@ def test_a_way_for_which_the_time_is_too_short_waits_for_the_next_action():
     above = np.array([1.2, 1.06, 0.92, 0.78, 0.64, 0.5])
     slow = np.concatenate([np.ones(5), np.zeros(6), (above - 0.635) / 0.615])[None]
     task.step(slow)
-    assert np.all(task.simulation.grippers.held > 0) and np.all(task.simulation.grippers.positions[..., 2] > 1.15 * SIDE)
-    # it is followed from there, down to where they let go, in 65 steps
-    heights, inner = [], task._control_step
+    assert np.all(task.simulation.grippers.held > 0) and np.all(task.simulation.grippers.positions[..., 2] > 0.51 * SIDE)
+    # from the first place again, down to where they let go, in 65 steps; there is no second throw
+    held, heights, inner = [], [], task._control_step
 
     def step(actions):
         inner(actions)
-        if np.all(task.simulation.grippers.held > 0):
-            heights.append(task.simulation.grippers.positions[0, :, 2].astype(float) / SIDE)
+        held.append(np.any(task.simulation.grippers.held > 0))
+        heights.append(task.simulation.grippers.positions[0, :, 2].astype(float).mean() / SIDE)
 
     task._control_step = step
     task.step(slow)
-    assert np.all(task.simulation.grippers.held == 0) and heights[64] == pytest.approx(np.full(2, 0.5), abs=0.05)
+    released = held.index(False)
+    highest = int(np.argmax(heights[:released]))
+    assert heights[highest] > 1.15 and heights[released - 1] == pytest.approx(0.5, abs=0.05)
+    assert released - highest == pytest.approx(65, abs=8) and not any(held[released:])
+
+
+def test_time_of_a_way_stands_still_while_hands_are_far_from_it():
+    hands = Hands(Throw((4.0, 8.0), (0.0, 0.0, 0.8), (1.0, 0.2, 0.2)))
+    # a side of 0.5 m: 0.06 m behind is too far, 0.04 m is not
+    far = hands.velocity(np.array([0.0, 0.56]), 0.5)
+    assert far == pytest.approx([0.0, -20 * 0.06]) and hands.begun
+    near = [hands.velocity(np.array([0.0, 0.54]), 0.5) for _ in range(2)]
+    # each step 0.1 m lower, in a thirtieth of a second, and back; in the second one 0.14 m are missing
+    assert near[0] == pytest.approx([0.0, -0.1 * 30 - 20 * 0.04]) and near[1] == pytest.approx([0.0, -20 * 0.14])
+    places = [(0, 0.4), (0, 0.3), (0, 0.2), (0, 0.1), (0.1, 0.1), (0.2, 0.1)]
+    assert all(hands.velocity(np.array(place), 0.5) is not None for place in places) and not hands.done
+    assert (
+        hands.velocity(np.array([0.3, 0.1]), 0.5) is not None and hands.velocity(np.array([0.4, 0.1]), 0.5) is None and hands.done
+    )
 
 
 def test_throws_have_the_same_bits_alone_in_a_batch_and_from_a_restored_state():

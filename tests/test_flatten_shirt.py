@@ -22,9 +22,9 @@ def turned(x, yaw, over=False):
     return x - (0, 0, x[:, 2].min() - 0.003)
 
 
-def evaluated(x=None, seed=3, steps=25):
+def evaluated(x=None, seed=3, steps=25, env_id=ID):
     """Info of the last step of an episode, after so many steps from this shirt, or from the start."""
-    env = gym.make(ID).unwrapped
+    env = gym.make(env_id).unwrapped
     env.reset(seed=seed)
     task, own = env.task, env.task.episode[0]
     if x is not None:

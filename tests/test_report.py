@@ -92,16 +92,22 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     other = [*same, result(0.1, env_kwargs={"physics": "fast"}), result(0.2, learner="sac")]
     assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", results.LABELS["sac"]]
     now = {"ClothReach-v0": "now"}
-    assert report.best_of("ClothReach-v0", other, now, from_scratch=True) == "PPO: 0.85 in 2 min"
+    assert report.best_of("ClothReach-v0", other, now, from_scratch=True) == "PPO: 0.85 (worst of 2 seeds: 0.80) in 2 min"
     expert = report.best_of("ClothReach-v0", other, now, from_scratch=False)
     assert expert == "SAC, started with expert episodes: 0.20 in 2 min"
     # who always arrives, and never at no cost, is not the best
     careless = [result(1.0, learner="sac_scratch", cost=70.0, safe_success_rate=0.0)]
     safe = [result(0.9, seed=seed, cost=0.3, safe_success_rate=rate) for seed, rate in enumerate((0.80, 0.85, 0.87))]
-    assert report.best_of("ClothReach-v0", [*careless, *safe], now, True) == "PPO: 0.84 at no cost in 2 min"
+    assert (
+        report.best_of("ClothReach-v0", [*careless, *safe], now, True) == "PPO: 0.84 at no cost (worst of 3 seeds: 0.80) in 2 min"
+    )
     assert report.best_of("ClothDrape-v0", other, now, True) == "–"
     assert report.best_of("ClothReach-v0", other, {"ClothReach-v0": "later"}, True).endswith("2 min **(old)**")
-    # what is of this code goes before a better score of older code
+    # what is learned from states goes before a better score from pictures, and what is of this code before any of older code
+    seeing = result(0.95, learner="sac_scratch", env_kwargs={"obs_mode": "depth"})
+    pictures = {**now, 'ClothReach-v0 {"obs_mode": "depth"}': "now"}
+    assert report.best_of("ClothReach-v0", [result(0.9), seeing], pictures, True) == "PPO: 0.90 in 2 min"
+    assert report.best_of("ClothReach-v0", [seeing], pictures, True) == "SAC, `obs_mode='depth'`: 0.95 in 2 min"
     mixed = [result(0.9), result(0.7, learner="sac_scratch", digest="later")]
     assert report.best_of("ClothReach-v0", mixed, {"ClothReach-v0": "later"}, True) == "SAC: 0.70 in 2 min"
 

@@ -41,6 +41,7 @@ OPTIONS = {
     "ClothFoldShirt-v0": [{"target": {}}],
     "ClothFlatten-v0": [{"rumpled": True}],
     "ClothFlattenShirt-v0": [{"rumpled": True}],
+    "ClothCanonicalize-v0": [{"rumpled": True}],
     "ClothHook-v0": [{"hook": {"height": 9}}, {"hook": {"yaw": 2}}, {"hook": {"color": 1}}, {"hook": 7}],
     "ClothHook-Hard-v0": [{"hook": {"center": (5, 5)}}, {"rumpled": 1}],
     "ClothFling-v0": [{"rumpled": True}],

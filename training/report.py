@@ -177,9 +177,16 @@ def _rates(rows: list[Result]) -> list[float]:
 def best_rows(
     env_id: str, results: list[Result], digests: dict[str, str], learners: Iterable[str]
 ) -> tuple[str, list[Result]] | None:
-    """The label and the seeds of the best of some learners; results of the present behavior go before old ones."""
+    """The label and the seeds of the best of some learners; results of the present behavior, and then from states, go first."""
     found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id and rows[0]["learner"] in learners]
-    rank = {label: (all(is_present(row, digests) for row in rows), interquartile_mean(_rates(rows))) for label, rows in found}
+    rank = {
+        label: (
+            all(is_present(row, digests) for row in rows),
+            "obs_mode" not in rows[0]["env_kwargs"],
+            interquartile_mean(_rates(rows)),
+        )
+        for label, rows in found
+    }
     return max(found, key=lambda one: rank[one[0]], default=None)
 
 
@@ -194,7 +201,8 @@ def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_sc
     label, rows = best
     at = " at no cost" if "safe_success_rate" in rows[0] else ""
     old = _old(all(is_present(row, digests) for row in rows))
-    return f"{label}: {interquartile_mean(_rates(rows)):.2f}{at} in {max(_minutes(rows), 1):.0f} min{old}"
+    worst = f" (worst of {len(rows)} seeds: {min(_rates(rows)):.2f})" if len(rows) > 1 else ""
+    return f"{label}: {interquartile_mean(_rates(rows)):.2f}{at}{worst} in {max(_minutes(rows), 1):.0f} min{old}"
 
 
 def scores_of(env_id: str, results: list[Result], scripted: list[Result], digests: dict[str, str]) -> list[dict[str, Any]]:

@@ -1,0 +1,101 @@
+"""ClothCanonicalize-v0: spread a crumpled T-shirt on the floor in one pose: about the origin, front up, neck toward +y."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from clothgym._jit import inlined
+from clothgym.envs.coverage import CELL, FINE_CELL, shared_area, softgym_area
+from clothgym.envs.episode import Fields
+from clothgym.envs.flatten import improvement, is_measured, measure_raised, note_coverage
+from clothgym.envs.flatten_shirt import SHIRT, FlattenShirtTask, facing_up
+from clothgym.envs.garment_scores import funnels
+from clothgym.envs.measures import SPEED2
+from clothgym.envs.scoring import ENOUGH_REST, holds_nothing
+from clothgym.envs.single import ClothEnv
+
+ENOUGH_UP = 0.9  # share of the front panel that looks up, in a success
+
+
+# --- a step of one environment, see ``stepping`` ------------------------------------------------------------------------------
+
+
+@inlined
+def _measure(own, rules, sheet):
+    """Heights of grippers, and the coverage of the canonical outline, on the coarser grid except at the start."""
+    measure_raised(own, sheet)
+    if is_measured(own, sheet):
+        both, _ = shared_area(sheet.x, rules.outline, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL)
+        note_coverage(own, rules, both)
+
+
+@inlined
+def _evaluate(own, rules, sheet, info):
+    """Write the coverage of the outline, the overlap, how far the front looks up, and others' measures; returns the improvement."""
+    both, either = shared_area(sheet.x, rules.outline, sheet.mesh.triangles, FINE_CELL)
+    info.coverage, info.overlap = min(both / rules.flat_area, 1.0), both / either
+    info.face_up = facing_up(sheet.x, sheet.mesh.triangles, rules.front)
+    info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.x, rules.canonical, np.sqrt(rules.flat_area))
+    info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.softgym_area
+    info.rms_speed = np.sqrt(sheet.summary[SPEED2])
+    posed = info.coverage >= rules.enough and info.face_up >= ENOUGH_UP
+    info.is_success = posed and info.rms_speed < ENOUGH_REST and holds_nothing(own, rules, sheet)
+    return improvement(info.coverage, own.coverage_start)
+
+
+# --- the task -----------------------------------------------------------------------------------------------------------------
+
+
+class CanonicalizeTask(FlattenShirtTask):
+    """The task of ``ClothCanonicalize-v0``, see ``ClothCanonicalizeEnv``."""
+
+    kernels = FlattenShirtTask.kernels._replace(measure=_measure, evaluate=_evaluate)
+    acting_steps = 640
+    throws = 4
+    enough = 0.8
+    evaluation: ClassVar[Fields] = (*FlattenShirtTask.evaluation, ("overlap", float))
+
+    def constants(self) -> dict[str, Any]:
+        return super().constants() | {"outline": np.ascontiguousarray(SHIRT.mesh.rest_positions.T, np.float32)}
+
+    def pose(self) -> NDArray:
+        return SHIRT.mesh.rest_positions[self.corners, :2]
+
+
+class ClothCanonicalizeEnv(ClothEnv):
+    """Spread a crumpled T-shirt on the floor in its canonical pose: about the origin, front up, neck toward +y.
+
+    ## Description
+    The T-shirt, its starts and the grippers are those of ``ClothFlattenShirt-v0``.  Here it has to lie in one pose, from which a
+    fixed sequence of motions can fold it.  After 640 steps the grippers open, and the shirt settles for 40 steps, in which actions
+    are ignored; then it is evaluated.  In the canonical pose the shirt lies flat, centered on the origin, its neck toward +y and
+    its left sleeve toward -x.  With ``action_mode="throw"`` the environment also turns an edge that it lifts, as it should lie.
+
+    $physics
+
+    ## Observation Space
+    $observations
+
+    ``coverage`` is the covered share of the canonical outline, as below.  ``next`` is chosen as in ``ClothFlattenShirt-v0``, until
+    the coverage is 0.805.
+
+    ## Rewards
+    As in ``ClothFlatten-v0``, with the coverage of the canonical outline.
+
+    ## Evaluation
+    The coverage c is the area that the shirt covers inside the outline of the canonical pose, seen from above, over the area of
+    that outline, 0.31 m^2.  It is measured as in ``ClothFlatten-v0``, and the normalized performance is the normalized improvement
+    of c.  In a success c is 0.8 or more, nine tenths of the front panel look up, and the shirt is released and at rest (less than
+    0.02 m/s rms).
+
+    ``info`` is that of ``ClothFlattenShirt-v0``, with this coverage.  At the evaluation it also has ``overlap``, the intersection
+    over union of the covered area and the outline.  ``peer/funnels`` is Cloth Funnels' distance from this pose.
+
+    ## Starting State
+    As in ``ClothFlattenShirt-v0``.
+    """
+
+    task_class = CanonicalizeTask
