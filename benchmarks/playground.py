@@ -55,9 +55,9 @@ def measure(scene: str) -> dict[str, Any]:
     return {
         "scene": scene,
         "sheet": f"{rows} x {columns}",
-        "frame [ms]": median,
-        "95 % below [ms]": often,
-        "longest [ms]": most,
+        "median [ms]": median,
+        "95th percentile [ms]": often,
+        "maximum [ms]": most,
         "message [kB]": round(browser.size / 1e3, 1),
     }
 
