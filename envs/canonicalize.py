@@ -28,14 +28,14 @@ def _measure(own, rules, sheet):
     """Heights of grippers, and the coverage of the canonical outline, on the coarser grid except at the start."""
     measure_raised(own, sheet)
     if is_measured(own, sheet):
-        both, _ = shared_area(sheet.x, rules.outline, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL)
+        both, _ = shared_area(sheet.x, rules.flat, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL)
         note_coverage(own, rules, both)
 
 
 @inlined
 def _evaluate(own, rules, sheet, info):
-    """Write the coverage of the outline, the overlap, how far the front looks up, and others' measures; returns the improvement."""
-    both, either = shared_area(sheet.x, rules.outline, sheet.mesh.triangles, FINE_CELL)
+    """Write the coverage of the outline, the overlap, how far the front looks up, and the measures of other benchmarks."""
+    both, either = shared_area(sheet.x, rules.flat, sheet.mesh.triangles, FINE_CELL)
     info.coverage, info.overlap = min(both / rules.flat_area, 1.0), both / either
     info.face_up = facing_up(sheet.x, sheet.mesh.triangles, rules.front)
     info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.x, rules.canonical, np.sqrt(rules.flat_area))
@@ -59,7 +59,8 @@ class CanonicalizeTask(FlattenShirtTask):
     evaluation: ClassVar[Fields] = (*FlattenShirtTask.evaluation, ("overlap", float))
 
     def constants(self) -> dict[str, Any]:
-        return super().constants() | {"outline": np.ascontiguousarray(SHIRT.mesh.rest_positions.T, np.float32)}
+        # of the type of ``sheet.x``, as ``shared_area`` takes both
+        return super().constants() | {"flat": np.ascontiguousarray(SHIRT.mesh.rest_positions.T, np.float32)}
 
     def pose(self) -> NDArray:
         return SHIRT.mesh.rest_positions[self.corners, :2]
@@ -72,7 +73,8 @@ class ClothCanonicalizeEnv(ClothEnv):
     The T-shirt, its starts and the grippers are those of ``ClothFlattenShirt-v0``.  Here it has to lie in one pose, from which a
     fixed sequence of motions can fold it.  After 640 steps the grippers open, and the shirt settles for 40 steps, in which actions
     are ignored; then it is evaluated.  In the canonical pose the shirt lies flat, centered on the origin, its neck toward +y and
-    its left sleeve toward -x.  With ``action_mode="throw"`` the environment also turns an edge that it lifts, as it should lie.
+    its left sleeve toward -x.  With ``action_mode="throw"`` an episode has four throws, and the environment also turns a
+    lifted edge to its direction in the canonical pose.
 
     $physics
 
@@ -88,8 +90,8 @@ class ClothCanonicalizeEnv(ClothEnv):
     ## Evaluation
     The coverage c is the area that the shirt covers inside the outline of the canonical pose, seen from above, over the area of
     that outline, 0.31 m^2.  It is measured as in ``ClothFlatten-v0``, and the normalized performance is the normalized improvement
-    of c.  In a success c is 0.8 or more, nine tenths of the front panel look up, and the shirt is released and at rest (less than
-    0.02 m/s rms).
+    of c.  In a success, c is 0.8 or more, at least nine tenths of the front panel face up, and the shirt is released and at rest
+    (less than 0.02 m/s rms).  Rewards, performance, ``first_success`` and ``success_held`` do not depend on the side that is up.
 
     ``info`` is that of ``ClothFlattenShirt-v0``, with this coverage.  At the evaluation it also has ``overlap``, the intersection
     over union of the covered area and the outline.  ``peer/funnels`` is Cloth Funnels' distance from this pose.

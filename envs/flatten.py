@@ -59,7 +59,7 @@ def is_measured(own, sheet):
 
 @inlined
 def note_coverage(own, rules, area):
-    """Write the coverage by an area, and at the start that of the start."""
+    """Store the coverage that an area amounts to; at the start, also as the starting coverage."""
     own.coverage = min(area / rules.flat_area, 1.0)
     if own.step == 0:
         own.coverage_start = own.coverage
@@ -189,8 +189,8 @@ class SpreadingTask(ManipulationTask):
         """Largest distance of neighboring particles at rest [m]."""
         return max(self.physics.mesh.spacing)
 
-    def dear(self) -> NDArray[np.float64]:
-        """Cost of the edge between each two of the corners, beside that of the cloth there, (4, 4), see ``taking.next_takes``."""
+    def edge_costs(self) -> NDArray[np.float64]:
+        """Extra cost of the edge between each pair of corners, in other particles, (4, 4), see ``taking.next_takes``."""
         return np.zeros((CORNERS, CORNERS))
 
     def flat_areas(self) -> tuple[float, float]:
@@ -203,7 +203,12 @@ class SpreadingTask(ManipulationTask):
         own = {"particle_radius": self.spacing, "enough": self.enough}
         areas = dict(zip(("flat_area", "softgym_area"), self.flat_areas()))
         neighbors = neighbors_of(mesh, self.corners, self.spacing)
-        taken = {"corners": self.corners, "corner_neighbors": neighbors, "columns": (mesh.shape or (0, 0))[1], "dear": self.dear()}
+        taken = {
+            "corners": self.corners,
+            "corner_neighbors": neighbors,
+            "columns": (mesh.shape or (0, 0))[1],
+            "edge_costs": self.edge_costs(),
+        }
         return super().constants() | own | areas | taken
 
 
@@ -322,11 +327,12 @@ class ClothFlattenEnv(ClothEnv):
     and one more in which the sheet settles, with ``settling="steps"``.  Grippers that hold nothing take what ``next`` shows.  They
     lift a single corner until the other gripper can take its neighbor, lift the edge above 1.17 L, toward the first place, and
     stretch it.  Once it hangs still, or swings outward at less than 0.5 m/s rms, they move to the first place and through the five
-    others, both at the same height and the same place along ``out``.  Then they let go, and rise until the action ends.  They move
-    at 0.9 m/s at most, and more slowly while the sheet is strained; the time of the way stands still while they are farther than
-    0.1 L from it.  If the action ends before the way does, they keep the edge, and the next action starts a new way; what is held
-    at the end of the last action is released.  Nothing is taken in the last 95 control steps, nor at a coverage of 0.955 or more.
-    The numbers of an action are those of ``ClothFling-v0``, but for places along ``out`` from -0.7 to 0.7 L from the origin.
+    others, both at the same height and the same place along ``out``.  Then they let go, rise to 0.3 m, and wait until the action
+    ends.  They move at 0.9 m/s at most, and more slowly while the sheet is strained; the clock of the way stops while they are more
+    than 0.1 L from where they should be.  If the action ends before the way does, they keep the edge, and the next action starts a
+    new way; what is held at the end of the last action is released.  Nothing is taken in the last 95 control steps, nor at a
+    coverage of 0.955 or more.  The numbers of an action are those of ``ClothFling-v0``, but for places along ``out`` from -0.7 to
+    0.7 L from the origin.
 
     $physics
 

@@ -1,8 +1,9 @@
-"""The scripted expert of ``ClothFlatten-v0``: take an edge by its corners, lift it, stretch it, lay the sheet down.
+"""The scripted expert of the flattening tasks: take an edge by its corners, lift it, stretch it, lay the sheet down.
 
 It sees the whole state, and has no memory: what the grippers hold, and how high they have been since, says where it is.  With
-``action_mode="throw"`` it takes and lifts an edge for an agent, whose throw follows.  A garment gets entangled: it is always lifted
-by one corner first, and the pull on the cloth that is held is limited.
+``action_mode="throw"`` it takes and lifts an edge for an agent, whose throw follows, see ``Hands``.  A garment gets entangled: it
+is always lifted by one corner first, and the pull on the cloth that is held is limited.  Where a sheet has to lie in one pose, the
+expert turns the edge, and carries it to where the sheet is laid down from.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ SPEED, LAYING = 0.9, 0.6  # of a gripper, as a share of its limit, and as the sh
 # NEARER [m] is corrected: for each meter of it the grippers move backward faster [1/s], and down more slowly, by this share [1/m]
 AHEAD, NEARER, CORRECTION = 0.8, 0.05, 6.0
 # share of its speed that strain leaves, ``first - second strain``, at most 1, and the strain at which both hands let go
-SHEETS, GARMENTS = (1.3, 2.0, 0.5), (1.6, 4.0, 0.35)
+SHEET_STRAINS, GARMENT_STRAINS = (1.3, 2.0, 0.5), (1.6, 4.0, 0.35)
 ALMOST_TORN, OTHER_END = 0.85, 50  # of garments: strain anywhere that counts; steps after which an edge's other end is lifted first
-# of a sheet that has to lie in one pose: how far it turns at once, and at most is askew [rad], and where it hangs before it is
-# laid down, from the middle of the far edge [m]
+# of a sheet that has to lie in one pose: how far it turns at once, and at most is askew [rad], and how far beyond the place of its
+# far edge it hangs before it is laid down [m]
 TURNING, ASKEW, HUNG = 0.1, 0.05, 0.32
 AGAIN = 95  # steps that another try takes
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
@@ -71,8 +72,8 @@ def flatten_actions(task: Any, hands: Sequence[Hands] | None = None) -> NDArray:
                 move[e], grip[e] = _take_other(tips[e], goals[e], others[e], corner, side, own, speed[e])
             # entangled cloth is pulled slowly, and released before it tears
             if both or task.entangles:
-                strain, (one, less, most) = _strain(task, e), GARMENTS if task.entangles else SHEETS
-                move[e] *= np.clip(one - less * strain, 0.0, 1.0)
+                strain, (full, slope, most) = _strain(task, e), GARMENT_STRAINS if task.entangles else SHEET_STRAINS
+                move[e] *= np.clip(full - slope * strain, 0.0, 1.0)
                 grip[e] = 1 if strain > most else grip[e]
         elif own["coverage"] >= task.enough + FLAT or own["step"] > task.acting_steps - AGAIN:
             move[e] = _up(tips[e])
@@ -229,25 +230,26 @@ def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, 
     waits = middle[2] > LIFTED[1] * side - 0.01 if throwing is None else not throwing.begun
     if waits and aim is not None:
         # first to where it is laid down from, turned as it should lie
-        way = (aim.far + HUNG * out - middle) * (1, 1, 0) if throwing is None else np.zeros(3)
+        way = (aim.far + HUNG * out - middle) * (1, 1, 0) if throwing is None else ((aim.near - middle) @ along) * along
         if abs(aim.angle) > ASKEW or length(way) > 0.03:
             return keep + 4 * way, -np.ones(2)
     if waits and (sways or np.linalg.norm(tips[1] - tips[0]) < taut - 0.02):
         return keep, -np.ones(2)
+    if aim is not None:
+        # sideways to where the edge should lie
+        keep = keep + 4 * ((aim.near - middle) @ along) * along
     if throwing is not None:
         way = throwing.velocity(np.array([middle @ out, middle[2]]), side)
         return (np.zeros((2, 3)), np.ones(2)) if way is None else (keep + way[0] * out + (0, 0, way[1]), -np.ones(2))
     height = x[ends, 2].mean()
-    there = reach > 0.96 * deep or -middle @ out > 1.3 * side
-    if aim is not None:
-        # sideways to where the edge should lie, and at the end backward
-        left = aim.near - middle
-        keep = keep + 4 * (left @ along) * along
-        if low < 0.012 and reach > 0.96 * deep and left @ out < -0.01:
-            return keep + np.clip(4 * (left @ out), -0.3, 0) * out, -np.ones(2)
-        there = left @ out > -0.01
-    if low < 0.012 and there:
-        return np.zeros((2, 3)), np.ones(2)
+    if low < 0.012:
+        left = (aim.near - middle) @ out if aim is not None else 0.0
+        if aim is not None and left < -0.01 and reach > 0.96 * deep:
+            # the whole sheet is pulled backward to its place
+            return keep + np.clip(4 * left, -0.3, 0) * out, -np.ones(2)
+        arrived = reach > 0.96 * deep or -middle @ out > 1.3 * side if aim is None else left >= -0.01
+        if arrived:
+            return np.zeros((2, 3)), np.ones(2)
     # down behind the far edge, backward when it touches the floor; at the end slowly enough that cloth off the floor does not fold
     touching = far[2] < 0.03 or height < 0.5 * deep
     slack = float(np.clip(deep - 0.01 - AHEAD * height - reach, 0.0, NEARER)) if height < 0.5 * deep else 0.0

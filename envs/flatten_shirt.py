@@ -22,7 +22,7 @@ from clothgym.mesh import ClothMesh
 
 SHIRT = garment_named(CRUMPLED_SHIRTS.garment)
 CORNERS = ("waist_left", "waist_right", "sleeve_top_left", "sleeve_top_right")  # that grippers take
-BY_THE_SIDE = 8.0  # other particles at a corner for which a shirt is still not lifted by its side, whose sleeve hangs down
+BY_THE_SIDE = 8.0  # extra cost of lifting a shirt by its side, from which a sleeve hangs down, in other particles
 
 
 @apart
@@ -77,8 +77,8 @@ class FlattenShirtTask(FlattenTask):
         flat = np.ascontiguousarray(SHIRT.mesh.rest_positions.T)
         return garment_scores.flat_area(SHIRT), float(softgym_area(flat, SPACING))
 
-    def dear(self) -> NDArray[np.float64]:
-        costs = super().dear()
+    def edge_costs(self) -> NDArray[np.float64]:
+        costs = super().edge_costs()
         for one, other in EDGES[1::2]:
             costs[one, other] = costs[other, one] = BY_THE_SIDE
         return costs
@@ -121,7 +121,9 @@ class ClothFlattenShirtEnv(ClothEnv):
     $observations
 
     The corners are the left and right end of the hem, and of the sleeves' upper side.  The edges between them are the hem, the
-    sides, and the line from sleeve to sleeve.  ``next`` is chosen as in ``ClothFlatten-v0``, until the coverage is 0.905.
+    sides, and the line from sleeve to sleeve.  ``next`` is chosen as in ``ClothFlatten-v0``, except that a side is never the first
+    edge, and counts as eight more particles where a gripper that holds a corner chooses its neighbor.  It is 0 for a released shirt
+    from a coverage of 0.905.
 
     ## Rewards
     As in ``ClothFlatten-v0``.

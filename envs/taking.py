@@ -92,12 +92,12 @@ def take_corners(x, corners, neighbors, places, others):
 
 
 @inlined
-def _free_edge(x, corners, dear, tips, places, others, side, goals, count):
-    """Both ends of the nearest edge with free corners, if it is not dear; returns whether there is one."""
+def _free_edge(x, corners, edge_costs, tips, places, others, side, goals, count):
+    """Both ends of the nearest edge with free corners and no extra cost; returns whether there is one."""
     least, best, crossed = np.inf, -1, 0
     for e in range(EDGES.shape[0]):
         a, b = EDGES[e, 0], EDGES[e, 1]
-        if others[a] + others[b] > 0 or dear[a, b] > 0 or distance(x[:, corners[a]], x[:, corners[b]]) < TOO_CLOSE * side:
+        if others[a] + others[b] > 0 or edge_costs[a, b] > 0 or distance(x[:, corners[a]], x[:, corners[b]]) < TOO_CLOSE * side:
             continue
         straight = distance(tips[0], places[a]) + distance(tips[1], places[b])
         across = distance(tips[0], places[b]) + distance(tips[1], places[a])
@@ -114,15 +114,15 @@ def _free_edge(x, corners, dear, tips, places, others, side, goals, count):
 
 
 @apart
-def next_takes(x, corners, neighbors, dear, holder, tips, side, low, high, goals, count):
+def next_takes(x, corners, neighbors, edge_costs, holder, tips, side, low, high, goals, count):
     """Next grasp point of each gripper [m], (2, 3), and the number of other particles there, or -1 for no grasp point, (2,), out.
 
-    Both go to the nearest edge with free corners.  If there is none, one goes to the corner with the least other cloth.  While one
-    holds a corner, the other goes to a neighboring corner.
+    Both go to the nearest edge with free corners that costs nothing extra.  If there is none, one goes to the corner with the least
+    other cloth.  While one holds a corner, the other goes to a neighboring corner.
 
-    x: a sheet [m], (3, particles).  dear: cost of the edge between two corners, in other particles, (4, 4).  holder: gripper that
-    holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].  low, high: corners of the arena of the tips [m], (3,); a grasp
-    from beyond the arena counts as one with 1000 others.
+    x: a sheet [m], (3, particles).  edge_costs: extra cost of the edge between two corners, in other particles, (4, 4).  holder:
+    gripper that holds each particle, or -1.  tips: [m], (2, 3).  side: L [m].  low, high: corners of the arena of the tips [m],
+    (3,); a grasp from beyond the arena counts as one with 1000 others.
     """
     places, others = np.empty((CORNERS, 3)), np.empty(CORNERS, np.int64)
     take_corners(x, corners, neighbors, places, others)
@@ -151,10 +151,10 @@ def next_takes(x, corners, neighbors, dear, holder, tips, side, low, high, goals
         for i in range(CORNERS):
             if holder[corners[i]] >= 0 or i == CORNERS - 1 - own[1 - taker]:
                 continue
-            cost = others[i] + dear[i, own[1 - taker]] + WAY_TO_NEIGHBOR * distance(places[i], tips[taker]) / side
+            cost = others[i] + edge_costs[i, own[1 - taker]] + WAY_TO_NEIGHBOR * distance(places[i], tips[taker]) / side
             if cost < least:
                 least, which = cost, i
-    elif not _free_edge(x, corners, dear, tips, places, others, side, goals, count):
+    elif not _free_edge(x, corners, edge_costs, tips, places, others, side, goals, count):
         # the corner with the least cost, which decreases with height
         for i in range(CORNERS):
             ways = distance(tips[0], places[i]), distance(tips[1], places[i])
@@ -256,7 +256,9 @@ def observe_next(own, rules, sheet, seen, edges):
     if edges and not holding:
         next_edge(x, rules.corners, rules.corner_neighbors, rules.columns, tips, low, high, places, count)
     else:
-        next_takes(x, rules.corners, rules.corner_neighbors, rules.dear, sheet.holder, tips, rules.side, low, high, places, count)
+        next_takes(
+            x, rules.corners, rules.corner_neighbors, rules.edge_costs, sheet.holder, tips, rules.side, low, high, places, count
+        )
     _show_next(sheet, seen)
 
 
@@ -268,10 +270,12 @@ def _of(task: Any) -> tuple[Any, ...]:
 
 
 @kernel
-def _all_next_takes(x, corners, neighbors, dear, holder, tips, side, low, high, goals, count):
+def _all_next_takes(x, corners, neighbors, edge_costs, holder, tips, side, low, high, goals, count):
     """``next_takes`` of many sheets, (sheets, 3, particles)."""
     for sheet in range(x.shape[0]):
-        next_takes(x[sheet], corners, neighbors, dear, holder[sheet], tips[sheet], side, low, high, goals[sheet], count[sheet])
+        next_takes(
+            x[sheet], corners, neighbors, edge_costs, holder[sheet], tips[sheet], side, low, high, goals[sheet], count[sheet]
+        )
 
 
 def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
@@ -279,7 +283,9 @@ def next_takes_of(task: Any) -> tuple[NDArray, NDArray]:
     x, tips, corners, neighbors = _of(task)
     goals, count = np.zeros(tips.shape), np.empty(tips.shape[:2], np.int64)
     holder = np.ascontiguousarray(task.simulation.grippers.holder)
-    _all_next_takes(x, corners, neighbors, task.rules[0]["dear"], holder, tips, task.physics.side, *task.arena(), goals, count)
+    _all_next_takes(
+        x, corners, neighbors, task.rules[0]["edge_costs"], holder, tips, task.physics.side, *task.arena(), goals, count
+    )
     return goals, count
 
 

@@ -20,7 +20,7 @@ LASTING, ABOVE = (1.0, 13.0), (0.02, 1.25)
 STEP = 0.25  # of ``way``, in control steps
 BACK = 20.0  # speed toward the way, for each meter from it [1/s]
 RATE = 30.0  # control steps in a second
-BEHIND = 0.1  # distance of hands from their way at which its time stands still, in sides
+BEHIND = 0.1  # distance of hands from where they should be at which the time of their way stands still, in sides
 TAUT = 0.985  # share of the cloth's length between the grippers to which it is stretched
 
 
@@ -88,7 +88,7 @@ class Hands:
     def velocity(self, at: NDArray, side: float) -> NDArray | None:
         """Of hands that are there, along and above [m/s], (2,), or None as they let go; at: [m], (2,).
 
-        Time stands still while they are farther from the way than BEHIND, as on the way to its beginning.
+        Time stands still while they are farther than BEHIND from where they should be now, as before they reach the first place.
         """
         times, places = self.way
         self.begun = True

@@ -3,9 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_flatten_shirt import AREA, REST, TRIANGLES, evaluated, turned
+from test_flatten_shirt import REST, TRIANGLES, evaluated, turned
 
-from clothgym.envs.flatten_expert import _aim
+from clothgym.envs.flatten_expert import _aim, _turned
 from clothgym.envs.flatten_shirt import SHIRT
 
 ID = "clothgym:ClothCanonicalize-v0"
@@ -34,9 +34,9 @@ def test_a_shirt_in_the_canonical_pose_is_a_success():
 def test_the_coverage_is_that_of_the_outline_and_the_front_has_to_be_up(yaw, shift, over):
     x = turned(REST, yaw, over) + (*shift, 0)
     here, there = inside(x), inside(REST)
-    share, overlap = (here & there).sum() * CELL**2 / AREA, (here & there).sum() / (here | there).sum()
+    share, overlap = (here & there).sum() / there.sum(), (here & there).sum() / (here | there).sum()
     info = evaluated(x, env_id=ID)
-    assert info["coverage"] == pytest.approx(min(share, 1), abs=0.015) and info["overlap"] == pytest.approx(overlap, abs=0.02)
+    assert info["coverage"] == pytest.approx(share, abs=0.015) and info["overlap"] == pytest.approx(overlap, abs=0.02)
     assert info["is_success"] == (share > 0.8 and not over)
     assert info["face_up"] == pytest.approx(0 if over else 1, abs=0.02)
 
@@ -47,6 +47,7 @@ def test_the_expert_turns_an_edge_by_the_angle_that_is_left_to_where_it_should_l
     aim = _aim(task, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0]))
     points = {name: REST[particle] for name, particle in SHIRT.key_points.items()}
     assert aim.angle == pytest.approx(np.pi / 2)
+    assert _turned(np.array([0.0, 1.0, 0.0]), aim.angle) == pytest.approx([-1, 0, 0])
     assert aim.near == pytest.approx([0, points["sleeve_top_left"][1], 0], abs=1e-6)
     assert aim.far == pytest.approx([0, points["waist_left"][1], 0], abs=1e-6)
     square = gym.make("clothgym:ClothFlatten-v0").unwrapped.task

@@ -122,6 +122,13 @@ def test_nets_see_the_named_observations_and_zero_for_the_others(single):
     for name in ("time_left", "way"):
         shown[slices[name]] = True
     assert 0 < shown.sum() < 58 and np.array_equal((seen != 0).all(axis=0), shown) and not seen[:, ~shown].any()
+    # of a pictured run the critics, which see the state
+    pictured = {"physics": "fast", "obs_mode": "depth", "privileged": True, "image_size": 16}
+    config["hyperparameters"] = single.asdict(options(single, n_envs=2, sees=["way"]))
+    run = single.Run(config | {"env_kwargs": pictured}, None)
+    run.normalizer.see(drawn)
+    assert np.array_equal(np.flatnonzero(run.normalizer(drawn).numpy().any(axis=0)), np.arange(58)[slices["way"]])
+    config["env_kwargs"] = {}
     with pytest.raises(ValueError, match="sees: no observation wind"):
         single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["wind"]))}, None)
 

@@ -48,7 +48,7 @@ def test_where_there_is_no_free_place_the_least_is_taken():
     assert places_to_take(x[None], MESH)[1][0].tolist() == [0, 0, 3, 0]
 
 
-def taken_next(x, tips, holder=None, high=(9, 9, 9), dear=None):
+def taken_next(x, tips, holder=None, high=(9, 9, 9), edge_costs=None):
     """Where grippers take hold next, and of how many other particles."""
     holder = np.full(MESH.num_particles, -1) if holder is None else holder
     goals, count = np.full((2, 3), np.nan), np.empty(2, np.int64)
@@ -57,7 +57,7 @@ def taken_next(x, tips, holder=None, high=(9, 9, 9), dear=None):
         across,
         np.array(MESH.corners),
         corner_neighbors(MESH),
-        np.zeros((4, 4)) if dear is None else dear,
+        np.zeros((4, 4)) if edge_costs is None else edge_costs,
         holder,
         np.array(tips, float),
         0.6,
@@ -248,19 +248,19 @@ def test_the_far_edge_is_observed_while_an_edge_is_held():
     env.close()
 
 
-def test_a_dear_edge_is_taken_only_where_the_others_are_covered():
+def test_an_edge_that_costs_more_is_taken_only_where_the_others_are_covered():
     x, holder = lying_flat(), np.full(MESH.num_particles, -1)
-    dear = np.zeros((4, 4))
-    dear[0, 2] = dear[2, 0] = 2.0
+    edge_costs = np.zeros((4, 4))
+    edge_costs[0, 2] = edge_costs[2, 0] = 2.0
     # above the edge of the corners 0 and 2 both go to another one
-    goals, count = taken_next(x, [above(x, 0), above(x, 2)], dear=dear)
+    goals, count = taken_next(x, [above(x, 0), above(x, 2)], edge_costs=edge_costs)
     taken = {int(np.linalg.norm(goal - [above(x, i) for i in range(4)], axis=1).argmin()) for goal in goals}
     assert count == [0, 0] and taken in ({0, 1}, {2, 3})
     # who holds corner 0 takes corner 1 instead of the nearer corner 2, unless three particles lie there
     holder[0] = 1
     tips = [above(x, 2), x[0]]
-    goals, _ = taken_next(x, tips, holder, dear=dear)
+    goals, _ = taken_next(x, tips, holder, edge_costs=edge_costs)
     assert np.linalg.norm(goals[0] - above(x, 1)) < 1e-6
     x[[100, 120, 140]] = x[MESH.corners[1]] + (0.0, 0.0, 0.001)
-    goals, _ = taken_next(x, tips, holder, dear=dear)
+    goals, _ = taken_next(x, tips, holder, edge_costs=edge_costs)
     assert np.linalg.norm(goals[0] - above(x, 2)) < 1e-6

@@ -191,7 +191,7 @@ def best_rows(
 
 
 def best_of(env_id: str, results: list[Result], digests: dict[str, str], from_scratch: bool) -> str:
-    """The best learner of an environment, with its success and time.
+    """The best learner of an environment, with its success, that of its worst seed, and its time.
 
     from_scratch: of those that see no expert, or else of those that do.
     """
