@@ -38,7 +38,7 @@ def facing_up(x, triangles, share):
 
 
 @inlined
-def _evaluate(own, rules, sheet, info):
+def evaluate_shirt(own, rules, sheet, info):
     """Write what ``flatten`` measures, the distance of Cloth Funnels, and how far the front looks up; returns the improvement."""
     info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.x, rules.canonical, np.sqrt(rules.flat_area))
     info.face_up = facing_up(sheet.x, sheet.mesh.triangles, rules.front)
@@ -49,7 +49,7 @@ class FlattenShirtTask(FlattenTask):
     """The task of ``ClothFlattenShirt-v0``, see ``ClothFlattenShirtEnv``."""
 
     physics = FoldShirtTask.physics
-    kernels = FlattenTask.kernels._replace(evaluate=_evaluate)
+    kernels = FlattenTask.kernels._replace(evaluate=evaluate_shirt)
     acting_steps = 450
     throws = 3
     enough = 0.9
