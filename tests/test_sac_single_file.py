@@ -305,12 +305,12 @@ SHORT = {
 }
 
 
-def trained(single, monkeypatch, folder, *, stop_at=None, resume=False, env_kwargs='{"physics": "fast"}'):
+def trained(single, monkeypatch, folder, *, stop_at=None, resume=False, evaluations=2, env_kwargs='{"physics": "fast"}'):
     """A short run; stop_at: updates after which it is interrupted."""
     import learning
 
     monkeypatch.setattr(learning, "film", lambda *args, **kwargs: None)
-    kwargs = {"evaluations": 2, "eval_episodes": 2, "final_episodes": 4}
+    kwargs = {"evaluations": evaluations, "eval_episodes": 2, "final_episodes": 4}
     if resume:
         args = single.Args(resume=folder, **kwargs)
     else:
@@ -381,6 +381,32 @@ def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatc
     assert trained(single, monkeypatch, folder, resume=True) == 0
 
 
+@pytest.mark.parametrize(("keeps", "kept"), [("best", 1), ("last", 3)])
+def test_a_run_keeps_the_policy_of_its_best_evaluation(single, tmp_path, monkeypatch, keeps, kept):
+    import learning
+
+    # the last evaluation has the successes of the second, and less of its performance
+    scores = iter([(0.1, 0.2), (0.6, 0.5), (0.2, 0.9), (0.6, 0.4)])
+    seen, acted = np.full((1, 58), 0.1, np.float32), []
+
+    def note(record, acting, timesteps, episodes):
+        acted.append(acting(None, seen))
+        success, performance = next(scores)
+        line = dict.fromkeys(learning.SCORES, 0.0) | {"timesteps": timesteps}
+        record.lines.append(line | {"success_rate": success, "normalized_performance": performance})
+        return record.lines[-1]
+
+    monkeypatch.setattr(learning.Record, "note", note)
+    monkeypatch.setitem(SHORT, "keeps", keeps)
+    trained(single, monkeypatch, tmp_path, evaluations=4)
+    policy, config = policies.read(tmp_path / "policy.npz"), single.policies.read_config(tmp_path)
+    assert [np.array_equal(policy(seen), one) for one in acted] == [i == kept for i in range(4)]
+    assert policy.about["chosen_by"] == 0.6
+    # a checkpoint of the run that has ended acts like the file
+    run = single.Run(config, learning.load_last(tmp_path))
+    assert np.allclose(run.acts(None, seen), policy(seen), atol=2e-3)
+
+
 def test_a_curriculum_ends_with_the_arguments_of_the_run(single):
     config = {
         "env": "ClothReach-v0", "seed": 0, "threads": 1, "timesteps": 24, "env_kwargs": {"action_repeat": 2},
@@ -417,6 +443,7 @@ WRONG = {
     '--options {"net_arch":[64,true]}': "--options: net_arch [64, True]: must be a list of counts",
     '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
     '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
+    '--options {"keeps":"first"}': "--options: keeps 'first': must be last or best",
     '--options {"critics":1}': "--options: critics 1: must be from 2 to 100",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",

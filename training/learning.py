@@ -96,6 +96,12 @@ class Record:
         files.write(self.folder / PROGRESS, "".join(json.dumps(files.checked_in(one)) + "\n" for one in self.lines))
         return line
 
+    def kept(self) -> dict[str, Any]:
+        """The line of the policy that the run keeps: the last one, or the best one where its hyperparameters say so."""
+        if self.config["hyperparameters"].get("keeps") != "best":
+            return self.lines[-1]
+        return max(reversed(self.lines), key=lambda line: (line["success_rate"], line["normalized_performance"]))
+
 
 class Watch(Record, BaseCallback):
     """Between rollouts: a checkpoint each minute, and every so many steps a score on held-out seeds.
@@ -340,7 +346,7 @@ def account_of(record: Record) -> dict[str, Any]:
         "digest": digest_of(config["env"], config["env_kwargs"]),
         "timesteps": config["timesteps"],
         **times,
-        "chosen_by": record.lines[-1]["success_rate"],
+        "chosen_by": record.kept()["success_rate"],
         "machine": machine(),
     }
 

@@ -51,6 +51,7 @@ FOLLOWING = {"observation": "following", "picture": "following_picture"}  # name
 NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
+KEEPS = ("last", "best")
 MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sheets, and is not to learn from it to stand still
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
@@ -86,6 +87,7 @@ class Options:
     cost_limit: float | None = None  # the mean cost of an episode that is allowed
     multiplier_rate: float = 0.0005  # of the price of costs, for each unit of cost over the limit, in each step of the batch
     critics: int = 2  # of the reward to come; more than two (REDQ) where decisions are few and updates many
+    keeps: str = "last"  # of the policies that were evaluated on the way; "best" where scores differ much between evaluations
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
@@ -137,7 +139,7 @@ class Args:
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
         _of_their_types(chosen)
-        free = {"normalize", "sees"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        free = {"normalize", "sees", "keeps"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
@@ -155,6 +157,10 @@ def _of_their_types(chosen: dict[str, Any]) -> None:
         if name == "sees":
             if type(value) not in (list, tuple) or not all(isinstance(one, str) for one in value):
                 raise ValueError(f"--options: sees {value!r}: must be a list of names")
+            continue
+        if name == "keeps":
+            if value not in KEEPS:
+                raise ValueError(f"--options: keeps {value!r}: must be {' or '.join(KEEPS)}")
             continue
         default = Options.__dataclass_fields__[name].default
         kinds, wanted = {
@@ -391,6 +397,7 @@ class Run:
         last: each environment's last decision; settling: whether its sheet settles since then.
         collecting: seconds in which environments stepped.
         episodes: success, performance and cost of the last training episodes, which have noise.
+        kept: the policy that the run keeps, of those that were evaluated, and its normalization.
     """
 
     def __init__(self, config: dict[str, Any], state: dict[str, Any] | None) -> None:
@@ -416,6 +423,7 @@ class Run:
             advice = "choose a smaller one in --options, or a smaller image_size in --env-kwargs"
             raise ValueError(f"buffer_size={self.options.buffer_size}: {much}: {advice}")
         self.last = Replay(self.options.n_envs, numbers, actions, picture).rows
+        self.kept: dict[str, dict[str, Any]] = {}
         self.thread = ThreadPoolExecutor(1)
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
@@ -581,6 +589,19 @@ class Run:
         with torch.no_grad():
             return self.agent.act(self.seen(self.parts(observations)))[0].numpy()
 
+    def keep_policy(self) -> None:
+        """Keep a copy of the policy as it is, with its normalization."""
+        import torch
+
+        numbers = {name: torch.tensor(getattr(self.normalizer, name)) for name in ("mean", "variance")}
+        self.kept = {"policy": {name: part.clone() for name, part in self.agent.policy.state_dict().items()}, "normalizer": numbers}
+
+    def take_kept(self) -> None:
+        """Act as the policy that was kept, from now on."""
+        self.agent.policy.load_state_dict(self.kept["policy"])
+        for name, numbers in self.kept["normalizer"].items():
+            setattr(self.normalizer, name, numbers.numpy())
+
     def state(self, times: dict[str, float]) -> dict[str, Any]:
         """All that a run needs to go on, but for the episodes."""
         import torch
@@ -593,7 +614,7 @@ class Run:
             "policy": agent.policy.state_dict(),
             "optimizer": {name: one.state_dict() for name, one in agent.optimizers.items()}
             | {"of critics": agent.critics.state_dict(), "of targets": agent.targets.state_dict()},
-            "variables": parts, "constraint": {"multiplier": agent.multiplier},
+            "variables": parts, "kept": self.kept, "constraint": {"multiplier": agent.multiplier},
             "num_timesteps": self.done, "num_updates": self.updates, "times": times,
         }  # fmt: skip
 
@@ -613,6 +634,7 @@ class Run:
             agent.log_alpha.data, agent.multiplier = parts["log_alpha"], state["constraint"]["multiplier"]
             for name in ("mean", "variance"):
                 setattr(self.normalizer, name, parts[name].numpy())
+            self.kept = state["kept"]
             self.normalizer.count, self.replay.added = float(parts["count"]), int(parts["added"])
             for name, rows in self.replay.rows.items():
                 rows[: self.replay.filled] = parts[name].numpy()
@@ -652,9 +674,13 @@ def train(args: Args) -> None:
                 if evaluated:
                     line = record.note(acting(run, run.policy({})), run.done, args.eval_episodes)
                     tqdm.write(f"{run.done:,} steps: success {line['success_rate']:.3f}, {line['normalized_performance']:.3f}")
+                    if record.kept() is line:
+                        run.keep_policy()
                 save_tensors(folder / policies.CHECKPOINT, run.state(record.times()))
                 record.saved = time.perf_counter()
                 record.clock.start()
+    run.take_kept()
+    save_tensors(folder / policies.CHECKPOINT, run.state(record.times()))  # a policy of pictures is in the checkpoint alone
     policy = run.policy(learning.account_of(record))
     seeds = list(range(HELD_OUT, HELD_OUT + min(args.final_episodes, NOISY_EPISODES)))
     noisy = score(run_episodes(config["env"], run.noisy, seeds, **config["env_kwargs"]))
