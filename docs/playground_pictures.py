@@ -50,8 +50,8 @@ def main() -> None:
         shots.append(shot(tab))
         browser.close()
     playground.stop()
-    write(HERE / "playground.png", np.concatenate(shots, axis=0))
-    print(f"written to {HERE / 'playground.png'}")
+    write(HERE / "playground.webp", np.concatenate(shots, axis=0))
+    print(f"written to {HERE / 'playground.webp'}")
 
 
 def shot(tab: Any) -> Any:
