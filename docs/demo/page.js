@@ -177,10 +177,10 @@ class Page extends Picture {
     }
   }
 
-  // The panel covers the lower part, and on a phone the heading the upper one.
+  // The panel covers the lower part, and the heading the upper one, unless the window is so wide that it stands beside the sheet.
   free() {
     const below = 1 - $("#panel").getBoundingClientRect().top / innerHeight;
-    const above = innerWidth < 640 ? $("header > p").getBoundingClientRect().bottom / innerHeight : 0.02;
+    const above = innerWidth < 1000 ? $("header > p").getBoundingClientRect().bottom / innerHeight : 0.02;
     return [Math.min(below, 0.5), 1 - Math.min(above, 0.3)];
   }
 
