@@ -354,6 +354,30 @@ def test_a_run_leaves_its_story_and_the_same_bits_again(single, tmp_path, monkey
     assert one(env.reset(seed=0)[0]).shape == (4, 3)
 
 
+def test_references_are_taken_from_a_committed_run_on_the_same_environment(single, tmp_path, monkeypatch):
+    import learning
+
+    def committed(digest, episodes):
+        scores = {name: {"episodes": episodes, "success_rate": 0.5} for name in ("noop", "random")}
+        return {"env_kwargs": {"action_repeat": 4, "physics": "fast"}, "digest": digest, "references": scores}
+
+    monkeypatch.setattr(learning.results, "RUNS", tmp_path)
+    monkeypatch.setattr(learning, "digest_of", lambda env_id, env_kwargs: "now")
+    rows = {
+        "ClothReach-v0_old": committed("before", 4), "ClothFold-v0_0": committed("now", 4),
+        "ClothReach-v0_short": committed("now", 3),
+        "ClothReach-v0_other": committed("now", 4) | {"env_kwargs": {"action_repeat": 4}},
+    }  # fmt: skip
+    for name, row in rows.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "evaluation.json").write_text(json.dumps(row))
+    config = {"env": "ClothReach-v0", "env_kwargs": {"action_repeat": 4, "physics": "fast"}}
+    assert learning.known_references(config, 4) == {}
+    rows["ClothReach-v0_old"]["digest"] = "now"
+    (tmp_path / "ClothReach-v0_old" / "evaluation.json").write_text(json.dumps(rows["ClothReach-v0_old"]))
+    assert learning.known_references(config, 4) == rows["ClothReach-v0_old"]["references"]
+
+
 def test_an_interrupted_run_goes_on_with_its_buffer(single, tmp_path, monkeypatch):
     from clothgym.adapters.runs import load_last
 
