@@ -45,7 +45,7 @@ def clamp_displacements(x, v, w, sheet, scratch, block, h):
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch.halvings)
+                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, False)
                 # vertices that stayed in place have left the common motion, and so perhaps their limits
                 due = _any_beyond(x, memory.start[block], memory.limits[block], sheet.pairs.samples, l)
         # a query at the certified positions gives new bounds
@@ -205,7 +205,7 @@ def _query_again(x, v, w, sheet, scratch, block, l, h, outside):
             _clamp(x, v, memory, block, l, h, scratch.p, limits, held, zero, zero, zero)
             outside[:] = True
             active = memory.active[block, l, :constraints]
-            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch.halvings)
+            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch, True)
         note_lag(w, memory, block, l)
 
 
