@@ -1,5 +1,7 @@
 """Self-collision: nothing passes through itself, by a count that knows nothing of it."""
 
+from collections import namedtuple
+
 import numpy as np
 import pytest
 from exact_intersections import intersecting_pairs
@@ -8,6 +10,7 @@ from folded import SIDE, sheet, three_layers
 import clothgym
 from clothgym import contact_memory
 from clothgym.collisions.self.broad_phase import Reach, enclose, far_leaves
+from clothgym.collisions.self.gap_constraints import enforce_gaps
 from clothgym.collisions.self.impulses import FASTEST, _correct
 from clothgym.collisions.self.query import query
 from clothgym.collisions.self.query_scratch import LEAF_PAIRS, Found, scratch_for_queries
@@ -406,3 +409,50 @@ def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
     _correct(x, v, mobility, np.arange(4, dtype=np.int32)[None], coefficients, impulses, chosen, 1, h, real(0), real(0), h, 1)
     np.testing.assert_allclose(impulses[0], [0, 0, FASTEST / (2 * (1 + 3 / 9))], rtol=1e-6)
     np.testing.assert_allclose(v.sum(axis=1), [0, 0, -1000], rtol=1e-6)
+
+
+Kept = namedtuple("Kept", "old lag report members planes constraints behind")
+Scratch = namedtuple("Scratch", "halvings zone wish before_zone mean squares")
+
+
+def enforced(x, moves, w, limit=np.inf):
+    """Two vertices that a gap constraint keeps at their distance along z, and a third that no constraint names; what becomes
+    of their moves and of their velocities, which are as large, and the lag."""
+    real, n = np.float32, 3
+    old = np.array(x, real).T[:, :, None].copy()
+    now, v = old + np.array(moves, real).T[:, :, None], np.array(moves, real).T[:, :, None].copy()
+    members = np.zeros((1, 1, 1, G_SIZE), np.int32)
+    members[0, 0, 0, :5] = [1, 2, 0, 0, 1]
+    planes = np.array([[[[0, 0, 1, x[0][2] - x[1][2]]]]])
+    report, ones = np.zeros((1, 1, REPORT_SIZE)), np.ones((1, 1), np.int32)
+    memory = Kept(old[None], np.zeros((1, 3, n, 1), real), report, members, planes, ones, np.zeros((1, 1), real))
+    spare = np.empty((6, n), real)
+    scratch = Scratch(np.empty(n, np.int64), np.empty(n, np.int64), spare, spare.copy(), np.empty(6), np.full(n, limit**2, real))
+    outside, active = np.ones(n, np.bool_), np.zeros(1, np.int32)
+    enforce_gaps(now, v, np.array(w, real)[:, None], memory, 0, 0, outside, active, 1, scratch, True)
+    return (now - old)[..., 0].T, v[..., 0].T, memory.lag[0, ..., 0].T
+
+
+@pytest.mark.parametrize("height", [0.001, 1e-5])
+def test_what_a_jam_holds_keeps_its_momentum(height):
+    """A vertex of 1 kg comes down on one of 3 kg, which rises; both sink together, unless rounding may open their gap."""
+    x, moves = [(0, 0, 0.5 + height), (0, 0, 0.5), (0, 0, 0.6)], [(2e-4, 0, -8e-4), (0, 4e-4, 0), (0, 0, -3e-4)]
+    moved, v, lag = enforced(x, moves, [1, 1 / 3, 1])
+    together = np.array([0.5e-4, 3e-4, -2e-4]) if height > 1e-4 else np.zeros(3)
+    np.testing.assert_allclose(moved, [together, together, moves[2]], atol=1e-7)
+    np.testing.assert_allclose(v, [together, together, moves[2]], atol=1e-9)
+    assert not lag.any()
+
+
+def test_a_jam_moves_no_farther_than_its_limits_and_as_what_is_attached():
+    x, moves = [(0, 0, 0.501), (0, 0, 0.5), (0, 0, 0.6)], [(0, 0, -8e-4), (0, 0, 0), (0, 0, 0)]
+    moved, v, _ = enforced(x, moves, [1, 1, 1], limit=1e-4)
+    np.testing.assert_allclose(moved[:2, 2], -1e-4, atol=1e-7)
+    np.testing.assert_allclose(v[:2, 2], -1e-4, atol=1e-8)
+    # an attached vertex takes the other one along, and does not lag; two that do not move alike stay, and both lag
+    moved, v, lag = enforced(x, moves, [0, 1, 1])
+    np.testing.assert_allclose(moved[:2, 2], -8e-4, atol=1e-7)
+    assert v[1, 2] == np.float32(-8e-4) and not lag.any()
+    moved, v, lag = enforced(x, moves, [0, 0, 1])
+    assert not moved[:2].any()
+    np.testing.assert_allclose(lag, moves, atol=1e-7)
