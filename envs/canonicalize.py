@@ -47,8 +47,6 @@ class CanonicalizeTask(FlattenShirtTask):
     """The task of ``ClothCanonicalize-v0``, see ``ClothCanonicalizeEnv``."""
 
     kernels = FlattenShirtTask.kernels._replace(measure=_measure, evaluate=_evaluate)
-    acting_steps = 640
-    throws = 4
     enough = 0.8
     evaluation: ClassVar[Fields] = (*FlattenShirtTask.evaluation, ("overlap", float))
 

@@ -50,8 +50,8 @@ class FlattenShirtTask(FlattenTask):
 
     physics = FoldShirtTask.physics
     kernels = FlattenTask.kernels._replace(evaluate=evaluate_shirt)
-    acting_steps = 450
-    throws = 3
+    acting_steps = 640
+    throws = 4
     enough = 0.9
     entangles = True
     bank = CRUMPLED_SHIRTS
@@ -108,7 +108,7 @@ class ClothFlattenShirtEnv(ClothEnv):
     """Spread a crumpled T-shirt on the floor with two grippers and release it.
 
     ## Description
-    A T-shirt of two layers lies crumpled on the floor.  Two grippers can grasp it, including other layers.  After 450 steps they
+    A T-shirt of two layers lies crumpled on the floor.  Two grippers can grasp it, including other layers.  After 640 steps they
     open, and the shirt settles for 40 steps, in which actions are ignored; then it is evaluated.  Either side may be up.
 
     The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
