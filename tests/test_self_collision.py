@@ -411,48 +411,76 @@ def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
     np.testing.assert_allclose(v.sum(axis=1), [0, 0, -1000], rtol=1e-6)
 
 
-Kept = namedtuple("Kept", "old lag report members planes constraints behind")
-Scratch = namedtuple("Scratch", "halvings zone wish before_zone mean squares")
+Jam = namedtuple("Jam", "old lag report members planes constraints behind")
+Scratch = namedtuple("Scratch", "halvings zone wish before_zone zone_before mean squares")
+H = 0.5  # substep [s]
 
 
-def enforced(x, moves, w, limit=np.inf):
-    """Two vertices that a gap constraint keeps at their distance along z, and a third that no constraint names; what becomes
-    of their moves and of their velocities, which are as large, and the lag."""
-    real, n = np.float32, 3
+def enforced(x, moves, w, pairs=((0, 1, 1.0),), limit=np.inf):
+    """What becomes of the moves of vertices, of their velocities, which are moves / H, and of the lag, (vertices, 3) each.
+
+    pairs: the upper and the lower vertex of each gap constraint along z, and the share of their distance that it keeps.
+    """
+    real, n = np.float32, len(x)
     old = np.array(x, real).T[:, :, None].copy()
-    now, v = old + np.array(moves, real).T[:, :, None], np.array(moves, real).T[:, :, None].copy()
-    members = np.zeros((1, 1, 1, G_SIZE), np.int32)
-    members[0, 0, 0, :5] = [1, 2, 0, 0, 1]
-    planes = np.array([[[[0, 0, 1, x[0][2] - x[1][2]]]]])
-    report, ones = np.zeros((1, 1, REPORT_SIZE)), np.ones((1, 1), np.int32)
-    memory = Kept(old[None], np.zeros((1, 3, n, 1), real), report, members, planes, ones, np.zeros((1, 1), real))
-    spare = np.empty((6, n), real)
-    scratch = Scratch(np.empty(n, np.int64), np.empty(n, np.int64), spare, spare.copy(), np.empty(6), np.full(n, limit**2, real))
-    outside, active = np.ones(n, np.bool_), np.zeros(1, np.int32)
-    enforce_gaps(now, v, np.array(w, real)[:, None], memory, 0, 0, outside, active, 1, scratch, True)
+    now, v = old + np.array(moves, real).T[:, :, None], np.array(moves, real).T[:, :, None] / real(H)
+    members = np.zeros((1, 1, len(pairs), G_SIZE), np.int32)
+    members[0, 0, :, :5] = [[1, 2, 0, upper, lower] for upper, lower, _ in pairs]
+    heights = old[2, :, 0].astype(float)
+    planes = np.array([[[[0, 0, 1, share * (heights[upper] - heights[lower])] for upper, lower, share in pairs]]])
+    count = np.full((1, 1), len(pairs), np.int32)
+    memory = Jam(
+        old[None], np.zeros((1, 3, n, 1), real), np.zeros((1, 1, REPORT_SIZE)), members, planes, count, np.zeros((1, 1), real)
+    )
+    rows, whole = (np.empty((6, n), real) for _ in range(2)), (np.empty(n, np.int64) for _ in range(3))
+    scratch = Scratch(next(whole), next(whole), *rows, next(whole), np.empty(6), np.full(n, limit**2, real))
+    outside, active = np.ones(n, np.bool_), np.arange(len(pairs), dtype=np.int32)
+    enforce_gaps(now, v, np.array(w, real)[:, None], memory, 0, 0, outside, active, len(pairs), scratch, real(H), True)
     return (now - old)[..., 0].T, v[..., 0].T, memory.lag[0, ..., 0].T
 
 
 @pytest.mark.parametrize("height", [0.001, 1e-5])
 def test_what_a_jam_holds_keeps_its_momentum(height):
-    """A vertex of 1 kg comes down on one of 3 kg, which rises; both sink together, unless rounding may open their gap."""
+    """A vertex of 1 kg comes down on one of 3 kg, which rises; both sink together, unless rounding may close their gap."""
     x, moves = [(0, 0, 0.5 + height), (0, 0, 0.5), (0, 0, 0.6)], [(2e-4, 0, -8e-4), (0, 4e-4, 0), (0, 0, -3e-4)]
     moved, v, lag = enforced(x, moves, [1, 1 / 3, 1])
     together = np.array([0.5e-4, 3e-4, -2e-4]) if height > 1e-4 else np.zeros(3)
     np.testing.assert_allclose(moved, [together, together, moves[2]], atol=1e-7)
-    np.testing.assert_allclose(v, [together, together, moves[2]], atol=1e-9)
+    np.testing.assert_allclose(v * H, [together, together, moves[2]], atol=1e-8)
     assert not lag.any()
+
+
+def test_what_cannot_be_certified_stays_to_the_bit():
+    """A gap constraint that keeps more than there is, as of parts that almost touch: rounding could close their gap."""
+    moved, v, _ = enforced([(0, 0, 0.500001), (0, 0, 0.5)], [(2e-4, 0, -8e-4), (0, 4e-4, 0)], [1, 1], pairs=[(0, 1, np.inf)])
+    assert not moved.any() and not v.any()
+
+
+def test_a_jam_takes_along_what_it_runs_into():
+    """A jam of 2 kg comes down on a vertex of 1 kg at rest: all three sink by the third part of the sum of their moves."""
+    x, moves = [(0, 0, 0.502), (0, 0, 0.501), (0, 0, 0.5)], [(0, 0, -1.2e-3), (0, 0, 0), (0, 0, 0)]
+    moved, v, _ = enforced(x, moves, [1, 1, 1], pairs=[(0, 1, 1.0), (1, 2, 0.9)])
+    np.testing.assert_allclose(moved[:, 2], -4e-4, atol=1e-7)
+    np.testing.assert_allclose(v[:, 2] * H, -4e-4, atol=1e-8)
+    # attached, it stays, and so does all else; the jam of two others, which it took in, moves by itself
+    x, moves = [*x, (0, 0, 0.4995), (0, 0, 0.499)], [*moves, (0, 0, -2e-4), (0, 0, 0)]
+    moved, _, lag = enforced(x, moves, [0, 0, 0, 1, 1], pairs=[(0, 1, 1.0), (1, 2, 0.9), (3, 4, 1.0)])
+    np.testing.assert_allclose(moved[:, 2], [0, 0, 0, -1e-4, -1e-4], atol=1e-7)
+    np.testing.assert_allclose(lag[:, 2], [-1.2e-3, 0, 0, 0, 0], atol=1e-7)
 
 
 def test_a_jam_moves_no_farther_than_its_limits_and_as_what_is_attached():
     x, moves = [(0, 0, 0.501), (0, 0, 0.5), (0, 0, 0.6)], [(0, 0, -8e-4), (0, 0, 0), (0, 0, 0)]
     moved, v, _ = enforced(x, moves, [1, 1, 1], limit=1e-4)
     np.testing.assert_allclose(moved[:2, 2], -1e-4, atol=1e-7)
-    np.testing.assert_allclose(v[:2, 2], -1e-4, atol=1e-8)
-    # an attached vertex takes the other one along, and does not lag; two that do not move alike stay, and both lag
-    moved, v, lag = enforced(x, moves, [0, 1, 1])
-    np.testing.assert_allclose(moved[:2, 2], -8e-4, atol=1e-7)
-    assert v[1, 2] == np.float32(-8e-4) and not lag.any()
-    moved, v, lag = enforced(x, moves, [0, 0, 1])
+    np.testing.assert_allclose(v[:2, 2] * H, -1e-4, atol=1e-8)
+    # an attached vertex takes the other one along, as far as it gets, and does not lag
+    for limit, way in ((np.inf, -8e-4), (1e-4, -1e-4)):
+        moved, v, lag = enforced(x, moves, [0, 1, 1], limit=limit)
+        np.testing.assert_allclose(moved[:2, 2], way, atol=1e-7)
+        assert v[1, 2] * H == pytest.approx(way, abs=1e-7)
+        np.testing.assert_allclose(lag[0], (0, 0, -8e-4 - way), atol=1e-7)
+    # two that do not move alike stay, and lag
+    moved, _, lag = enforced(x, moves, [0, 0, 1])
     assert not moved[:2].any()
     np.testing.assert_allclose(lag, moves, atol=1e-7)

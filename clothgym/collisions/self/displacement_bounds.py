@@ -1,7 +1,8 @@
 """Displacement bounds of self-collision: vertices that leave their bounds are checked, and in strict mode clamped.
 
 Everything happens between two certified states, the positions at the end of two substeps.  A move that is cut short ends on the
-straight line from the first state to the second; the first lies within every bound.
+straight line from the first state to the second; the first lies within every bound.  A zone of vertices that may not move by
+themselves moves as a whole, and what that may violate is tested.
 
 A vertex is *outside* if it has moved farther than its bound since the last query.  Then its gap constraints are evaluated (see
 ``gap_constraints``), or a query gives new bounds.
@@ -45,8 +46,8 @@ def clamp_displacements(x, v, w, sheet, scratch, block, h):
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, False)
-                # vertices that stayed in place have left the common motion, and so perhaps their limits
+                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h, False)
+                # vertices that stayed in place or moved as a zone have left the common motion, and so perhaps their limits
                 due = _any_beyond(x, memory.start[block], memory.limits[block], sheet.pairs.samples, l)
         # a query at the certified positions gives new bounds
         if due:
@@ -205,7 +206,7 @@ def _query_again(x, v, w, sheet, scratch, block, l, h, outside):
             _clamp(x, v, memory, block, l, h, scratch.p, limits, held, zero, zero, zero)
             outside[:] = True
             active = memory.active[block, l, :constraints]
-            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch, True)
+            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch, h, True)
         note_lag(w, memory, block, l)
 
 

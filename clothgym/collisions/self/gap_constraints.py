@@ -1,7 +1,8 @@
 """Gap constraints of self-collision: pairs that are kept apart along a fixed direction, and certified so between queries.
 
 A gap constraint (see ``narrow_phase``) is *active* if one of its vertices is outside its displacement bound, and *violated* if its
-gap along its normal is smaller than the distance that it keeps.
+gap along its normal is smaller than the distance that it keeps.  A *zone* is what would stay in place because of violated gap
+constraints, and moves as a whole.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from clothgym.contact_memory import G_GROUP, G_KEPT, G_NUMBER, G_OWN, G_VERTICES
 
 PATIENCE = 4  # evaluations of all gap constraints after which a query, which gives the vertices new bounds, is cheaper
 HALVINGS = 4  # times that the moves of a gap constraint's vertices are halved before they stay in place
-GROWTHS = 8  # times that a zone takes in what it would violate a gap constraint with, at most
-LEAST_MOVED = 3e-5  # distance that the gap constraints in a zone keep at least, if it moves: more than rounding can take [m]
+GROWTHS = 8  # a zone that has taken in this many times what it would violate a gap constraint with stays in place
+LEAST_MOVED = 3e-5  # least gap in a zone, at the last certified positions, with which it moves: more than rounding can take [m]
 ALIKE = 1e-6  # largest difference of the displacements of attached vertices in a zone that moves as they do [m]
 INACTIVE_COST = 8  # inactive gap constraints that cost as much to skip as one active one to evaluate
 
@@ -46,8 +47,8 @@ def list_active(members, outside, active):
 
 
 @kernel
-def is_violated(x, members, planes, t, l):
-    """Whether gap constraint t of lane l is violated: min n . x_first - max n . x_second < the distance that it keeps."""
+def gap_of(x, members, planes, t, l):
+    """Gap of constraint t of lane l along its normal [m]: min n . x_first - max n . x_second."""
     own = members[t, G_OWN]
     nx, ny, nz = planes[t, 0], planes[t, 1], planes[t, 2]
     nearest, farthest = np.inf, -np.inf
@@ -58,8 +59,14 @@ def is_violated(x, members, planes, t, l):
             nearest = min(nearest, place)
         else:
             farthest = max(farthest, place)
+    return nearest - farthest
+
+
+@kernel
+def is_violated(x, members, planes, t, l):
+    """Whether gap constraint t of lane l is violated: its gap is less than the distance that it keeps."""
     # false for NaN: a diverged lane is left alone
-    return nearest - farthest < planes[t, G_KEPT]
+    return gap_of(x, members, planes, t, l) < planes[t, G_KEPT]
 
 
 @uncounted
@@ -81,14 +88,14 @@ def evaluate_constraints(x, memory, block, l, active):
 
 
 @uncounted
-def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, bounded):
+def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h, bounded):
     """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
     positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.  What stays in place then moves as a
     whole, where it can, see ``_move_zones``.
 
     active: room for all gap constraints, (constraints,); the first ``number`` entries are the active ones.  outside: which vertices
-    are outside their bounds; becomes which have been moved, too, (particles,).  scratch: a ``query_scratch.QueryScratch``.
-    bounded: whether vertices must stay within their limits, ``scratch.squares``; the caller looks otherwise.
+    are outside their bounds; becomes which have been moved, too, (particles,).  scratch: a ``query_scratch.QueryScratch``.  h: the
+    substep [s].  bounded: whether zones stay within their vertices' limits, ``scratch.squares``; otherwise the caller tests them.
     """
     halvings, wish = scratch.halvings, scratch.wish
     old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
@@ -142,26 +149,41 @@ def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, bo
                     x[k, p, l] = goal
         if spread:
             number = list_active(members, outside, active)
-    _move_zones(x, v, w, memory, block, l, outside, scratch, bounded)
+    _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded)
     note_lag(w, memory, block, l)
 
 
 @uncounted
-def _move_zones(x, v, w, memory, block, l, outside, scratch, bounded):
-    """Move what would stay in place: each zone, vertices that gap constraints join, by one displacement, which keeps its gaps.
+def _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded):
+    """Move what would stay in place: each zone, vertices that gap constraints join, by one displacement, which keeps its gaps:
 
-    It is the mean of their displacements, and so is their velocity, weighted with their masses: a zone keeps its momentum (impact
-    zones: Provot, "Collision and self-collision handling in cloth model dedicated to design garments", 1997; here without their
-    rotation).  If it stayed in place, the cloth around it would hang from it as from a nail.
+        d = sum_p m_p d_p / sum_p m_p,   u = sum_p m_p u_p / sum_p m_p,
+
+    the means of the displacements d_p and velocities u_p that its vertices would have, weighted with their masses m_p, so a zone
+    keeps its momentum (impact zones: Provot, "Collision and self-collision handling in cloth model dedicated to design garments",
+    1997; here without their rotation).  If it stayed in place, the cloth around it would hang from it as from a nail.
     """
-    members, constraints, zone = memory.members[block, l], memory.constraints[block, l], scratch.zone
+    members, constraints, zone, old, wish = (
+        memory.members[block, l],
+        memory.constraints[block, l],
+        scratch.zone,
+        memory.old[block],
+        scratch.wish,
+    )
     # the vertices that would stay in place, each with the number of its zone; at first, each is one
     some = False
     for p in range(zone.shape[0]):
         zone[p] = p if scratch.halvings[p] > HALVINGS else -1
         some |= zone[p] >= 0
-    # join the zones of each gap constraint
-    spread = some
+    if not some:
+        return
+    # what the others do, before any zone moves
+    for p in range(zone.shape[0]):
+        if scratch.halvings[p] == 0:
+            for k in range(3):
+                wish[k, p], wish[3 + k, p] = x[k, p, l] - old[k, p, l], v[k, p, l]
+    # join the zones of each gap constraint: they take the least number among them, until no constraint joins two
+    spread = True
     while spread:
         spread = False
         for t in range(constraints):
@@ -174,29 +196,29 @@ def _move_zones(x, v, w, memory, block, l, outside, scratch, bounded):
                 if zone[p] > least:
                     zone[p] = least
                     spread = True
-    if some:
-        for root in range(zone.shape[0]):
-            if zone[root] == root:
-                _move_zone(root, x, v, w, memory, block, l, outside, scratch, bounded)
+    # one after the other: each begins and ends without a violated constraint
+    for root in range(zone.shape[0]):
+        if zone[root] == root:
+            _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded)
 
 
 @uncounted
-def _move_zone(root, x, v, w, memory, block, l, outside, scratch, bounded):
-    """Move one zone.  It takes in what it would violate a gap constraint with, and all of it is left where it was if that does not
+def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
+    """Move one zone.  It takes in what it would violate a gap constraint with.  All of it is left where it was if that does not
     end, if its attached vertices do not move alike, or if a gap in it is so small that rounding counts."""
-    old, lag, zone, wish, before = memory.old[block], memory.lag[block], scratch.zone, scratch.wish, scratch.before_zone
+    lag, zone, before, zone_before = memory.lag[block], scratch.zone, scratch.before_zone, scratch.zone_before
     for p in range(zone.shape[0]):
+        zone_before[p] = zone[p]
         for k in range(3):
             before[k, p], before[3 + k, p] = x[k, p, l], v[k, p, l]
-            if scratch.halvings[p] == 0:
-                wish[k, p], wish[3 + k, p] = x[k, p, l] - old[k, p, l], v[k, p, l]
-    moves, grows = True, True
-    growths = 0
+    # place it, until it runs into nothing
+    moves, grows, growths = True, True, 0
     while moves and grows:
-        moves = _place_zone(root, x, v, w, old, l, outside, scratch, bounded)
-        apart, grows = _take_in(root, x, memory, block, l, zone)
-        growths += 1
-        moves &= apart and (not grows or growths < GROWTHS)
+        moves = _place_zone(root, x, v, w, memory.old[block], l, outside, scratch, h, bounded)
+        if moves:
+            apart, grows = _take_in(root, x, memory, block, l, zone)
+            growths += 1
+            moves = apart and (not grows or growths < GROWTHS)
     for p in range(zone.shape[0]):
         if zone[p] == root:
             for k in range(3):
@@ -204,12 +226,15 @@ def _move_zone(root, x, v, w, memory, block, l, outside, scratch, bounded):
                     x[k, p, l], v[k, p, l] = before[k, p], before[3 + k, p]
                 elif w[p, l] <= 0:
                     lag[k, p, l] -= x[k, p, l] - before[k, p]
+        # what it had taken in is free to move
+        if not moves:
+            zone[p] = zone_before[p]
 
 
 @uncounted
-def _place_zone(root, x, v, w, old, l, outside, scratch, bounded):
-    """Place a zone: x <- old + d, v <- u, with the means d and u of the displacements and velocities that its vertices would have,
-    weighted with their masses, or those of an attached vertex, if it has one.  Returns whether its attached vertices move alike."""
+def _place_zone(root, x, v, w, old, l, outside, scratch, h, bounded):
+    """Place a zone: x <- old + d, v <- u, with the means of ``_move_zones``, or with the displacement of an attached vertex, if it
+    has one, and u = d / h.  Returns whether it may move: its attached vertices move alike, and all numbers are finite."""
     zone, wish, mean = scratch.zone, scratch.wish, scratch.mean
     held, alike, total, limit = -1, True, 0.0, np.inf
     mean[:] = 0.0
@@ -224,14 +249,17 @@ def _place_zone(root, x, v, w, old, l, outside, scratch, bounded):
                 held = p if held < 0 else held
                 for k in range(3):
                     alike &= abs(wish[k, p] - wish[k, held]) <= ALIKE
-    for k in range(6):
+    for k in range(3):
         mean[k] = mean[k] / total if held < 0 else wish[k, held]
+        mean[3 + k] = mean[3 + k] / total if held < 0 else wish[k, held] / h
     # no farther than the least limit
     square = mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2]
     if bounded and square > limit:
         share = np.sqrt(limit / square)
         for k in range(6):
             mean[k] *= share
+    if not (alike and square < np.inf):
+        return False
     for p in range(zone.shape[0]):
         if zone[p] == root:
             outside[p] = True
@@ -239,20 +267,22 @@ def _place_zone(root, x, v, w, old, l, outside, scratch, bounded):
                 x[k, p, l] = old[k, p, l] + x.dtype.type(mean[k])
                 if w[p, l] > 0:
                     v[k, p, l] = mean[3 + k]
-    return alike
+    return True
 
 
 @uncounted
 def _take_in(root, x, memory, block, l, zone):
-    """Take into a zone what it violates a gap constraint with.  Returns whether it may move, and whether it has grown."""
-    members, planes = memory.members[block, l], memory.planes[block, l]
-    moves, grows = True, False
+    """Take into a zone what it violates a gap constraint with.  Returns whether the gaps in it are large enough to move it, and
+    whether it has grown."""
+    members, planes, old = memory.members[block, l], memory.planes[block, l], memory.old[block]
+    apart, grows = True, False
     for t in range(memory.constraints[block, l]):
         number, own = members[t, G_NUMBER], 0
         for m in range(number):
             own += zone[members[t, G_VERTICES + m]] == root
+        # one displacement keeps a gap but for rounding
         if own == number:
-            moves &= planes[t, G_KEPT] >= LEAST_MOVED
+            apart &= gap_of(old, members, planes, t, l) >= LEAST_MOVED
         elif own > 0 and is_violated(x, members, planes, t, l):
             grows = True
             for m in range(number):
@@ -264,7 +294,7 @@ def _take_in(root, x, memory, block, l, zone):
                     for q in range(zone.shape[0]):
                         if zone[q] == other:
                             zone[q] = root
-    return moves, grows
+    return apart, grows
 
 
 @uncounted
