@@ -97,17 +97,14 @@ def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h,
     are outside their bounds; becomes which have been moved, too, (particles,).  scratch: a ``query_scratch.QueryScratch``.  h: the
     substep [s].  bounded: whether zones stay within their vertices' limits, ``scratch.squares``; otherwise the caller tests them.
     """
-    halvings, wish = scratch.halvings, scratch.wish
-    old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
     members, planes, constraints = memory.members[block, l], memory.planes[block, l], active.shape[0]
-    zero, half = x.dtype.type(0), x.dtype.type(0.5)
     # mark the violated constraints as jammed
     again = False
     for c in range(number):
         if is_violated(x, members, planes, active[c], l):
             members[active[c], G_GROUP] = GROUP_JAMMED
             again = True
-    halvings[:] = 0
+    scratch.halvings[:] = 0
     while again:
         # rounds over the active constraints, in their order; when a move activates others, the round goes on over all of them
         again, spread, c, t = False, False, 0, -1
@@ -124,33 +121,45 @@ def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h,
                 c += 1
             if not is_violated(x, members, planes, t, l):
                 continue
-            # halve the moves of its vertices, those of attached particles into their lag
-            for m in range(members[t, G_NUMBER]):
-                p = members[t, G_VERTICES + m]
-                if halvings[p] > HALVINGS:
-                    continue
-                if halvings[p] == 0:
-                    report[REPORT_CLAMPED] += 1
-                    for k in range(3):
-                        wish[k, p], wish[3 + k, p] = x[k, p, l] - old[k, p, l], v[k, p, l]
-                halvings[p] += 1
-                again = True
-                spread |= not outside[p]
-                outside[p] = True
-                share = half if halvings[p] <= HALVINGS else zero
-                for k in range(3):
-                    goal = old[k, p, l]
-                    if share > zero:  # zero times a move that is not finite is not zero
-                        goal += share * (x[k, p, l] - goal)
-                    if w[p, l] <= zero:
-                        lag[k, p, l] += x[k, p, l] - goal
-                    else:
-                        v[k, p, l] *= share
-                    x[k, p, l] = goal
+            halved, others = _halve_moves(t, x, v, w, memory, block, l, outside, scratch)
+            again |= halved
+            spread |= others
         if spread:
             number = list_active(members, outside, active)
     _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded)
     note_lag(w, memory, block, l)
+
+
+@uncounted
+def _halve_moves(t, x, v, w, memory, block, l, outside, scratch):
+    """Halve the moves of the vertices of gap constraint t, those of attached particles into their lag, or leave them in place.
+    Returns whether there are moves, and whether one is of a vertex that was inside its bound."""
+    halvings, wish, members = scratch.halvings, scratch.wish, memory.members[block, l]
+    old, lag, report = memory.old[block], memory.lag[block], memory.report[block, l]
+    zero, half, moved, spread = x.dtype.type(0), x.dtype.type(0.5), False, False
+    for m in range(members[t, G_NUMBER]):
+        p = members[t, G_VERTICES + m]
+        if halvings[p] > HALVINGS:
+            continue
+        if halvings[p] == 0:
+            report[REPORT_CLAMPED] += 1
+            for k in range(3):
+                wish[k, p], wish[3 + k, p] = x[k, p, l] - old[k, p, l], v[k, p, l]
+        halvings[p] += 1
+        moved = True
+        spread |= not outside[p]
+        outside[p] = True
+        share = half if halvings[p] <= HALVINGS else zero
+        for k in range(3):
+            goal = old[k, p, l]
+            if share > zero:  # zero times a move that is not finite is not zero
+                goal += share * (x[k, p, l] - goal)
+            if w[p, l] <= zero:
+                lag[k, p, l] += x[k, p, l] - goal
+            else:
+                v[k, p, l] *= share
+            x[k, p, l] = goal
+    return moved, spread
 
 
 @uncounted
