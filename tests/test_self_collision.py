@@ -225,6 +225,27 @@ def test_a_jam_does_not_carry_attachments_away():
     assert not wring.simulation.intersections().any()
 
 
+def test_a_jam_has_the_same_bits_alone_and_from_a_restored_state():
+    def wrung(seeds):
+        option = {"mode": "strict", "thickness": 0.012}
+        wring = MANEUVERS["impossible wring"](sheet(9), seeds=seeds, thickness=0.012, time_step=1 / 60, self_collision=option)
+        for _ in range(80):
+            wring.step()
+        return wring.simulation
+
+    both, alone = wrung([1, 2]), wrung([2])
+    np.testing.assert_array_equal(both.positions[1], alone.positions[0])
+    state, clamped = both.get_state(), 0
+    both.step(10)
+    ended = both.positions
+    both.set_state(state)
+    for _ in range(10):
+        both.step()
+        clamped += both.self_contacts.clamped.min()
+    np.testing.assert_array_equal(both.positions, ended)
+    assert clamped > 100
+
+
 def test_anchors_that_stand_still_again_are_caught_up_with():
     """A sheet that is swung so hard that its corners are thrown together: no pair freezes that has room to come apart."""
     mesh = clothgym.grid(13, 13, 0.5, 0.5)
