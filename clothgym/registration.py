@@ -94,7 +94,7 @@ ENVIRONMENTS = {
 # length of the longest episode of each id, in steps
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
-    "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 490, "ClothCanonicalize-v0": 680, "ClothFold-v0": 210,
+    "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 680, "ClothCanonicalize-v0": 680, "ClothFold-v0": 210,
     "ClothFold-Hard-v0": 280,
     "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
     "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
