@@ -172,13 +172,8 @@ def _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded):
     keeps its momentum (impact zones: Provot, "Collision and self-collision handling in cloth model dedicated to design garments",
     1997; here without their rotation).  If it stayed in place, the cloth around it would hang from it as from a nail.
     """
-    members, constraints, zone, old, wish = (
-        memory.members[block, l],
-        memory.constraints[block, l],
-        scratch.zone,
-        memory.old[block],
-        scratch.wish,
-    )
+    members, constraints, old = memory.members[block, l], memory.constraints[block, l], memory.old[block]
+    zone, wish = scratch.zone, scratch.wish
     # the vertices that would stay in place, each with the number of its zone; at first, each is one
     some = False
     for p in range(zone.shape[0]):
@@ -216,6 +211,7 @@ def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
     """Move one zone.  It takes in what it would violate a gap constraint with.  All of it is left where it was if that does not
     end, if its attached vertices do not move alike, or if a gap in it is so small that rounding counts."""
     lag, zone, before, zone_before = memory.lag[block], scratch.zone, scratch.before_zone, scratch.zone_before
+    # what to return to
     for p in range(zone.shape[0]):
         zone_before[p] = zone[p]
         for k in range(3):
@@ -228,6 +224,7 @@ def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
             apart, grows = _take_in(root, x, memory, block, l, zone)
             growths += 1
             moves = apart and (not grows or growths < GROWTHS)
+    # attached vertices lag less by the way that they have gone; or all is as before
     for p in range(zone.shape[0]):
         if zone[p] == root:
             for k in range(3):
@@ -247,6 +244,7 @@ def _place_zone(root, x, v, w, old, l, outside, scratch, h, bounded):
     zone, wish, mean = scratch.zone, scratch.wish, scratch.mean
     held, alike, total, limit = -1, True, 0.0, np.inf
     mean[:] = 0.0
+    # the sums over free vertices, the least limit, and the first attached vertex
     for p in range(zone.shape[0]):
         if zone[p] == root:
             limit = min(limit, scratch.squares[p])
