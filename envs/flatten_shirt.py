@@ -60,8 +60,7 @@ class FlattenShirtTask(FlattenTask):
         *FlattenTask.evaluation, ("face_up", float), ("peer_funnels", float), ("peer_funnels_shape", float),
     )  # fmt: skip
 
-    @classmethod
-    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+    def observed_particles(self, mesh: ClothMesh) -> NDArray:
         """The garment's key points."""
         return np.array(list(SHIRT.key_points.values()))
 

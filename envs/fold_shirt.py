@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any, ClassVar
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined
-from clothgym.checks import one_of
+from clothgym.checks import one_of, shown
 from clothgym.envs.episode import Fields
 from clothgym.envs.fold import FoldingTask, evaluate_fold
 from clothgym.envs.gripper_task import PHYSICS
@@ -26,9 +27,9 @@ TAKEN = {"tshirt": ("sleeve_top", "waist"), "shorts": ("waist", "pipe_outer"), "
 
 
 @cache
-def garment_named(name: str) -> Garment:
-    """The garment of that name in ``SIZES``."""
-    return make(name, SPACING, sizes=SIZES[name])
+def garment_named(name: str, sizes: tuple[tuple[str, float], ...] = ()) -> Garment:
+    """The garment of that name in ``SIZES``; sizes: others than those, as pairs of a name and a value."""
+    return make(name, SPACING, sizes=SIZES[name] | dict(sizes))
 
 
 # --- the ideal folds, and the measures of others ------------------------------------------------------------------------------
@@ -96,10 +97,12 @@ class FoldShirtTask(FoldingTask):
 
     Args:
         garment: one of ``SIZES``.
+        sizes: of the garment, others than those in ``SIZES``, as ``clothgym.garments`` takes them.
     """
 
+    garment = garment_named("tshirt")
     physics = replace(
-        PHYSICS, mesh=garment_named("tshirt").mesh, material=chosen_fabric("polyester", MEDIAN), substeps="auto",
+        PHYSICS, mesh=garment.mesh, material=chosen_fabric("polyester", MEDIAN), substeps="auto",
         fast={"air_density": 0.0},
     )  # fmt: skip
     kernels = FoldingTask.kernels._replace(evaluate=_evaluate)
@@ -110,21 +113,26 @@ class FoldShirtTask(FoldingTask):
     expert_low = (0.03,)
     key_points = "key points of the garment, of ``clothgym.garments``"
     evaluation: ClassVar[Fields] = (*FoldingTask.evaluation, ("vertex_distance", float), ("peer_foldnet", float))
-    arguments: ClassVar = {**FoldingTask.arguments, "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``'}
+    arguments: ClassVar = {
+        **FoldingTask.arguments,
+        "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``',
+        "sizes": 'of the garment, by name, as ``clothgym.garments`` takes them: ``{"length": 0.7}``',
+    }
 
-    def __init__(self, num_envs: int, garment: str = "tshirt", **kwargs: Any) -> None:
+    def __init__(self, num_envs: int, garment: str = "tshirt", sizes: Mapping[str, float] | None = None, **kwargs: Any) -> None:
         one_of("garment", garment, *SIZES)
-        self.garment = garment_named(garment)
+        if sizes is not None and not isinstance(sizes, Mapping):
+            raise ValueError(f"sizes={shown(sizes)}: must be a dict, for instance {{'length': 0.7}}")
+        self.garment = garment_named(garment, tuple(sorted((sizes or {}).items())))
         self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
         points = self.garment.key_points
         self.stages = [[(points[f"{name}_left"], points[f"{name}_right"]) for name in TAKEN[garment]]]
         self.below = [taken for taken, _ in self.stages[0]]
         super().__init__(num_envs, **kwargs)
 
-    @classmethod
-    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+    def observed_particles(self, mesh: ClothMesh) -> NDArray:
         """The garment's key points."""
-        return np.array(next(list(one.key_points.values()) for one in map(garment_named, SIZES) if one.mesh is mesh))
+        return np.array(list(self.garment.key_points.values()))
 
     def ideals(self, points: NDArray) -> NDArray[np.float64]:
         return folded(self.garment)[..., :2]
@@ -145,7 +153,8 @@ class ClothFoldShirtEnv(ClothEnv):
     the grippers take by the left ends of waist and leg.
 
     The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
-    sides, and open at neck, hem and cuffs.  All environments have the same sizes; ``randomize`` draws fabrics.
+    sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a vector have the same sizes;
+    ``randomize`` draws fabrics.
 
     $physics
 

@@ -301,9 +301,8 @@ class HookingTask(HangingTask):
         own |= {"arm_out": ARM * side * float(np.cos(RISE)), "arm_up": ARM * side * float(np.sin(RISE))}
         return super().constants() | own
 
-    @classmethod
-    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
-        return cls.sheet_cut.key
+    def observed_particles(self, mesh: ClothMesh) -> NDArray:
+        return self.sheet_cut.key
 
     def tip_of(self, root: NDArray, turn: NDArray) -> NDArray:
         """End of the arm with this root and turn [m]."""

@@ -186,7 +186,7 @@ def _whole(page: str) -> str:
 def observations_of(task_class: type[Task]) -> list[str]:
     """The lines of the table of observations, under a sentence on their number."""
     mesh = task_class.physics.mesh
-    points = len(task_class.observed_particles(mesh))
+    points = len(_unmade(task_class).observed_particles(mesh))
     declared = [*points_observed(task_class, "keypoints", points), *task_class.observations]
     ends = np.cumsum([int(np.prod(one.shape)) for one in declared]).tolist()
     rows = [

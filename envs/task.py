@@ -389,8 +389,7 @@ class Task:
 
     # --- what a task defines: picture ---------------------------------------------------------------------------------
 
-    @classmethod
-    def observed_particles(cls, mesh: ClothMesh) -> NDArray:
+    def observed_particles(self, mesh: ClothMesh) -> NDArray:
         """The particles that are observed with ``obs_mode="keypoints"``."""
         return key_particles(mesh)
 

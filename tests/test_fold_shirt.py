@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from clothgym.envs import garment_scores
-from clothgym.envs.fold_shirt import SIZES, compared, folded, garment_named
+from clothgym.envs.fold_shirt import SIZES, SPACING, compared, folded, garment_named
+from clothgym.garments import random_garment
 from clothgym.geometry.intersections import find_intersections
 
 ID = "clothgym:ClothFoldShirt-v0"
@@ -117,3 +118,21 @@ def test_key_points_of_the_garment_are_observed():
 def test_a_garment_without_a_fold_is_refused():
     with pytest.raises(ValueError, match="garment='skirt': must be 'tshirt' or 'shorts' or 'trousers'"):
         gym.make(ID, garment="skirt")
+
+
+@pytest.mark.slow
+def test_the_expert_folds_shirts_of_other_sizes():
+    """Of random sizes: the mesh, the key points that grippers take and the ideal follow them."""
+    for seed in (0, 3):
+        chosen = random_garment("tshirt", seed, SPACING)
+        env, info = episodes(2, sizes=dict(chosen.sizes))
+        assert np.array_equal(env.task.physics.mesh.rest_positions, chosen.mesh.rest_positions)
+        assert env.task.below == [chosen.key_points["sleeve_top_left"], chosen.key_points["waist_left"]]
+        assert info["is_success"].all() and info["fold_error_mm"].max() < 30
+
+
+def test_sizes_that_no_garment_has_are_refused():
+    with pytest.raises(ValueError, match="no size of a tshirt 'lenght'; did you mean 'length'"):
+        gym.make(ID, sizes={"lenght": 0.7})
+    with pytest.raises(ValueError, match="sizes=0.7: must be a dict"):
+        gym.make(ID, sizes=0.7)
