@@ -137,7 +137,8 @@ class Observer:
 
     def _prepare(self, size: int, camera: Any, points: int) -> gym.spaces.Box:
         """Where the scene is seen from, and what kernels need of it; returns the space of a picture."""
-        from clothgym.render import quick, quick_solids  # imported here: who observes the state draws nothing
+        from clothgym.envs.views import Views  # imported here, as all that draws: who observes the state draws nothing
+        from clothgym.render import quick, quick_solids
 
         task, mode = self.task, self.mode
         middle, half = task.working_area()
@@ -151,11 +152,11 @@ class Observer:
         self._surfaces = quick.surfaces_of(task.physics.mesh.triangles, meshes)
         side = task.physics.side
         if mode == "heightmap":
-            self.sight = quick.straight_down(middle, half, size)
+            self._views = Views(task, None, size, quick.straight_down(middle, half, size))
             self._bound = float(np.float32(task.arena()[1][2] / side + HIGHEST))
             return gym.spaces.Box(0.0, self._bound, (size, size), np.float32)
         chosen = checked_camera(task, camera)
-        self.sight = quick.sight_of(chosen, size)
+        self._views = Views(task, chosen, size, quick.sight_of(chosen, size))
         if mode == "pointcloud":
             self._bound = float(task.position_bound)
             return gym.spaces.Box(-self._bound, self._bound, (points, 3), np.float32)
@@ -219,10 +220,10 @@ class Observer:
         out = (flat, _NO_NUMBERS) if pictures.dtype == np.uint8 else (_NO_COLORS, flat)
         places = task.simulation.layout.at(envs)
         measure = np.ascontiguousarray(task.episode["origin"]), float(task.rules["per_side"][0]), self._bound
-        x = task.simulation.view.x
+        x, views = task.simulation.view.x, self._views.of(envs)
 
         def work(first: int, last: int) -> None:
-            draw_pictures(first, last, self._kind, envs, places, x, self._surfaces, things, self.sight, measure, out)
+            draw_pictures(first, last, self._kind, envs, places, x, self._surfaces, things, views, measure, out)
 
         _jit.run_spans(work, len(envs), min(task.threads, max(1, len(envs) // PICTURES_A_THREAD)))
         self.stale[envs] = False

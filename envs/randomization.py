@@ -1,4 +1,4 @@
-"""``randomize=``: each episode draws its fabric and friction, and how late and how noisy actions and observations are.
+"""``randomize=``: each episode draws its fabric and friction, how late and how noisy actions and observations are, and its camera.
 
 Policies meet delay and noise outside of a simulation (Peng et al. 2018, "Sim-to-real transfer of robotic control with dynamics
 randomization").  They are drawn from the environment's own generator, so an episode is the same in any batch.
@@ -14,15 +14,21 @@ from numpy.typing import NDArray
 
 from clothgym.checks import finite, shown
 from clothgym.envs.episode import DIVERGED, Fields
-from clothgym.envs.observing import PICTURES
+from clothgym.envs.observing import CAMERA, PICTURES
 from clothgym.envs.physics import checked_ranges
 from clothgym.parameters import PROPERTIES
 
 if TYPE_CHECKING:
     from clothgym.envs.task import Task
 
-# the greatest end of each range; the least is 0
-LIMITS = {"friction": 10.0, "action_delay": 100, "action_noise": 10.0, "observation_noise": 10.0}
+# least and greatest end of each range; those of pictures are explained in ``views``
+OF_CAMERAS: dict[str, tuple[float, float]] = {
+    "camera_yaw": (-180, 180), "camera_tilt": (-90, 90), "camera_distance": (0.5, 2),
+}  # fmt: skip
+OF_COLORS: dict[str, tuple[float, float]] = {"brightness": (0, 4), "hue": (-180, 180)}
+LIMITS: dict[str, tuple[float, float]] = {
+    "friction": (0, 10), "action_delay": (0, 100), "action_noise": (0, 10), "observation_noise": (0, 10), **OF_CAMERAS, **OF_COLORS,
+}  # fmt: skip
 PREFIX = "randomization/"  # of the keys in info
 
 
@@ -32,7 +38,7 @@ class Disturbances:
     Attributes:
         ranges: of those of ``LIMITS`` that are drawn: the coefficient ``friction`` of all solids; ``action_delay``, in control
             steps; and standard deviations of normal noise: ``action_noise``, in each number of an action and control step, and
-            ``observation_noise``, in each number of the state vector, in its unit.
+            ``observation_noise``, in each number of the state vector, in its unit; and those of pictures, see ``views``.
         max_delay: the longest delay that can be drawn, in control steps.
     """
 
@@ -40,17 +46,21 @@ class Disturbances:
         self.ranges: dict[str, tuple[float, float]] = {}
         for name, bounds in ranges.items():
             pair = finite(f"randomize: {name}", bounds)
-            if pair.shape != (2,) or not 0 <= pair[0] <= pair[1] <= LIMITS[name]:
-                raise ValueError(f"randomize: {name}={shown(bounds)} must be a range [low, high] from 0 to {LIMITS[name]}")
+            least, most = LIMITS[name]
+            if pair.shape != (2,) or not least <= pair[0] <= pair[1] <= most:
+                raise ValueError(f"randomize: {name}={shown(bounds)} must be a range [low, high] from {least:g} to {most:g}")
             if name == "action_delay" and (pair != np.rint(pair)).any():
                 raise ValueError(f"randomize: {name}={shown(bounds)} must be a range of whole control steps")
             self.ranges[name] = pair[0].item(), pair[1].item()
         self.max_delay = int(self.ranges.get("action_delay", (0, 0))[1])
 
     def check_observed(self, obs_mode: str) -> None:
-        """Refuse noise of observations that are not the state vector."""
+        """Refuse noise of observations that are not the state vector, and a camera and colors of those that have none."""
         if "observation_noise" in self.ranges and obs_mode in PICTURES:
             raise ValueError(f"randomize: no observation_noise with obs_mode={obs_mode!r}: only the state vector has noise")
+        for names, modes in ((OF_CAMERAS, CAMERA), (OF_COLORS, ("rgb", "rgbd"))):
+            if obs_mode not in modes and (name := next((name for name in names if name in self.ranges), None)):
+                raise ValueError(f"randomize: no {name} with obs_mode={obs_mode!r}; it is for {', '.join(modes)}")
 
     def remembers(self, actions: int) -> Fields:
         """Fields of an episode: what it has drawn, and its last actions, of control step t in row ``t mod (max_delay + 1)``."""

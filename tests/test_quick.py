@@ -130,7 +130,7 @@ def picture(kind, sight, x, mesh, names=(), **numbers):
     colors, values = np.zeros((1, size), np.uint8), np.zeros((1, size), np.float32)
     block = np.ascontiguousarray(x.T[None, :, :, None])
     quick.draw_pictures(
-        0, 1, kind, zero, (zero, zero), block, surfaces, (shapes, rows), sight,
+        0, 1, kind, zero, (zero, zero), block, surfaces, (shapes, rows), quick.views_from(sight),
         (np.zeros((1, 3), np.float32), numbers.get("per_side", 1.0), numbers.get("bound", 20.0)), (colors, values),
     )  # fmt: skip
     return (colors if kind == quick.RGB else values)[0].reshape(SIZE, SIZE, -1)

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import clothgym  # noqa: F401
 
@@ -131,6 +132,47 @@ def test_pictures_have_no_noise():
         batch(obs_mode="depth", randomize={"observation_noise": [0, 0.1]})
 
 
+def test_a_drawn_camera_is_the_given_one_turned_about_its_target():
+    """Turned by scipy: about the vertical after the picture's horizontal, whose sense raises the eye; and farther away."""
+    camera = {"eye": (0.3, -1.2, 0.9), "target": (0.1, 0.0, 0.1), "vertical_fov": 40.0}
+    target = np.array(camera["target"])
+    back = np.array(camera["eye"]) - target
+    right = np.cross(-back, (0, 0, 1))
+    turn = Rotation.from_rotvec([0, 0, np.radians(30)]) * Rotation.from_rotvec(-np.radians(12) * right / np.linalg.norm(right))
+    eye = target + 1.2 * turn.apply(back)
+    assert eye[2] > camera["eye"][2]
+    drawn = {"camera_yaw": [30, 30], "camera_tilt": [12, 12], "camera_distance": [1.2, 1.2]}
+    seen = batch(2, obs_mode="rgb", image_size=48, camera=camera, randomize=drawn).reset(seed=3)[0]
+    wanted = batch(2, obs_mode="rgb", image_size=48, camera={**camera, "eye": tuple(eye)}).reset(seed=3)[0]
+    assert (np.abs(seen.astype(int) - wanted).max(axis=-1) > 0).mean() < 0.01
+    plain = batch(2, obs_mode="rgb", image_size=48, camera=camera).reset(seed=3)[0]
+    assert (np.abs(seen.astype(int) - plain).max(axis=-1) > 0).mean() > 0.1
+
+
+def test_brightness_multiplies_all_colors_and_hue_turns_those_of_the_cloth():
+    plain = batch(2, obs_mode="rgb").reset(seed=3)[0]
+    dark, bright = (batch(2, obs_mode="rgb", randomize={"brightness": [b, b]}).reset(seed=3)[0] for b in (0.5, 1.5))
+    assert np.array_equal(dark, plain // 2) and np.array_equal(bright, np.minimum(1.5 * plain, 255).astype(np.uint8))
+    # by a third of a turn red is green, green blue and blue red; the rest of the scene stays as it is
+    turned = batch(2, obs_mode="rgb", randomize={"hue": [120, 120]}).reset(seed=3)[0]
+    cloth = (turned != plain).any(axis=-1)
+    assert cloth.sum() > 200 and np.abs(turned[cloth].astype(int) - np.roll(plain[cloth], 1, axis=-1)).max() <= 1
+
+
+def test_drawn_views_are_the_same_in_any_batch_and_from_a_state():
+    ranges = {"camera_yaw": [-30, 30], "camera_distance": [0.8, 1.2], "brightness": [0.5, 1.5], "hue": [-90, 90]}
+    many, one = (batch(count, obs_mode="rgbd", image_size=24, randomize=ranges) for count in (3, 1))
+    seen, info = many.reset(seed=7)
+    alone, own = one.reset(seed=9)
+    assert np.array_equal(seen[2:], alone) and own["randomization/hue"][0] == info["randomization/hue"][2]
+    state, given = many.get_state(), actions(4)
+    seen = [many.step(action)[0] for action in given]
+    other = batch(3, obs_mode="rgbd", image_size=24, randomize=ranges)
+    other.reset(seed=0)
+    other.set_state(state)
+    assert all(np.array_equal(other.step(action)[0], first) for action, first in zip(given, seen))
+
+
 @pytest.mark.parametrize(
     "ranges, said",
     [
@@ -140,12 +182,21 @@ def test_pictures_have_no_noise():
         ({"observation_noise": [0.2, 0.1]}, "must be a range"),
         ({"action_noise": [0, float("nan")]}, "action_noise"),
         ([0, 1], "must be a dict"),
+        ({"camera_yaw": [-5, 5]}, "no camera_yaw with obs_mode='keypoints'; it is for rgb, depth, rgbd, pointcloud"),
+        ({"hue": [-200, 5]}, "from -180 to 180"),
         ({"friction": [-0.1, 0.5]}, "friction=.* must be a range .low, high. from 0 to 10"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(ranges, said):
     with pytest.raises(ValueError, match=said):
         batch(randomize=ranges)
+
+
+def test_a_camera_that_could_see_from_below_the_floor_is_refused():
+    with pytest.raises(ValueError, match="camera_tilt=-80 would put the camera below the floor"):
+        batch(obs_mode="depth", camera="task", randomize={"camera_tilt": [-80, 10]})
+    with pytest.raises(ValueError, match="no brightness with obs_mode='depth'; it is for rgb, rgbd"):
+        batch(obs_mode="depth", randomize={"brightness": [0.5, 1.5]})
 
 
 def test_motions_of_picks_have_no_delay():

@@ -5,7 +5,8 @@ the same to the bit for both triangles of an edge (Pineda 1988); spheres, capsul
 So a depth is that of the exact surface.  Surfaces are flat and matt, under one fixed light from above (Lambert); nothing casts a
 shadow.
 
-``Sight`` is a camera with a picture's size: a pinhole camera, or parallel rays straight down, for heights.
+``Sight`` is a camera with a picture's size: a pinhole camera, or parallel rays straight down, for heights.  ``Views`` are
+those of a batch, one for all environments or one for each.
 """
 
 from __future__ import annotations
@@ -54,6 +55,27 @@ class Sight(NamedTuple):
     numbers: NDArray[np.float64]
     near: NDArray[np.float32]
     color: NDArray[np.uint8]
+
+
+class Views(NamedTuple):
+    """From where, in which colors and how bright the environments of a batch are drawn: one view for all, or one for each.
+
+    numbers, near, color: as those of ``Sight``, with an axis of views before.  cloth: colors of the front and the back, from 0 to
+    255, (views, 2, 3).  brightness: factor on all colors, (views,).
+    """
+
+    numbers: NDArray[np.float64]
+    near: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    cloth: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+
+
+def views_from(sight: Sight, count: int = 1) -> Views:
+    """So many views from one place, in the usual colors."""
+    cloth = np.tile(np.array([CORAL, INDIGO], np.float64), (count, 1, 1))
+    numbers, near, color = sight
+    return Views(np.stack([numbers] * count), np.stack([near] * count), np.stack([color] * count), cloth, np.ones(count))
 
 
 def sight_of(camera: Camera, size: int) -> Sight:
@@ -112,17 +134,17 @@ def surfaces_of(cloth: NDArray, meshes: list[tuple[NDArray, NDArray] | None]) ->
 
 
 @kernel
-def draw_pictures(first, last, kind, envs, places, x, surfaces, things, sight, measure, out):
+def draw_pictures(first, last, kind, envs, places, x, surfaces, things, views, measure, out):
     """Draw environments ``envs[first:last]``.
 
     kind: RGB, DEPTH [m], RGBD (colors from 0 to 1, depth [m]), HEIGHTS or POINTS (in sides).
-    places: block and lane of each of ``envs``; x: [m], (block, 3, particles, lane).  surfaces, sight: as these are called here.
+    places: block and lane of each of ``envs``; x: [m], (block, 3, particles, lane).  surfaces, views: as these are called here.
     things: the shape of each solid, see ``quick_solids``, (solids,), and its rows, (len(envs), solids, SOLID_ROWS).
     measure: what points are relative to [m], (num_envs, 3); sides in a meter; and the farthest depth [m], or the largest height or
     coordinate, in sides.  out: to be written to, uint8 for colors and float32 for numbers, both (num_envs, ...), flat.
     """
     (block, lane), (origin, per_side, bound), (pictures, numbers) = places, measure, out
-    height, width = sight.near.shape
+    several, height, width = views.near.shape
     colored = kind in (RGB, RGBD)
     # one picture's memory, used for one after the other
     count = max(x.shape[2], surfaces[1].shape[0])
@@ -132,17 +154,19 @@ def draw_pictures(first, last, kind, envs, places, x, surfaces, things, sight, m
     picture = near, what, color
     for i in range(first, last):
         e = envs[i]
-        draw_one(colored, i, block[i], lane[i], x, surfaces, things, sight, world, screen, picture)
+        v = e if several > 1 else 0
+        view, brightness = (views.numbers[v], views.near[v], views.color[v], views.cloth[v]), views.brightness[v]
+        draw_one(colored, i, block[i], lane[i], x, surfaces, things, view, world, screen, picture)
         if kind == RGB:
-            write_colors(color, e, pictures)
+            write_colors(color, brightness, e, pictures)
         elif kind == POINTS:
-            write_points(near, what, sight.numbers, origin, per_side, bound, e, numbers)
+            write_points(near, what, views.numbers[v], origin, per_side, bound, e, numbers)
         elif kind == HEIGHTS:
             write_heights(near, per_side, bound, e, numbers)
         elif kind == DEPTH:
             write_depths(near, bound, 1, e, numbers)
         else:
-            write_shares(color, e, numbers)
+            write_shares(color, brightness, e, numbers)
             write_depths(near, bound, 4, e, numbers)
 
 
@@ -150,7 +174,7 @@ def draw_pictures(first, last, kind, envs, places, x, surfaces, things, sight, m
 def draw_one(colored, i, b, l, x, surfaces, things, view, world, screen, picture):
     """One picture: the nearest surface at each pixel, ``near``; ``what`` it is; and its ``color``, if ``colored``."""
     cloth, vertices, triangles, first_vertex, first_triangle = surfaces
-    (shapes, solids), (sight, background, floor), (near, what, color) = things, view, picture
+    (shapes, solids), (sight, background, floor, cloth_colors), (near, what, color) = things, view, picture
     height, width = near.shape
     for r in range(height):
         for c in range(width):
@@ -188,7 +212,9 @@ def draw_one(colored, i, b, l, x, surfaces, things, view, world, screen, picture
         for c in range(3):
             world[p, c] = x[b, c, p, l]
     project(world, particles, sight, screen)
-    draw_triangles(colored, CLOTH, CORAL, INDIGO, cloth, 0, cloth.shape[0], world, screen, picture)
+    front = cloth_colors[0, 0], cloth_colors[0, 1], cloth_colors[0, 2]
+    back = cloth_colors[1, 0], cloth_colors[1, 1], cloth_colors[1, 2]
+    draw_triangles(colored, CLOTH, front, back, cloth, 0, cloth.shape[0], world, screen, picture)
 
 
 @uncounted
@@ -269,13 +295,13 @@ def draw_triangles(colored, mark, front_color, back_color, triangles, begin, end
 
 
 @uncounted
-def write_colors(color, e, pictures):
-    """Colors of a picture, to its row."""
+def write_colors(color, brightness, e, pictures):
+    """Colors of a picture times its brightness, to its row."""
     height, width, _ = color.shape
     for r in range(height):
         for c in range(width):
             for k in range(3):
-                pictures[e, 3 * (r * width + c) + k] = color[r, c, k]
+                pictures[e, 3 * (r * width + c) + k] = np.uint8(min(brightness * color[r, c, k], 255.0))
 
 
 @uncounted
@@ -303,13 +329,13 @@ def write_depths(near, bound, channels, e, numbers):
 
 
 @uncounted
-def write_shares(color, e, numbers):
-    """Colors from 0 to 1, the first three of four channels, to the picture's row."""
+def write_shares(color, brightness, e, numbers):
+    """Colors times brightness, from 0 to 1, the first three of four channels, to the picture's row."""
     height, width, _ = color.shape
     for r in range(height):
         for c in range(width):
             for k in range(3):
-                numbers[e, 4 * (r * width + c) + k] = color[r, c, k] / np.float32(255)
+                numbers[e, 4 * (r * width + c) + k] = np.float32(min(brightness * color[r, c, k], 255.0)) / np.float32(255)
 
 
 @uncounted
