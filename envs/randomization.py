@@ -21,9 +21,9 @@ from clothgym.parameters import PROPERTIES
 if TYPE_CHECKING:
     from clothgym.envs.task import Task
 
-# least and greatest end of each range; those of pictures are explained in ``views``
+# least and greatest end of each range; those of pictures are explained in ``views``.  Depths end at twice the camera's own distance
 OF_CAMERAS: dict[str, tuple[float, float]] = {
-    "camera_yaw": (-180, 180), "camera_tilt": (-90, 90), "camera_distance": (0.5, 2),
+    "camera_yaw": (-180, 180), "camera_tilt": (-90, 90), "camera_distance": (0.5, 1.5),
 }  # fmt: skip
 OF_COLORS: dict[str, tuple[float, float]] = {"brightness": (0, 4), "hue": (-180, 180)}
 LIMITS: dict[str, tuple[float, float]] = {

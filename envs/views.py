@@ -46,11 +46,11 @@ class Views:
 
     def of(self, envs: NDArray) -> quick.Views:
         """The views of all environments, of which these are as their episodes have drawn them."""
-        for env in envs.tolist() if self.names else ():
-            drawn = [float(self.task.episode[name][env]) for name in self.names]
-            if not np.array_equal(drawn, self._drawn[env]):
-                self._draw(env, dict(zip(self.names, drawn)))
-                self._drawn[env] = drawn
+        if self.names:
+            drawn = np.stack([self.task.episode[name][envs] for name in self.names], axis=1)
+            for k in np.flatnonzero((drawn != self._drawn[envs]).any(axis=1)).tolist():
+                self._draw(int(envs[k]), dict(zip(self.names, drawn[k].tolist())))
+            self._drawn[envs] = drawn
         return self._views
 
     def _draw(self, env: int, drawn: dict[str, float]) -> None:

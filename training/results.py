@@ -33,6 +33,7 @@ LABELS = {
     "bc_ppo": "behavior cloning, then PPO", "sac_scratch": "SAC", "sac": "SAC, started with expert episodes",
     "her": "SAC with hindsight (HER), started with expert episodes",
 }  # fmt: skip
+VARIANTS = {"fold", "garment"}  # arguments that make another task of an id
 FROM_SCRATCH = ("ppo", "ppo_penalty", "ppo_lagrange", "sac_scratch")  # learners that see no expert
 Result = dict[str, Any]
 
@@ -150,8 +151,8 @@ def choose() -> None:
 
     for path in sorted(RUNS.glob(f"*/{POLICY}")):
         about = policies.read(path).about
-        if not about["chosen_by"]:
-            # a policy that never succeeds is not kept
+        if not about["chosen_by"] or VARIANTS & about["env_kwargs"].keys():
+            # a policy that never succeeds is not kept, nor one of a variant of the task
             path.unlink()
             continue
         kept = COMMITTED / f"{about['env']}_{about['learner']}.npz"
