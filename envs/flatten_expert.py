@@ -34,7 +34,7 @@ ALMOST_TORN, OTHER_END = 0.85, 50  # of garments: strain anywhere that counts; s
 # of a sheet that has to lie in one pose: how far it turns at once, and at most is askew [rad], and how far beyond the place of its
 # far edge it hangs before it is laid down [m]
 TURNING, ASKEW, HUNG = 0.2, 0.05, 0.32
-AGAIN, AGAIN_IN_POSE = 95, 150  # steps before the end after which no other try begins, also where a sheet has to lie in one pose
+AGAIN, AGAIN_IN_POSE = 95, 150  # steps before the end in which no other try begins, without and with a pose to lie in
 # of picking and placing: the corners that are taken, and the others, pull by pull; first edges, then diagonals
 PULLS = ((0, 1, 2, 3), (2, 3, 0, 1), (0, 3, 1, 2), (1, 2, 0, 3), (0, 3, 1, 2), (1, 2, 0, 3))
 EDGES_FIRST = 2

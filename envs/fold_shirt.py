@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined
-from clothgym.checks import one_of, shown
+from clothgym.checks import known, number, one_of, shown
 from clothgym.envs.episode import Fields
 from clothgym.envs.fold import FoldingTask, evaluate_fold
 from clothgym.envs.gripper_task import PHYSICS
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.single import ClothEnv
-from clothgym.garments import USUAL_THICKNESS, Garment, make
+from clothgym.garments import RANGES, USUAL_THICKNESS, Garment, make
 from clothgym.mesh import ClothMesh
 
 SPACING = 0.04  # of the particles [m]
@@ -26,9 +26,26 @@ SIZES: dict[str, dict[str, float]] = {"tshirt": {"chest_width": 0.42, "length": 
 TAKEN = {"tshirt": ("sleeve_top", "waist"), "shorts": ("waist", "pipe_outer"), "trousers": ("waist", "pipe_outer")}
 
 
-@cache
-def garment_named(name: str, sizes: tuple[tuple[str, float], ...] = ()) -> Garment:
-    """The garment of that name in ``SIZES``; sizes: others than those, as pairs of a name and a value."""
+def garment_named(name: str, sizes: Mapping[str, float] | None = None) -> Garment:
+    """The garment of that name in ``SIZES``; sizes: others than those, within the ranges of random garments.
+
+    Raises:
+        ValueError: unknown sizes, or out of these ranges.
+    """
+    if sizes is not None and not isinstance(sizes, Mapping):
+        raise ValueError(f"sizes={shown(sizes)}: must be a dict, for instance {{'length': 0.7}}")
+    chosen = {}
+    for each, value in (sizes or {}).items():
+        known(f"size of {name}", each, RANGES[name])
+        low, high = RANGES[name][each]
+        chosen[each] = number(f"sizes: {each}", value)
+        if not low <= chosen[each] <= high:
+            raise ValueError(f"sizes: {each}={shown(value)}: must be from {low:g} to {high:g}, the range of random garments")
+    return _garment(name, tuple(sorted(chosen.items())))
+
+
+@lru_cache(maxsize=64)
+def _garment(name: str, sizes: tuple[tuple[str, float], ...]) -> Garment:
     return make(name, SPACING, sizes=SIZES[name] | dict(sizes))
 
 
@@ -97,7 +114,10 @@ class FoldShirtTask(FoldingTask):
 
     Args:
         garment: one of ``SIZES``.
-        sizes: of the garment, others than those in ``SIZES``, as ``clothgym.garments`` takes them.
+        sizes: of the garment, others than those in ``SIZES``, in the units of ``clothgym.garments``.
+
+    Raises:
+        ValueError: an unknown garment, or sizes outside of the ranges of random garments.
     """
 
     garment = garment_named("tshirt")
@@ -121,9 +141,7 @@ class FoldShirtTask(FoldingTask):
 
     def __init__(self, num_envs: int, garment: str = "tshirt", sizes: Mapping[str, float] | None = None, **kwargs: Any) -> None:
         one_of("garment", garment, *SIZES)
-        if sizes is not None and not isinstance(sizes, Mapping):
-            raise ValueError(f"sizes={shown(sizes)}: must be a dict, for instance {{'length': 0.7}}")
-        self.garment = garment_named(garment, tuple(sorted((sizes or {}).items())))
+        self.garment = garment_named(garment, sizes)
         self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
         points = self.garment.key_points
         self.stages = [[(points[f"{name}_left"], points[f"{name}_right"]) for name in TAKEN[garment]]]
@@ -153,7 +171,7 @@ class ClothFoldShirtEnv(ClothEnv):
     the grippers take by the left ends of waist and leg.
 
     The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
-    sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a vector have the same sizes;
+    sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a batch have the same sizes;
     ``randomize`` draws fabrics.
 
     $physics
@@ -169,7 +187,7 @@ class ClothFoldShirtEnv(ClothEnv):
     ## Evaluation
     Fold error, height, overlap, success, and the normalized performance are defined as for the half fold of ``ClothFold-v0``, with
     ``fold_error_max`` at most 0.1.  The ideal is the garment folded along its middle, left over right or right over left, whichever
-    is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m.
+    is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m by default.
 
     At the end there are also measures of three-dimensional distance from the ideal, whose four layers are one cloth thickness
     apart: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and translation along

@@ -137,7 +137,7 @@ class Observer:
 
     def _prepare(self, size: int, camera: Any, points: int) -> gym.spaces.Box:
         """Where the scene is seen from, and what kernels need of it; returns the space of a picture."""
-        from clothgym.envs.views import Views  # imported here, as all that draws: who observes the state draws nothing
+        from clothgym.envs.views import DrawnViews  # imported here, as all that draws: who observes the state draws nothing
         from clothgym.render import quick, quick_solids
 
         task, mode = self.task, self.mode
@@ -152,11 +152,11 @@ class Observer:
         self._surfaces = quick.surfaces_of(task.physics.mesh.triangles, meshes)
         side = task.physics.side
         if mode == "heightmap":
-            self._views = Views(task, None, size, quick.straight_down(middle, half, size))
+            self._views = DrawnViews(task, None, size, quick.straight_down(middle, half, size))
             self._bound = float(np.float32(task.arena()[1][2] / side + HIGHEST))
             return gym.spaces.Box(0.0, self._bound, (size, size), np.float32)
         chosen = checked_camera(task, camera)
-        self._views = Views(task, chosen, size, quick.sight_of(chosen, size))
+        self._views = DrawnViews(task, chosen, size, quick.sight_of(chosen, size))
         if mode == "pointcloud":
             self._bound = float(task.position_bound)
             return gym.spaces.Box(-self._bound, self._bound, (points, 3), np.float32)

@@ -33,7 +33,7 @@ PREFIX = "randomization/"  # of the keys in info
 
 
 class Disturbances:
-    """Friction of the solids, delay and noise of the actions, and noise of the observations, of a batch.
+    """Friction of the solids, delay and noise of the actions, noise, camera and colors of the observations, of a batch.
 
     Attributes:
         ranges: of those of ``LIMITS`` that are drawn: the coefficient ``friction`` of all solids; ``action_delay``, in control

@@ -90,8 +90,9 @@ class Task:
             that ends within them ends there.
         gamma: discount of the agent's steps to which the shaping is adapted: a step that does not end the episode gives
             ``gamma Phi' - Phi`` as the potential goes from Phi to Phi', so that no policy gains by it (Ng et al. 1999).
-        randomize: ranges from which each episode draws material properties, and the delay and noise of actions and observations,
-            ``{"density": [0.1, 0.2], "action_delay": [0, 2]}``, see ``randomization``; what was drawn is in info.
+        randomize: ranges from which each episode draws material properties, the delay and noise of actions and observations, and
+            the camera and colors of pictures, ``{"density": [0.1, 0.2], "action_delay": [0, 2]}``, see ``randomization``; what was
+            drawn is in info.
         settling: "steps", or "at_once": the agent's last step continues until its sheet has settled and is evaluated.
         wind: arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``; None for the task's own air, ``{}`` for still air.
         threads: threads to use; all cores by default for a batch.
@@ -122,7 +123,7 @@ class Task:
             ``observation``, (num_envs, numbers), and ``air``, the wind of each step [m/s], (num_envs, steps, 3), part of the state.
         observation_slices: slice of each observation in ``observation[env]``, the state vector, by its name.
         state_bound: largest magnitude of each number in the state vector.
-        disturbances: delay and noise that ``randomize`` asks for.
+        disturbances: what ``randomize`` draws beside the fabric's properties.
         observed: the observations that ``reset`` and ``step`` return.
         rules: one record of numbers that all environments share.
         outcome, info, physical, terms: records of the results of the last step or reset, (num_envs,), see ``answers``.

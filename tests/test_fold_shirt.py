@@ -132,7 +132,10 @@ def test_the_expert_folds_shirts_of_other_sizes():
 
 
 def test_sizes_that_no_garment_has_are_refused():
-    with pytest.raises(ValueError, match="no size of a tshirt 'lenght'; did you mean 'length'"):
+    with pytest.raises(ValueError, match="no size of tshirt 'lenght'; did you mean 'length'"):
         gym.make(ID, sizes={"lenght": 0.7})
     with pytest.raises(ValueError, match="sizes=0.7: must be a dict"):
         gym.make(ID, sizes=0.7)
+    for value in (3.0, [0.7], "a"):
+        with pytest.raises(ValueError, match="sizes: length.*must be"):
+            gym.make(ID, sizes={"length": value})

@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import clothgym  # noqa: F401
+from clothgym.render.quick import FLOOR_COLORS
 
 
 def batch(num_envs=3, env_id="ClothDrape-v0", **kwargs):
@@ -155,13 +156,27 @@ def test_brightness_multiplies_all_colors_and_hue_turns_those_of_the_cloth():
     assert np.array_equal(dark, plain // 2) and np.array_equal(bright, np.minimum(1.5 * plain, 255).astype(np.uint8))
     # by a third of a turn red is green, green blue and blue red; the rest of the scene stays as it is
     turned = batch(2, obs_mode="rgb", randomize={"hue": [120, 120]}).reset(seed=3)[0]
+    floor = np.any([(plain == color).all(axis=-1) for color in FLOOR_COLORS], axis=0)
     cloth = (turned != plain).any(axis=-1)
-    assert cloth.sum() > 200 and np.abs(turned[cloth].astype(int) - np.roll(plain[cloth], 1, axis=-1)).max() <= 1
+    assert cloth.sum() > 200 and floor.sum() > 5000 and not (cloth & floor).any()
+    assert np.abs(turned[cloth].astype(int) - np.roll(plain[cloth], 1, axis=-1)).max() <= 1
+    # in shares of 255, and depths as they were
+    clear, dark = (batch(2, obs_mode="rgbd", randomize=ranges).reset(seed=3)[0] for ranges in ({}, {"brightness": [0.5, 0.5]}))
+    assert dark[..., :3] == pytest.approx(clear[..., :3] / 2, abs=1e-6) and np.array_equal(dark[..., 3], clear[..., 3])
+
+
+def test_a_tilt_of_the_camera_straight_down_moves_the_eye_toward_the_top_of_the_picture():
+    """From there, at a low angle, the floor is near at the top of the picture, and far or beyond the limit at the bottom."""
+    plain, tilted = (batch(2, obs_mode="depth", image_size=64, randomize=some) for some in ({}, {"camera_tilt": [60, 60]}))
+    seen, other = plain.reset(seed=3)[0][..., 0], tilted.reset(seed=3)[0][..., 0]
+    assert np.ptp(seen[:, [1, 62], 2]) < 0.02
+    assert (other[:, 1, 2] < 0.8 * seen[:, 1, 2]).all() and (other[:, 62, 2] > 1.2 * seen[:, 62, 2]).all()
 
 
 def test_drawn_views_are_the_same_in_any_batch_and_from_a_state():
-    ranges = {"camera_yaw": [-30, 30], "camera_distance": [0.8, 1.2], "brightness": [0.5, 1.5], "hue": [-90, 90]}
-    many, one = (batch(count, obs_mode="rgbd", image_size=24, randomize=ranges) for count in (3, 1))
+    ranges = {"camera_yaw": [-30, 30], "camera_tilt": [-20, 20], "camera_distance": [0.8, 1.2], "brightness": [0.5, 1.5]}
+    ranges["hue"] = [-90, 90]
+    many, one = (batch(count, obs_mode="rgbd", image_size=24, randomize=ranges, threads=2) for count in (3, 1))
     seen, info = many.reset(seed=7)
     alone, own = one.reset(seed=9)
     assert np.array_equal(seen[2:], alone) and own["randomization/hue"][0] == info["randomization/hue"][2]
@@ -193,8 +208,17 @@ def test_ranges_that_cannot_be_are_refused(ranges, said):
 
 
 def test_a_camera_that_could_see_from_below_the_floor_is_refused():
-    with pytest.raises(ValueError, match="camera_tilt=-80 would put the camera below the floor"):
+    with pytest.raises(
+        ValueError, match=r"camera_tilt=\[-80.0, 10.0\]: the camera would be at z = -.*, below the floor; take a narrower"
+    ):
         batch(obs_mode="depth", camera="task", randomize={"camera_tilt": [-80, 10]})
+    # neither end of the range is below the floor: at distance sqrt(0.64 + 0.64) the lowest point is 1 - 1.13 high
+    low = {"eye": [0, -0.8, 0.2], "target": [0, 0, 1]}
+    with pytest.raises(ValueError, match=r"z = -0.131 m"):
+        batch(obs_mode="depth", camera=low, randomize={"camera_tilt": [-89, 0]})
+    # nor is the tilt: farther away, the eye is at 0.5 - 0.4 d
+    with pytest.raises(ValueError, match=r"camera_distance=\[0.8, 1.5\]: the camera would be at z = -0.1 m"):
+        batch(obs_mode="depth", camera={"eye": [0, -1.2, 0.1], "target": [0, 0, 0.5]}, randomize={"camera_distance": [0.8, 1.5]})
     with pytest.raises(ValueError, match="no brightness with obs_mode='depth'; it is for rgb, rgbd"):
         batch(obs_mode="depth", randomize={"brightness": [0.5, 1.5]})
 

@@ -108,6 +108,10 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     pictures = {**now, 'ClothReach-v0 {"obs_mode": "depth"}': "now"}
     assert report.best_of("ClothReach-v0", [result(0.9), seeing], pictures, True) == "PPO: 0.90 in 2 min"
     assert report.best_of("ClothReach-v0", [seeing], pictures, True) == "SAC, `obs_mode='depth'`: 0.95 in 2 min"
+    # a variant of the task does not stand for its id
+    variant = result(0.99, env_kwargs={"fold": "diagonal"})
+    assert report.best_of("ClothReach-v0", [result(0.9), variant], now, True) == "PPO: 0.90 in 2 min"
+    assert report.best_of("ClothReach-v0", [variant], now, True) == "–"
     mixed = [result(0.9), result(0.7, learner="sac_scratch", digest="later")]
     assert report.best_of("ClothReach-v0", mixed, {"ClothReach-v0": "later"}, True) == "SAC: 0.70 in 2 min"
 
@@ -178,5 +182,10 @@ def test_of_several_seeds_the_policy_is_kept_that_was_best_on_other_episodes(res
     policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_1" / "policy.npz")
     results.add([tmp_path / "ClothReach-v0_1"])
     assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["chosen_by"] == 0.1
+    # nor is the policy of a variant kept
+    about |= {"env_kwargs": {"fold": "diagonal"}, "seed": 2, "chosen_by": 1.0, "digest": "other"}
+    policies.Policy([(np.ones((3, 2)), np.ones(2))], about=about).save(tmp_path / "ClothReach-v0_2" / "policy.npz")
+    results.add([tmp_path / "ClothReach-v0_2"])
+    assert policies.read(tmp_path / "committed" / "ClothReach-v0_ppo.npz").about["seed"] == 1
     with pytest.raises(ValueError, match="holds no finished run, it lacks evaluation.json"):
         results.add([tmp_path])

@@ -178,11 +178,14 @@ def _rates(rows: list[Result]) -> list[float]:
 def best_rows(
     env_id: str, results: list[Result], digests: dict[str, str], learners: Iterable[str]
 ) -> tuple[str, list[Result]] | None:
-    """The label and the seeds of the best of some learners; the id's own task goes first, then present results, then states."""
-    found = [(label, rows) for (env, label), rows in groups(results).items() if env == env_id and rows[0]["learner"] in learners]
+    """The label and the seeds of the best of some learners on the id's own task; present results, then states, go first."""
+    found = [
+        (label, rows)
+        for (env, label), rows in groups(results).items()
+        if env == env_id and rows[0]["learner"] in learners and not VARIANTS & rows[0]["env_kwargs"].keys()
+    ]
     rank = {
         label: (
-            not VARIANTS & rows[0]["env_kwargs"].keys(),
             all(is_present(row, digests) for row in rows),
             "obs_mode" not in rows[0]["env_kwargs"],
             interquartile_mean(_rates(rows)),

@@ -33,7 +33,7 @@ LABELS = {
     "bc_ppo": "behavior cloning, then PPO", "sac_scratch": "SAC", "sac": "SAC, started with expert episodes",
     "her": "SAC with hindsight (HER), started with expert episodes",
 }  # fmt: skip
-VARIANTS = {"fold", "garment"}  # arguments that make another task of an id
+VARIANTS = {"fold", "garment", "sizes"}  # arguments that make another task of an id
 FROM_SCRATCH = ("ppo", "ppo_penalty", "ppo_lagrange", "sac_scratch")  # learners that see no expert
 Result = dict[str, Any]
 

@@ -6,7 +6,7 @@ So a depth is that of the exact surface.  Surfaces are flat and matt, under one 
 shadow.
 
 ``Sight`` is a camera with a picture's size: a pinhole camera, or parallel rays straight down, for heights.  ``Views`` are
-those of a batch, one for all environments or one for each.
+those of a batch: places and colors, of each one for all environments or one for each.
 """
 
 from __future__ import annotations
@@ -58,10 +58,11 @@ class Sight(NamedTuple):
 
 
 class Views(NamedTuple):
-    """From where, in which colors and how bright the environments of a batch are drawn: one view for all, or one for each.
+    """From where, in which colors and how bright the environments of a batch are drawn.
 
-    numbers, near, color: as those of ``Sight``, with an axis of views before.  cloth: colors of the front and the back, from 0 to
-    255, (views, 2, 3).  brightness: factor on all colors, (views,).
+    numbers, near, color: as those of ``Sight``, with an axis of places before, one for all environments or one for each.
+    cloth: colors of the front and the back, from 0 to 255, (looks, 2, 3).  brightness: factor on all colors, (looks,); one look for
+    all environments, or one for each.
     """
 
     numbers: NDArray[np.float64]
@@ -71,11 +72,11 @@ class Views(NamedTuple):
     brightness: NDArray[np.float64]
 
 
-def views_from(sight: Sight, count: int = 1) -> Views:
-    """So many views from one place, in the usual colors."""
-    cloth = np.tile(np.array([CORAL, INDIGO], np.float64), (count, 1, 1))
+def views_from(sight: Sight, places: int = 1, looks: int = 1) -> Views:
+    """So many views from the same place, in the usual colors."""
+    cloth = np.tile(np.array([CORAL, INDIGO], np.float64), (looks, 1, 1))
     numbers, near, color = sight
-    return Views(np.stack([numbers] * count), np.stack([near] * count), np.stack([color] * count), cloth, np.ones(count))
+    return Views(np.stack([numbers] * places), np.stack([near] * places), np.stack([color] * places), cloth, np.ones(looks))
 
 
 def sight_of(camera: Camera, size: int) -> Sight:
@@ -144,7 +145,8 @@ def draw_pictures(first, last, kind, envs, places, x, surfaces, things, views, m
     coordinate, in sides.  out: to be written to, uint8 for colors and float32 for numbers, both (num_envs, ...), flat.
     """
     (block, lane), (origin, per_side, bound), (pictures, numbers) = places, measure, out
-    several, height, width = views.near.shape
+    places_seen_from, height, width = views.near.shape
+    looks = views.brightness.shape[0]
     colored = kind in (RGB, RGBD)
     # one picture's memory, used for one after the other
     count = max(x.shape[2], surfaces[1].shape[0])
@@ -154,8 +156,8 @@ def draw_pictures(first, last, kind, envs, places, x, surfaces, things, views, m
     picture = near, what, color
     for i in range(first, last):
         e = envs[i]
-        v = e if several > 1 else 0
-        view, brightness = (views.numbers[v], views.near[v], views.color[v], views.cloth[v]), views.brightness[v]
+        v, w = e if places_seen_from > 1 else 0, e if looks > 1 else 0
+        view, brightness = (views.numbers[v], views.near[v], views.color[v], views.cloth[w]), views.brightness[w]
         draw_one(colored, i, block[i], lane[i], x, surfaces, things, view, world, screen, picture)
         if kind == RGB:
             write_colors(color, brightness, e, pictures)
