@@ -24,7 +24,7 @@ two_tasks = pytest.mark.parametrize("env_id", TWO)
 every_path = pytest.mark.parametrize("env_id", [*TWO, "ClothDrapeGripper-v0", "ClothFoldGoal-v0"])
 
 
-EXPERT_SEEDS = {"ClothCanonicalize-v0": 2}  # where the expert fails in the episode of seed 0
+EXPERT_SEEDS = {"ClothCanonicalize-v0": 2}  # where the expert fails in the episodes of seeds 0 and 1
 
 
 def make(env_id, **kwargs):

@@ -122,13 +122,23 @@ def test_a_garment_without_a_fold_is_refused():
 
 @pytest.mark.slow
 def test_the_expert_folds_shirts_of_other_sizes():
-    """Of random sizes: the mesh, the key points that grippers take and the ideal follow them."""
     for seed in (0, 3):
-        chosen = random_garment("tshirt", seed, SPACING)
-        env, info = episodes(2, sizes=dict(chosen.sizes))
-        assert np.array_equal(env.task.physics.mesh.rest_positions, chosen.mesh.rest_positions)
-        assert env.task.below == [chosen.key_points["sleeve_top_left"], chosen.key_points["waist_left"]]
+        _, info = episodes(2, sizes=dict(random_garment("tshirt", seed, SPACING).sizes))
         assert info["is_success"].all() and info["fold_error_mm"].max() < 30
+
+
+def test_sizes_give_the_mesh_and_the_key_points():
+    """Those of the random garment with these sizes; and a longer shirt is longer."""
+    chosen = random_garment("tshirt", 3, SPACING)
+    env = gym.make(ID, sizes=dict(chosen.sizes)).unwrapped
+    observation, _ = env.reset(seed=4)
+    assert np.array_equal(env.task.physics.mesh.rest_positions, chosen.mesh.rest_positions)
+    assert env.task.below == [chosen.key_points["sleeve_top_left"], chosen.key_points["waist_left"]]
+    x = env.task.simulation.positions[0].astype(float) - env.task.episode["origin"][0]
+    seen = observation[env.observation_slices["keypoints"]].reshape(-1, 3)
+    assert seen == pytest.approx(x[list(chosen.key_points.values())] / env.task.physics.side, abs=1e-5)
+    short, long = (np.ptp(garment_named("tshirt", {"length": value}).mesh.rest_positions[:, 1]) for value in (0.62, 0.75))
+    assert long - short == pytest.approx(0.13, abs=1e-6)
 
 
 def test_sizes_that_no_garment_has_are_refused():

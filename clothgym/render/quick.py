@@ -156,6 +156,7 @@ def draw_pictures(first, last, kind, envs, places, x, surfaces, things, views, m
     picture = near, what, color
     for i in range(first, last):
         e = envs[i]
+        # the environment's own view, or that of all
         v, w = e if places_seen_from > 1 else 0, e if looks > 1 else 0
         view, brightness = (views.numbers[v], views.near[v], views.color[v], views.cloth[w]), views.brightness[w]
         draw_one(colored, i, block[i], lane[i], x, surfaces, things, view, world, screen, picture)
@@ -214,6 +215,7 @@ def draw_one(colored, i, b, l, x, surfaces, things, view, world, screen, picture
         for c in range(3):
             world[p, c] = x[b, c, p, l]
     project(world, particles, sight, screen)
+    # its two sides in their colors
     front = cloth_colors[0, 0], cloth_colors[0, 1], cloth_colors[0, 2]
     back = cloth_colors[1, 0], cloth_colors[1, 1], cloth_colors[1, 2]
     draw_triangles(colored, CLOTH, front, back, cloth, 0, cloth.shape[0], world, screen, picture)
