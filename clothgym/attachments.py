@@ -461,12 +461,12 @@ def add_pulls(first, last, x, v, free_w, topology, fabric, holder, out):
 
     f: the forces of springs, bending and air.  Blocks ``first`` to ``last``.
     """
-    stiffness, rigidity, damping_time, _, resistance, gravity, wind = fabric
+    stiffness, rigidity, damping_time, size, _, resistance, gravity, wind = fabric
     f, scratch = np.empty(x.shape[1:], x.dtype), scratch_for_forces(x[first], topology.offset)
     for b in range(first, last):
         # the forces on all particles of the block
         f[:] = 0
-        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b])
+        elastic = Elastic(stiffness[b], rigidity[b], damping_time[b], size[b])
         add_spring_forces(x[b], v[b], f, topology.elements, elastic, scratch)
         add_bend_forces(x[b], v[b], f, topology.elements, elastic, scratch)
         add_air_forces(x[b], v[b], f, topology.air, resistance[b], wind[b], x.dtype.type(0), scratch)

@@ -102,11 +102,13 @@ class Elastic(NamedTuple):
     """Coefficients of the elements' forces by lane, a part of ``state.Fabric``.
 
     stiffness: of springs by kind [N/m], (kinds, lanes).  rigidity: of hinges [N m], (lanes,).  damping_time: [s], (lanes,).
+    size: factor on the mesh's rest lengths, (lanes,).
     """
 
     stiffness: NDArray
     rigidity: NDArray
     damping_time: NDArray
+    size: NDArray
 
 
 class SurfaceArrays(NamedTuple):

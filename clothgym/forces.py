@@ -29,7 +29,7 @@ set_spring_forces = placeholder(
 )
 add_spring_products = placeholder(
     "add_spring_products",
-    "of (x, p, y, elements, along, across, bend, scratch): adds the springs' stiffness matrix times p to y",
+    "of (x, p, y, elements, size, along, across, bend, scratch): adds the springs' stiffness matrix times p to y",
 )
 add_air_forces = placeholder(
     "add_air_forces", "of (x, v, f, surface, resistance, wind, interval, scratch): adds the air's force on each triangle to f [N]"
@@ -37,11 +37,11 @@ add_air_forces = placeholder(
 
 
 @disjoint
-def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, gi, hi, fj, gj, hj):
+def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, size, tau, fi, gi, hi, fj, gj, hj):
     """Add one spring's force to both its ends, in lanes; all arrays (lanes,).
 
     xi ... zj: components of positions [m]; ui ... wj: of velocities [m/s]; fi ... hj: of forces [N].  k: stiffness of the kind
-    [N/m]; share: the spring's weight; r: rest length [m]; tau: damping time [s].
+    [N/m]; share: the spring's weight; r: rest length of the mesh [m]; size: factor on it; tau: damping time [s].
     """
     one, tiny = xi.dtype.type(1), xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
@@ -49,7 +49,7 @@ def _pull(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, k, share, r, tau, fi, 
         ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
         # f = g d, with q = 1/|d|
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-        g = share * k[l] * ((one - r * q) + tau[l] * (ux * dx + uy * dy + uz * dz) * q * q)
+        g = share * k[l] * ((one - r * size[l] * q) + tau[l] * (ux * dx + uy * dy + uz * dz) * q * q)
         fx, fy, fz = g * dx, g * dy, g * dz
         fi[l] += fx
         gi[l] += fy
@@ -64,11 +64,12 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
     """Add the force of each spring and of its damper to ``f`` [N], (3, particles, lanes).
 
     ``f_i = k ((1 - r/|d|) + tau (u . d)/|d|^2) d`` and ``f_j = -f_i``: Hooke's law, and a Kelvin-Voigt damper along the spring.  d
-    is the vector from the first end i to the second end j, u its rate of change, r the rest length, and tau the damping time.
+    is the vector from the first end i to the second end j, u its rate of change, r the rest length, that of the mesh times
+    ``elastic.size``, and tau the damping time.
     The stiffness k [N/m] is the spring's weight times the row of its kind in ``elastic.stiffness``, (kinds, lanes).
     """
     # spring by spring, each in all lanes
-    stiffness, damping_time = elastic.stiffness, elastic.damping_time
+    stiffness, damping_time, size = elastic.stiffness, elastic.damping_time, elastic.size
     ends, rest_length, kind, weight = elements.springs
     x0, x1, x2, v0, v1, v2, f0, f1, f2 = x[0], x[1], x[2], v[0], v[1], v[2], f[0], f[1], f[2]
     for s in range(ends.shape[0]):
@@ -76,7 +77,7 @@ def add_lane_forces(x, v, f, elements, elastic, scratch):
         j = ends[s, 1]
         _pull(
             x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], v0[i], v1[i], v2[i], v0[j], v1[j], v2[j], stiffness[kind[s]], weight[s],
-            rest_length[s], damping_time, f0[i], f1[i], f2[i], f0[j], f1[j], f2[j],
+            rest_length[s], size, damping_time, f0[i], f1[i], f2[i], f0[j], f1[j], f2[j],
         )  # fmt: skip
 
 
@@ -95,10 +96,11 @@ def copy(start, f):
 
 
 @disjoint
-def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, share, r, fi, gi, hi, fj, gj, hj):
+def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, share, r, size, fi, gi, hi, fj, gj, hj):
     """One spring's part of ``add_spring_products``, in lanes; all arrays (lanes,).
 
     xi ... zj: components of positions [m]; ui ... wj: of the vector p; fi ... hj: of the result.  share: the spring's weight.
+    r, size: see ``_pull``.
     """
     one, zero, tiny = xi.dtype.type(1), xi.dtype.type(0), xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
@@ -106,7 +108,7 @@ def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, sha
         ux, uy, uz = uj[l] - ui[l], vj[l] - vi[l], wj[l] - wi[l]
         # across the spring: nothing where it is compressed
         q = one / np.sqrt(dx * dx + dy * dy + dz * dz + tiny)
-        stretched = one - r * q
+        stretched = one - r * size[l] * q
         aside = share * across[l] * (stretched if stretched > zero else zero)
         # (along - aside) n n^T u + aside u
         g = (share * along[l] - aside) * (ux * dx + uy * dy + uz * dz) * q * q
@@ -120,7 +122,7 @@ def _multiply(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, along, across, sha
 
 
 @uncounted
-def add_lane_products(x, p, y, elements, along, across, bend, scratch):
+def add_lane_products(x, p, y, elements, size, along, across, bend, scratch):
     """``y <- y + K p`` with the springs' stiffness matrix K, scaled separately along and across each spring; (3, particles, lanes).
 
     A spring's block of K is ``along n n^T + across max(1 - r/|d|, 0) (I - n n^T)``, with d the vector between its ends, r the rest
@@ -135,7 +137,7 @@ def add_lane_products(x, p, y, elements, along, across, bend, scratch):
         j = ends[s, 1]
         _multiply(
             x0[i], x1[i], x2[i], x0[j], x1[j], x2[j], p0[i], p1[i], p2[i], p0[j], p1[j], p2[j], along[kind[s]], across[kind[s]],
-            weight[s], rest_length[s], y0[i], y1[i], y2[i], y0[j], y1[j], y2[j],
+            weight[s], rest_length[s], size, y0[i], y1[i], y2[i], y0[j], y1[j], y2[j],
         )  # fmt: skip
 
 
@@ -302,12 +304,16 @@ def frequency_bound(o: Oscillators) -> float:
     return float(np.sqrt(bound))
 
 
-def structural_strain(mesh: ClothMesh, x: NDArray) -> NDArray:
-    """Strain ``|d|/r - 1`` of the structural springs, or edges, (num_envs, those springs); x [m], (num_envs, particles, 3)."""
+def structural_strain(mesh: ClothMesh, x: NDArray, size: NDArray | float = 1.0) -> NDArray:
+    """Strain ``|d|/r - 1`` of the structural springs, or edges, (num_envs, those springs).
+
+    x: [m], (num_envs, particles, 3).  size: factors on the mesh's rest lengths, (num_envs,), or one.
+    """
     springs = mesh.springs
     structural = springs.kind < SHEAR
     ends = x[:, springs.particles[structural]]
-    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / springs.rest_length[structural].astype(x.dtype) - 1
+    rest = np.multiply.outer(size, springs.rest_length[structural]).astype(x.dtype)
+    return np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) / rest - 1
 
 
 class Energy(NamedTuple):
@@ -329,7 +335,8 @@ def energy(elements: Elements, bending: Bending, state: State) -> Energy:
     x, v = state.positions.astype(np.float64), state.velocities.astype(np.float64)
     mass = 1 / state.free_inverse_mass.astype(np.float64)
     ends = x[:, springs.particles]
-    stretch = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) - springs.rest_length
+    rest = np.multiply.outer(state.size.astype(np.float64), springs.rest_length)
+    stretch = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2) - rest
     k = springs.weight * state.stiffness.astype(np.float64)[:, springs.kind]
     return Energy(
         kinetic=np.sum(mass * np.sum(v**2, axis=2), axis=1) / 2,

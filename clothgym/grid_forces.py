@@ -126,22 +126,24 @@ def _gather_kinds(f, offset, kinds):
 
 
 @inlined
-def _spring_kinds(x, v, offset, weight, kind, stiffness, rest_length, tau, out, before):
+def _spring_kinds(x, v, offset, weight, kind, rest_length, elastic, out, before):
     """Forces of all kinds of springs on their first ends [N]; x, v: (3, particles); out: (3, kinds, before + particles)."""
+    stiffness, tau, size = elastic.stiffness, elastic.damping_time[0], elastic.size[0]
     for a in range(weight.shape[0]):
         _spring_kind(
-            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
-            tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
+            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0],
+            rest_length[a] * size, tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
         )  # fmt: skip
 
 
 @inlined
-def _spring_and_curve_kinds(x, v, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, out, before):
+def _spring_and_curve_kinds(x, v, offset, weight, kind, rest_length, curve, elastic, out, before):
     """``_spring_kinds``, plus the quadratic model's forces along the same offsets."""
+    stiffness, tau, rigidity, size = elastic.stiffness, elastic.damping_time[0], elastic.rigidity[0], elastic.size[0]
     for a in range(weight.shape[0]):
         _spring_and_curve_kind(
-            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0], rest_length[a],
-            curve[a], rigidity, tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
+            x[0], x[1], x[2], v[0], v[1], v[2], offset[a], x.shape[1] - offset[a], weight[a], stiffness[kind[a], 0],
+            rest_length[a] * size, curve[a], rigidity, tau, out[0, a, before:], out[1, a, before:], out[2, a, before:],
         )  # fmt: skip
 
 
@@ -158,14 +160,13 @@ def _force_kinds(x, v, elements, elastic, kinds):
     """The forces of each kind on the first ends, of springs and of the quadratic bending model if it is used, to ``kinds``."""
     # names for one lane's arrays
     offset, kind, rest_length, weight, curve, _, _ = elements
-    stiffness, tau, rigidity = elastic.stiffness, elastic.damping_time[0], elastic.rigidity[0]
     r, s = rows_of(x), rows_of(v)
     before = kinds.shape[2] - r.shape[1]
     if curve.shape[0] > 0:
-        _spring_and_curve_kinds(r, s, offset, weight, kind, stiffness, rest_length, curve, rigidity, tau, kinds, before)
-        _curve_kinds(r, s, offset, weight.shape[0], curve, rigidity, tau, kinds, before)
+        _spring_and_curve_kinds(r, s, offset, weight, kind, rest_length, curve, elastic, kinds, before)
+        _curve_kinds(r, s, offset, weight.shape[0], curve, elastic.rigidity[0], elastic.damping_time[0], kinds, before)
     else:
-        _spring_kinds(r, s, offset, weight, kind, stiffness, rest_length, tau, kinds, before)
+        _spring_kinds(r, s, offset, weight, kind, rest_length, elastic, kinds, before)
 
 
 @uncounted
@@ -221,7 +222,7 @@ def _curve_product_kind(p, o, count, curve, bend, f):
 
 
 @uncounted
-def add_grid_products(x, p, y, elements, along, across, bend, scratch):
+def add_grid_products(x, p, y, elements, size, along, across, bend, scratch):
     """``y <- y + K p``, with K the stiffness matrix of springs and of the quadratic model if it is used; (3, particles, 1).
 
     along, across: see ``forces.add_lane_products``, (kinds, 1).  bend: coefficient of the quadratic model, (1,).
@@ -238,7 +239,7 @@ def add_grid_products(x, p, y, elements, along, across, bend, scratch):
         count = r.shape[1] - o
         fx, fy, fz = kinds[0, a, before:], kinds[1, a, before:], kinds[2, a, before:]
         if a < weight.shape[0]:
-            n, t, rest = along[kind[a], 0], across[kind[a], 0], rest_length[a]
+            n, t, rest = along[kind[a], 0], across[kind[a], 0], rest_length[a] * size[0]
             b, own = (bend[0], curve[a]) if curve.shape[0] > 0 else (zero, weight[a])
             _product_kind(
                 r[0], r[1], r[2], s[0], s[1], s[2], o, count, weight[a], -n, -t, rest, -b, own, fx, fy, fz

@@ -128,6 +128,7 @@ def oscillators(
     Raises:
         ValueError: masses that are too large or too small for the type of these numbers.
     """
+    size = float(fabric.size[block, lane])
     wrong = ~((free_w[block, :, lane] > 0) & (free_w[block, :, lane] < np.inf))
     if wrong.any():
         worst = int(np.argmax(wrong))
@@ -136,10 +137,10 @@ def oscillators(
             "change the size of the sheet, or its density"
         )
     return Oscillators(
-        positions=mesh.rest_positions,
+        positions=size * mesh.rest_positions,
         elements=elements,
         stiffness=fabric.stiffness[block, :, lane].astype(np.float64),
-        rigidity=float(fabric.rigidity[block, lane]),
+        rigidity=float(fabric.rigidity[block, lane]) / (1 if bending.isotropic else size * size),
         isotropic=bending.isotropic,
         damping_time=float(fabric.damping_time[block, lane]),
         inverse_mass=free_w[block, :, lane].astype(np.float64),
@@ -212,6 +213,12 @@ def refuse_properties(integrator: Integrator, mesh: ClothMesh, before: NDArray, 
             raise ValueError(refusal(integrator, name))
         if name in integrator.shared and np.ptp(after[:, column]) > 0:
             raise ValueError(refusal(integrator, name))
+
+
+def refuse_sizes(integrator: Integrator, size: NDArray) -> None:
+    """Refuse sizes that a matrix which all environments share cannot have, (num_envs,), with a ValueError."""
+    if integrator.prepare is not None and np.any(size != 1):
+        raise ValueError(f"{integrator.name} factorizes one matrix, of the mesh as it is: no other size; make a mesh of that size")
 
 
 def refusal(integrator: Integrator, name: str) -> str:

@@ -31,7 +31,7 @@ BEFORE, AFTER, USED = 0, 1, 2
 
 largest_strain = placeholder(
     "largest_strain",
-    "of (x, topology, largest): writes the largest strain of the structural and shear springs in each lane, (lanes,)",
+    "of (x, topology, size, largest): writes the largest strain of the structural and shear springs in each lane, (lanes,)",
 )
 
 
@@ -59,17 +59,18 @@ class Limiting(NamedTuple):
     sweeps: NDArray
 
 
-def _limit_strain(x, v, w, topology, limit, report):
+def _limit_strain(x, v, w, topology, size, limit, report):
     """Shorten springs longer than ``1 + limit`` rest lengths to that length, in place.
 
-    x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  topology: see ``elements.Topology``.  report: rows
-    BEFORE, AFTER and USED, (3, lanes).  BEFORE and USED keep the largest values of the control step.
+    x [m], v [m/s]: (3, particles, lanes).  w [1/kg]: (particles, lanes).  topology: see ``elements.Topology``.  size: see
+    ``elements.Elastic``.  report: rows BEFORE, AFTER and USED, (3, lanes).  BEFORE and USED keep the largest values of the control
+    step.
     """
     lanes = x.shape[2]
     largest = np.empty(lanes, x.dtype)
     enough = x.dtype.type(limit + TOLERANCE)
     for sweep in range(SWEEPS + 1):
-        largest_strain(x, topology, largest)
+        largest_strain(x, topology, size, largest)
         # stop when all lanes are within the tolerance, or no sweep is left
         going = False
         for l in range(lanes):
@@ -83,12 +84,12 @@ def _limit_strain(x, v, w, topology, limit, report):
         for l in range(lanes):
             if largest[l] > enough:
                 report[USED, l] = max(report[USED, l], x.dtype.type(sweep + 1))
-        _sweep_springs(x, v, w, topology.springs, x.dtype.type(limit), enough, largest)
+        _sweep_springs(x, v, w, topology.springs, size, x.dtype.type(limit), enough, largest)
 
 
-def _measure_strain(x, topology, report):
+def _measure_strain(x, topology, size, report):
     """Report the largest strain at the end of a control step.  Contact comes before and ignores the limit."""
-    largest_strain(x, topology, report[AFTER])
+    largest_strain(x, topology, size, report[AFTER])
 
 
 @disjoint
@@ -105,7 +106,7 @@ def _raise_to_stretch(x, y, z, o, weight, inverse, out):
 
 
 @kernel
-def _largest_on_grid(x, topology, largest):
+def _largest_on_grid(x, topology, size, largest):
     """The largest strain of a grid's structural and shear springs, (1,); x: (3, particles, 1)."""
     offset, kind, rest_length, weight, _, _, _ = topology.elements
     # the largest squared stretch at each particle, kind by kind
@@ -118,11 +119,11 @@ def _largest_on_grid(x, topology, largest):
     largest[0] = 0
     for p in range(n):
         largest[0] = max(largest[0], out[p])
-    largest[0] = np.sqrt(largest[0]) - one
+    largest[0] = np.sqrt(largest[0]) / size[0] - one
 
 
 @kernel
-def _largest_in_lanes(x, topology, largest):
+def _largest_in_lanes(x, topology, size, largest):
     """The largest strain of the structural and shear springs, (lanes,); x: (3, particles, lanes)."""
     # the largest squared stretch
     ends, rest_length, kind, _ = topology.springs
@@ -138,11 +139,11 @@ def _largest_in_lanes(x, topology, largest):
             largest[l] = max(largest[l], (dx * dx + dy * dy + dz * dz) * inverse)
     # as a strain
     for l in range(x.shape[2]):
-        largest[l] = np.sqrt(largest[l]) - one
+        largest[l] = np.sqrt(largest[l]) / size[l] - one
 
 
 @kernel
-def _sweep_springs(x, v, w, springs, limit, enough, largest):
+def _sweep_springs(x, v, w, springs, size, limit, enough, largest):
     """Visit each structural and shear spring, in the lanes whose largest strain exceeds ``enough``.
 
     With direction n from i to j and greatest length L, ``x_i <- x_i + s (|d| - L) n`` and ``x_j <- x_j - (1 - s) (|d| - L) n``.
@@ -156,11 +157,11 @@ def _sweep_springs(x, v, w, springs, limit, enough, largest):
             continue
         i, j = ends[s, 0], ends[s, 1]
         wi, wj = w[i], w[j]
-        longest = (one + limit) * rest_length[s]
+        unscaled = (one + limit) * rest_length[s]
         for l in range(x.shape[2]):
             dx, dy, dz = x[0, j, l] - x[0, i, l], x[1, j, l] - x[1, i, l], x[2, j, l] - x[2, i, l]
             length = np.sqrt(dx * dx + dy * dy + dz * dz)
-            mobile = wi[l] + wj[l]
+            mobile, longest = wi[l] + wj[l], unscaled * size[l]
             if largest[l] > enough and length >= longest and mobile > zero:
                 # positions: back to the greatest length
                 nx, ny, nz = dx / length, dy / length, dz / length
@@ -185,12 +186,12 @@ def _sweep_springs(x, v, w, springs, limit, enough, largest):
 
 
 @kernel
-def no_limit(x, v, w, topology, limit, report):
+def no_limit(x, v, w, topology, size, limit, report):
     """No limit: the springs stay as they are."""
 
 
 @kernel
-def no_measure(x, topology, report):
+def no_measure(x, topology, size, report):
     """No limit: nothing is measured."""
 
 

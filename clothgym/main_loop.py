@@ -29,10 +29,10 @@ from clothgym.integrators.base import Work, scratch_for_work
 substep = placeholder("substep", "of an integrator: moves a block on by h [s] under springs, bending, gravity, drag and push")
 # of ``limiting``
 limit_strain = placeholder(
-    "limit_strain", "of (x, v, w, topology, limit, strain_report): pulls springs beyond the strain limit back to it"
+    "limit_strain", "of (x, v, w, topology, size, limit, strain_report): pulls springs beyond the strain limit back to it"
 )
 measure_strain = placeholder(
-    "measure_strain", "of (x, topology, strain_report): writes the largest strain at the end of a control step"
+    "measure_strain", "of (x, topology, size, strain_report): writes the largest strain at the end of a control step"
 )
 # of ``collisions.self.step``
 warm_start = placeholder("warm_start", "of (x, v, w, sheet, block, step, lead): applies the impulses of contacts with itself")
@@ -114,7 +114,7 @@ def advance(first, last, motion, topology, fabric, solids, sheet, schedule, outc
     for b in range(first, last):
         x, v, w, colliders, strain_report = motion.x[b], motion.v[b], motion.w[b], solids.rows[b], outcome.strain_report[b]
         work = Work(fields, of_springs, of_bends, of_forces, motion.remainders[b])
-        elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b])
+        elastic = Elastic(fabric.stiffness[b], fabric.rigidity[b], fabric.damping_time[b], fabric.size[b])
         drag_rate, resistance, gravity, wind = fabric.drag_rate[b], fabric.resistance[b], fabric.gravity[b], fabric.wind[b]
         push[:] = 0
         strain_report[:] = 0
@@ -126,14 +126,14 @@ def advance(first, last, motion, topology, fabric, solids, sheet, schedule, outc
             # the integrator: springs, bending, gravity, drag and that push move the particles on
             substep(x, v, w, topology.elements, elastic, drag_rate, gravity, push, h, options, plan, work)
             # springs that are stretched beyond the limit are pulled back to it
-            limit_strain(x, v, w, topology, limit, strain_report)
+            limit_strain(x, v, w, topology, elastic.size, limit, strain_report)
             # contacts of the sheet with itself press as before, so that solids bear what lies on them
             warm_start(x, v, w, sheet, b, step, lead)
             # solids move on, and push the sheet out
             resolve(x, v, w, topology.triangles, shapes, colliders, h, lead, step, look_every, of_solids)
             # the contacts' impulses are corrected, and no vertex leaves its displacement bound
             solve_self_contact(x, v, w, sheet, of_itself, b, h, lead)
-        measure_strain(x, topology, strain_report)
+        measure_strain(x, topology, elastic.size, strain_report)
         mark_diverged(x, v, outcome.diverged[b])
 
 

@@ -40,12 +40,12 @@ def _read_springs(x, v, ends, kind, weight, stiffness, rows):
 
 
 @disjoint
-def _pull(dx, dy, dz, ux, uy, uz, k, rest_length, tau):
+def _pull(dx, dy, dz, ux, uy, uz, k, rest_length, size, tau):
     """The forces on the springs' first ends [N], in place of the differences; see ``forces.add_lane_forces``."""
     one, tiny = dx.dtype.type(1), dx.dtype.type(TINY)
     for s in range(rest_length.shape[0]):
         q = one / np.sqrt(dx[s] * dx[s] + dy[s] * dy[s] + dz[s] * dz[s] + tiny)
-        g = k[s] * ((one - rest_length[s] * q) + tau * (ux[s] * dx[s] + uy[s] * dy[s] + uz[s] * dz[s]) * q * q)
+        g = k[s] * ((one - rest_length[s] * size * q) + tau * (ux[s] * dx[s] + uy[s] * dy[s] + uz[s] * dz[s]) * q * q)
         dx[s], dy[s], dz[s] = g * dx[s], g * dy[s], g * dz[s]
 
 
@@ -66,12 +66,12 @@ def _add_pulls(rows, ends, f):
 def add_sheet_forces(x, v, f, elements, elastic, scratch):
     """The forces of ``forces.add_lane_forces``."""
     ends, rest_length, kind, weight = elements.springs
-    stiffness, tau, rows = elastic.stiffness[:, 0], elastic.damping_time[0], scratch.rows
+    stiffness, tau, size, rows = elastic.stiffness[:, 0], elastic.damping_time[0], elastic.size[0], scratch.rows
     r, s, total = merged(x), merged(v), merged(f)
     for begin in range(0, ends.shape[0], BATCH):
         end = min(begin + BATCH, ends.shape[0])
         _read_springs(r, s, ends[begin:end], kind[begin:end], weight[begin:end], stiffness, rows)
-        _pull(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rest_length[begin:end], tau)
+        _pull(rows[0], rows[1], rows[2], rows[3], rows[4], rows[5], rows[6], rest_length[begin:end], size, tau)
         _add_pulls(rows, ends[begin:end], total)
 
 

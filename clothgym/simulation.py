@@ -17,6 +17,7 @@ from clothgym.checks import (
     indices,
     members,
     not_negative,
+    number,
     one_of,
     positive,
     sheets,
@@ -38,7 +39,7 @@ from clothgym.limiting import Limiting, checked_limit
 from clothgym.main_loop import MainLoop, Motion, Outcome, Schedule, Solid, compiled
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
-from clothgym.parameters import AIR_DENSITY, changed, check_properties, fabric_rows, inverse_masses, of_material
+from clothgym.parameters import AIR_DENSITY, changed, check_properties, checked_size, fabric_rows, inverse_masses, of_material
 from clothgym.state import Fabric, Orders, State, View, at_rest, check_fits
 
 GRAVITY = 9.81
@@ -70,6 +71,7 @@ class Simulation:
         strain_limit: largest strain of yarns and diagonals, see ``limiting``; None for none.
         on_divergence: "warn" or "raise" when an environment diverges, or "ignore"; ``diverged`` tells which.
         dtype: "float32", or "float64" for reference runs.
+        size: factor on all lengths of the mesh at rest; ``set_parameters`` changes it by environment.
         threads: threads to use; all processors by default.  The outcome does not depend on it.
 
     Raises:
@@ -97,6 +99,7 @@ class Simulation:
         strain_limit: float | None = None,
         on_divergence: Literal["warn", "raise", "ignore"] = "warn",
         dtype: str = "float32",
+        size: float = 1.0,
         threads: int | None = None,
     ) -> None:
         # what was asked for, checked before anything is made
@@ -123,6 +126,8 @@ class Simulation:
         self.time_step = positive("time_step", time_step)
         self.air_density = not_negative("air_density", air_density)
         self.dtype = np.dtype(dtype)
+        scale = float(checked_size(np.array([number("size", size)]))[0])
+        guards.refuse_sizes(self.integrator, np.array(scale))
         # how the batch lies in memory
         self.layout = Layout.choose(self.num_envs, self.threads, self.integrator.any_order, is_regular(mesh))
         # what holds the sheet
@@ -156,6 +161,7 @@ class Simulation:
                 anchors=self._attachments.members,
                 attachments=self._attachments.count,
                 parameters=of_material(self.material),
+                size=scale,
                 gravity=vector("gravity", gravity),
                 wind=vector("wind", wind),
                 colliders=self._solids.described(),
@@ -327,7 +333,8 @@ class Simulation:
         """What ``reset`` is given, checked, for ``begin``."""
         env = self.layout.chosen(envs)
         shape = (len(env), self.mesh.num_particles, 3)
-        x = self.mesh.rest_positions if positions is None else sheets("positions", positions, shape)
+        rest = self.size[env, None, None] * self.mesh.rest_positions
+        x = rest if positions is None else sheets("positions", positions, shape)
         v = np.zeros(3) if velocities is None else sheets("velocities", velocities, shape, (3,))
         guards.warn_if_far(x, self.mesh, self.dtype)
         if positions is not None:
@@ -352,7 +359,9 @@ class Simulation:
 
     @exclusive
     def set_parameters(self, envs: ArrayLike | None = None, warn: bool = True, **properties: ArrayLike) -> None:
-        """Change material properties (see ``Material``), ``gravity`` or ``wind`` of some environments, by value or array.
+        """Change material properties (see ``Material``), ``size``, ``gravity`` or ``wind`` of some environments, by value or array.
+
+        The size is a factor on all lengths of the mesh at rest, from 0.8 to 1.25; positions stay as they are until a reset.
 
         With ``warn``, properties that need more substeps than there are warn with the number that would do.
 
@@ -363,15 +372,17 @@ class Simulation:
         block, lane = self.layout.at(env)
         after = self._parameters.copy()
         after[env], fields = changed(self.material, after[env], properties)
-        fabric_rows(self.mesh, after[env], self.bending.hinged, self.air_density)
+        size = fields.pop("size", self.size[env])
+        self._rows(after[env], size)
         guards.refuse_properties(self.integrator, self.mesh, self._parameters, after)
-        self._parameters = after
+        guards.refuse_sizes(self.integrator, size)
+        self._parameters, self._fabric.size[block, lane] = after, size
         for name, value in fields.items():
             getattr(self._fabric, name)[block, :, lane] = value
         if len(fields) < len(properties):
             self._apply_parameters(env)
             if warn:
-                _, first = np.unique(after[env], axis=0, return_index=True)
+                _, first = np.unique(np.column_stack([after[env], size]), axis=0, return_index=True)
                 self._warn_if_beyond_bound(env[first])
 
     @exclusive
@@ -429,8 +440,9 @@ class Simulation:
         """
         check_fits(state, self._state())
         check_properties(self.material, state.parameters)
-        fabric_rows(self.mesh, state.parameters, self.bending.hinged, self.air_density)
+        self._rows(state.parameters, state.size)
         guards.refuse_properties(self.integrator, self.mesh, state.parameters, state.parameters)
+        guards.refuse_sizes(self.integrator, state.size)
         self._attachments.check(state)
         self._solids.check(state)
         self._contact.check_memory(state)
@@ -459,13 +471,18 @@ class Simulation:
         self._contact.restore(state, self._x)
         self.turn.unfinished = ()
 
+    def _rows(self, parameters: NDArray, size: NDArray) -> dict[str, NDArray]:
+        """``fabric_rows`` on this mesh."""
+        return fabric_rows(self.mesh, parameters, size, self.bending.hinged, self.bending.isotropic, self.air_density)
+
     def _apply_parameters(self, env: NDArray) -> None:
         """Write spring constants, dampers, drag and masses of environments from their material properties."""
         (block, lane), self._planned_substeps = self.layout.at(env), 0
-        for name, rows in fabric_rows(self.mesh, self._parameters[env], self.bending.hinged, self.air_density).items():
+        size = self.size[env].astype(np.float64)
+        for name, rows in self._rows(self._parameters[env], size).items():
             array = getattr(self._fabric, name)
             array[(block, slice(None), lane) if rows.ndim == 2 else (block, lane)] = rows
-        self._free_w[block, :, lane] = inverse_masses(self.mesh, self._parameters[env])
+        self._free_w[block, :, lane] = inverse_masses(self.mesh, self._parameters[env], size)
         self._apply_masses(block, lane)
 
     def _apply_masses(self, block: NDArray, lane: NDArray) -> None:
@@ -489,7 +506,7 @@ class Simulation:
         """Positions, velocities, springs and attachments in the memory of the kernels.  It is not a copy, and is read only."""
         attachments = self._attachments
         held = attachments.x, attachments.opening, attachments.blocked, attachments.holder
-        return View(self._x, self._v, self._elements.springs, *held)
+        return View(self._x, self._v, self._fabric.size, self._elements.springs, *held)
 
     @property
     def orders(self) -> Orders:
@@ -503,6 +520,11 @@ class Simulation:
     def parameters(self) -> NDArray:
         """Material properties in the order of ``parameters.PROPERTIES``, (num_envs, properties); a fresh copy."""
         return self._parameters.copy()
+
+    @property
+    def size(self) -> NDArray:
+        """Factor on the mesh's lengths at rest, (num_envs,); a fresh copy."""
+        return self.layout.to_public(self._fabric.size)
 
     @property
     def diverged(self) -> NDArray:
@@ -555,7 +577,7 @@ class Simulation:
 
     def strain(self) -> NDArray:
         """Length over rest length, minus one, of the structural springs or edges, (num_envs, those springs)."""
-        return structural_strain(self.mesh, self.positions)
+        return structural_strain(self.mesh, self.positions, self.size)
 
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy of each environment [J], (num_envs,) each, in float64."""

@@ -15,12 +15,13 @@ from clothgym.checks import LARGEST, fits, shown
 from clothgym.contact_memory import SAVED
 from clothgym.elements import SpringArrays
 from clothgym.mesh import NUM_KINDS, ClothMesh
+from clothgym.parameters import SIZES
 
-VERSION = 2  # of the format of files
+VERSION = 3  # of the format of files
 # least and greatest values in a state; all others lie within LARGEST
 NOT_NEGATIVE = ("free_inverse_mass", "stiffness", "rigidity", "damping_time", "drag_rate", "resistance", "parameters")
 RANGES: dict[str, tuple[float, float]] = {name: (0, LARGEST) for name in NOT_NEGATIVE}
-RANGES |= {"openings": (0, 1), "wanted_openings": (0, 1), "steps": (0, 2**62)}
+RANGES |= {"size": SIZES, "openings": (0, 1), "wanted_openings": (0, 1), "steps": (0, 2**62)}
 # diverge with an environment; a reset mends them
 MAY_DIVERGE = ("positions", "velocities", "remainders", "attachment_positions", "attachment_targets")
 
@@ -29,7 +30,7 @@ class Fabric(NamedTuple):
     """Parameters that may differ by lane.
 
     stiffness: spring constants by kind [N/m], (block, kinds, lane).  rigidity: of the hinges [N m], (block, lane).
-    damping_time [s], (block, lane).
+    damping_time [s], (block, lane).  size: factor on the mesh's rest lengths, (block, lane).
     drag_rate: linear drag per mass [1/s], (block, lane). resistance: half the air's density times the coefficients of drag and
     skin friction [kg/m^3], and the sheet's mass per area [kg/m^2], (block, 3, lane). gravity [m/s^2] and wind [m/s], (block, 3,
     lane).
@@ -38,6 +39,7 @@ class Fabric(NamedTuple):
     stiffness: NDArray
     rigidity: NDArray
     damping_time: NDArray
+    size: NDArray
     drag_rate: NDArray
     resistance: NDArray
     gravity: NDArray
@@ -47,7 +49,7 @@ class Fabric(NamedTuple):
 class View(NamedTuple):
     """The live memory of a simulation, for kernels that read it: see the module.
 
-    x, v: [m], [m/s], (block, 3, particles, lane).
+    x, v: [m], [m/s], (block, 3, particles, lane).  size: factor on the mesh's rest lengths, (block, lane).
     attachments: where anchors and then grippers are [m], (block, attachments, 3, lane).  openings: of their fingers, (block,
     attachments, lane).
     blocked: whether solids stopped or deflected them in the last control step, (block, attachments, lane).
@@ -56,6 +58,7 @@ class View(NamedTuple):
 
     x: NDArray
     v: NDArray
+    size: NDArray
     springs: SpringArrays
     attachments: NDArray
     openings: NDArray
@@ -87,7 +90,7 @@ class State:
         holder: which attachment holds each particle, anchors first, then grippers; -1 if none does, (num_envs, particles).
         attachment_positions, attachment_targets: where each attachment is and is going [m], (num_envs, attachments, 3).
         openings, wanted_openings: of the grippers' fingers, from 0 to 1, (num_envs, attachments).
-        stiffness, rigidity, damping_time, drag_rate, resistance, gravity, wind: see ``Fabric``.
+        stiffness, rigidity, damping_time, size, drag_rate, resistance, gravity, wind: see ``Fabric``.
         parameters: the material properties they came from, (num_envs, properties).
         colliders: pose, size, friction and velocity of each collider, (num_envs, colliders, rows).
         collider_homes: the same where they are put at a reset.
@@ -110,6 +113,7 @@ class State:
     stiffness: NDArray
     rigidity: NDArray
     damping_time: NDArray
+    size: NDArray
     drag_rate: NDArray
     resistance: NDArray
     gravity: NDArray
@@ -213,6 +217,7 @@ def at_rest(
     anchors: NDArray,
     attachments: int,
     parameters: NDArray,
+    size: float,
     gravity: NDArray,
     wind: NDArray,
     colliders: NDArray,
@@ -221,15 +226,15 @@ def at_rest(
 ) -> State:
     """A batch at its rest positions that nothing holds yet; what follows from the parameters is still zero.
 
-    anchors: particles, (anchors,).  attachments: how many.  parameters: (properties,).  gravity, wind: (3,).  colliders:
-    (colliders, rows).  contact: of self-collision, see ``contact_memory.blank``.
+    anchors: particles, (anchors,).  attachments: how many.  parameters: (properties,).  size: of the sheet, a factor.  gravity,
+    wind: (3,).  colliders: (colliders, rows).  contact: of self-collision, see ``contact_memory.blank``.
     """
 
     def each(value: NDArray) -> NDArray:
         return np.broadcast_to(value, (num_envs, *np.shape(value)))
 
     return State(
-        positions=each(mesh.rest_positions),
+        positions=each(size * mesh.rest_positions),
         velocities=np.zeros((num_envs, mesh.num_particles, 3)),
         remainders=np.zeros((num_envs, 2, 3, mesh.num_particles)),
         free_inverse_mass=np.zeros((num_envs, mesh.num_particles)),
@@ -242,6 +247,7 @@ def at_rest(
         stiffness=np.zeros((num_envs, NUM_KINDS)),
         rigidity=np.zeros(num_envs),
         damping_time=np.zeros(num_envs),
+        size=np.full(num_envs, size),
         drag_rate=np.zeros(num_envs),
         resistance=np.zeros((num_envs, 3)),
         gravity=each(gravity),

@@ -25,7 +25,7 @@ def _measure(own, rules, sheet):
     """Heights of grippers, and the coverage of the canonical outline, on the coarser grid except at the start."""
     measure_raised(own, sheet)
     if is_measured(own, sheet):
-        both, _ = shared_area(sheet.x, rules.flat, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL)
+        both, _ = shared_area(sheet.unit, rules.flat, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL)
         note_coverage(own, rules, both)
 
 
@@ -33,7 +33,7 @@ def _measure(own, rules, sheet):
 def _evaluate(own, rules, sheet, info):
     """As ``ClothFlattenShirt-v0``, with the coverage of the canonical outline, and the overlap; returns the improvement."""
     evaluate_shirt(own, rules, sheet, info)
-    both, either = shared_area(sheet.x, rules.flat, sheet.mesh.triangles, FINE_CELL)
+    both, either = shared_area(sheet.unit, rules.flat, sheet.mesh.triangles, FINE_CELL)
     info.coverage, info.overlap = min(both / rules.flat_area, 1.0), both / either
     # what covers so much of the outline covers at least as much of the floor
     info.is_success = info.is_success and info.coverage >= rules.enough and info.face_up >= ENOUGH_UP
@@ -51,7 +51,7 @@ class CanonicalizeTask(FlattenShirtTask):
     evaluation: ClassVar[Fields] = (*FlattenShirtTask.evaluation, ("overlap", float))
 
     def constants(self) -> dict[str, Any]:
-        # of the type of ``sheet.x``, as ``shared_area`` takes both
+        # of the type of ``sheet.unit``, as ``shared_area`` takes both
         return super().constants() | {"flat": np.ascontiguousarray(SHIRT.mesh.rest_positions.T, np.float32)}
 
     def pose(self) -> NDArray:

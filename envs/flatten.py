@@ -70,7 +70,7 @@ def measure_coverage(own, rules, sheet):
     """Heights of grippers, and the coverage, on the coarser grid except at the start."""
     measure_raised(own, sheet)
     if is_measured(own, sheet):
-        note_coverage(own, rules, covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL))
+        note_coverage(own, rules, covered_area(sheet.unit, sheet.mesh.triangles, FINE_CELL if own.step == 0 else CELL))
 
 
 @inlined
@@ -91,8 +91,8 @@ def spread_potential(own, rules, sheet):
 @inlined
 def evaluate_spread(own, rules, sheet, info):
     """Write the sheet's coverage and speed; returns the normalized improvement."""
-    info.coverage = min(covered_area(sheet.x, sheet.mesh.triangles, FINE_CELL) / rules.flat_area, 1.0)
-    info.softgym_coverage = softgym_area(sheet.x, rules.particle_radius) / rules.softgym_area
+    info.coverage = min(covered_area(sheet.unit, sheet.mesh.triangles, FINE_CELL) / rules.flat_area, 1.0)
+    info.softgym_coverage = softgym_area(sheet.unit, rules.particle_radius) / rules.softgym_area
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = info.coverage >= rules.enough and info.rms_speed < ENOUGH_REST and holds_nothing(own, rules, sheet)
     return improvement(info.coverage, own.coverage_start)
@@ -221,6 +221,7 @@ class FlattenTask(SpreadingTask):
     )  # fmt: skip
     seen_from = View((0.9, -1.5, 1.35), (0.0, 0.0, 0.14), 36.0, scales_from=0.6)
     acting_steps = 300
+    resizes = True
     settling_steps = 40
     picks = 6
     throws: ClassVar[int] = 2  # actions of an episode that throws
@@ -282,7 +283,7 @@ class FlattenTask(SpreadingTask):
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side
         sheets = self.sheets()
-        x = sheets[int(rng.integers(len(sheets)))].copy()
+        x = sheets[int(rng.integers(len(sheets)))] * self.sizes()[env]
         # mirrored, turned and moved
         x = x if rng.uniform() < 0.5 else self.mirrored(x)
         yaw = rng.uniform(-np.pi, np.pi)

@@ -136,6 +136,7 @@ def _strain(task: Any, e: int) -> float:
         return largest
     ends, rest, *_ = task.physics.mesh.springs
     x = task.simulation.positions[e].astype(np.float64)
+    rest = rest * task.sizes()[e]
     pulled = (task.simulation.grippers.holder[e][ends] >= 0).any(axis=1)
     return float((length(x[ends[pulled, 1]] - x[ends[pulled, 0]]) / rest[pulled]).max()) - 1
 
@@ -183,11 +184,12 @@ class Aim(NamedTuple):
     far: NDArray
 
 
-def _aim(task: Any, corner: Any, edge: int, along: NDArray) -> Aim | None:
+def _aim(task: Any, e: int, corner: Any, edge: int, along: NDArray) -> Aim | None:
     """Of a task whose sheets have to lie in one pose; corner: numbers of the held corners, edge: of their edge."""
     pose = task.pose()
     if pose is None:
         return None
+    pose = task.sizes()[e] * pose
     wanted = pose[corner[1]] - pose[corner[0]]
     angle = np.arctan2(along[0] * wanted[1] - along[1] * wanted[0], along[:2] @ wanted)
     return Aim(float(angle), *(np.append(pose[of].mean(axis=0), 0.0) for of in (EDGES[edge], OPPOSITE[edge])))
@@ -200,14 +202,15 @@ def _turned(x: NDArray, angle: float) -> NDArray:
 
 def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, throwing: Hands | None) -> Any:
     """Lift the edge, stretch it, lay the sheet down behind its far edge, or follow the way of a throw, and let go."""
-    corners, rest, side, own = task.corners, task.physics.mesh.rest_positions, task.physics.side, task.episode[e]
+    corners, size, side, own = task.corners, task.sizes()[e], task.physics.side, task.episode[e]
+    rest = size * task.physics.mesh.rest_positions
     x, v = (of[e].astype(np.float64) for of in (task.simulation.positions, task.simulation.velocities))
     ends = corners[corner]
     taut = taut_length(rest, held)
     edge = next((i for i in range(4) if set(EDGES[i]) == set(corner)), -1)
     if edge < 0:  # a diagonal
         return np.zeros((2, 3)), np.array([-1.0, 1.0])
-    deep = task.across()[edge]
+    deep = size * task.across()[edge]
     # along the edge, and to the far edge, its front up
     along = (tips[1] - tips[0]) * (1, 1, 0)
     along /= max(np.linalg.norm(along), 1e-9)
@@ -215,7 +218,7 @@ def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, 
     turn = np.cross(rest[ends[1]] - rest[ends[0]], far_rest)[2]
     out = np.array([-along[1], along[0], 0.0]) * np.sign(turn)
     middle = tips.mean(axis=0)
-    aim = _aim(task, corner, edge, along)
+    aim = _aim(task, e, corner, edge, along)
     ahead = along if aim is None else _turned(along, np.clip(aim.angle, -TURNING, TURNING))
     apart = np.stack([-ahead, ahead]) * taut / 2
     low = x[ends, 2].min()

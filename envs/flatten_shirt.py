@@ -40,7 +40,7 @@ def facing_up(x, triangles, share):
 @inlined
 def evaluate_shirt(own, rules, sheet, info):
     """Write what ``flatten`` measures, the distance of Cloth Funnels, and how far the front looks up; returns the improvement."""
-    info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.x, rules.canonical, np.sqrt(rules.flat_area))
+    info.peer_funnels, info.peer_funnels_shape, _ = funnels(sheet.unit, rules.canonical, np.sqrt(rules.flat_area))
     info.face_up = facing_up(sheet.x, sheet.mesh.triangles, rules.front)
     return evaluate_spread(own, rules, sheet, info)
 
@@ -112,7 +112,7 @@ class ClothFlattenShirtEnv(ClothEnv):
 
     The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
     along shoulders, sleeves and sides, and open at neck, hem and cuffs.  L is its width from cuff to cuff, 0.76 m.  All
-    environments have the same sizes; ``randomize`` draws fabrics.
+    environments have the same sizes; ``randomize`` draws fabrics and sizes.
 
     $physics
 

@@ -131,7 +131,7 @@ def overlap(x, share, folds, triangles, cell):
 @inlined
 def _measure(own, rules, sheet):
     """Distances of the sheet from its nearest ideal fold, and its height, in sides."""
-    error, worst, height = fold_errors(sheet.x, sheet.mesh.share, rules.folds)
+    error, worst, height = fold_errors(sheet.unit, sheet.mesh.share, rules.folds)
     own.error, own.worst, own.height = error / rules.side, worst / rules.side, height / rules.side
 
 
@@ -159,8 +159,8 @@ def _potential(own, rules, sheet):
 @inlined
 def evaluate_fold(own, rules, sheet, info):
     """Write the error of the fold, its overlap with the ideal and its speed; returns the normalized performance."""
-    info.overlap = overlap(sheet.x, sheet.mesh.share, rules.folds, sheet.mesh.triangles, FINE_CELL)
-    info.fold_error_mm = 1000 * own.error * rules.side
+    info.overlap = overlap(sheet.unit, sheet.mesh.share, rules.folds, sheet.mesh.triangles, FINE_CELL)
+    info.fold_error_mm = 1000 * own.error * rules.side * sheet.size
     info.rms_speed = np.sqrt(sheet.summary[SPEED2])
     info.is_success = _reached(own, rules) and info.rms_speed < ENOUGH_REST
     flat = 1 / (1 + (own.height / ENOUGH_FLAT) ** 4)
@@ -209,6 +209,7 @@ class FoldingTask(DirectedTask, ManipulationTask):
 
     kernels = Kernels(_potential, evaluate_fold, _observe, measure=_measure, account=_account, fingers=close_or_open)
     settling_steps = 60
+    resizes = True
     arguments: ClassVar = {**ManipulationTask.arguments, **DirectedTask.arguments}
     direction = "the sheet's own x axis as it lies at the start"
     observations = (
@@ -247,7 +248,7 @@ class FoldingTask(DirectedTask, ManipulationTask):
     # --- reset ----------------------------------------------------------------------------------------------------------
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        x, center, turn = self.lie_flat(rng, self.away, self.turned)
+        x, center, turn = self.lie_flat(env, rng, self.away, self.turned)
         self.episode["origin"][env], self.episode["turn"][env] = (*center, 0), turn
         self.hover(env, rng, x[self.below])
         return self.uneven(x, rng)
@@ -260,7 +261,7 @@ class FoldingTask(DirectedTask, ManipulationTask):
         rest, turn = self.physics.mesh.rest_positions, self.episode["turn"][:, None]
         u, v, _ = (rest - rest.mean(axis=0)).T
         across = np.stack([turn[..., 0] * u - turn[..., 1] * v, turn[..., 1] * u + turn[..., 0] * v, 0 * turn[..., 0] * u], axis=2)
-        return self.episode["origin"][:, None] + across
+        return self.episode["origin"][:, None] + self.sizes()[:, None, None] * across
 
     # --- expert and picture ---------------------------------------------------------------------------------------------
 
@@ -279,7 +280,7 @@ class FoldingTask(DirectedTask, ManipulationTask):
         found = (self.episode["best"] > EXPERT_DONE) & ~np.logical_or.reduce(holder >= 0, axis=1)
         for low, stage in zip(self.expert_low, self.stages):
             taken, goals = (np.array(part) for part in zip(*stage))
-            count, whole = len(stage), length(rest[taken] - rest[goals])
+            count, whole = len(stage), self.sizes()[:, None] * length(rest[taken] - rest[goals])
             place, tip = x[:, taken], tips[:, :count]
             met, held = length(x[:, goals] - place) < EXPERT_MET * side, holder[:, taken] >= 0
             apart = held & (holder[:, goals] < 0)

@@ -117,6 +117,7 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
 
     kernels = Kernels(_potential, _evaluate, _observe, measure=_measure, account=_account, fingers=close_or_open)
     acting_steps = 80
+    resizes = True
     settling_steps = 40
     obs_modes = ("keypoints", "particles")
     # the goals come last, for ``as_dict``
@@ -193,8 +194,8 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
         return orders
 
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
-        mesh, side, own = self.physics.mesh, self.physics.side, self.episode[env]
-        x, center, _ = self.lie_flat(rng, self.away, self.turned)
+        mesh, side, own, size = self.physics.mesh, self.physics.side, self.episode[env], self.sizes()[env]
+        x, center, _ = self.lie_flat(env, rng, self.away, self.turned)
         own["origin"] = *center, 0
         # the fold: an edge or a corner, its index, and its range
         corners, edge, first = x[list(mesh.corners)], rng.uniform() >= self.single, int(rng.integers(4))
@@ -203,10 +204,10 @@ class FoldGoalTask(DirectedTask, ManipulationTask):
         own["goal"] = corners
         if edge:
             # both move along the adjacent edges
-            own["carried"], own["width"] = (a, b), share * side
+            own["carried"], own["width"] = (a, b), share * size * side
             own["goal"][[a, b]] += share * (corners[[before, beyond]] - corners[[a, b]]) + (0, 0, LAYER)
         else:
-            own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * side
+            own["carried"], own["width"] = (a, -1), share * np.sqrt(2) * size * side
             own["goal"][a] += share * (corners[beyond] - corners[a]) + (0, 0, LAYER)
         # each gripper above its corner
         self.hover(env, rng, corners[[a, b]])

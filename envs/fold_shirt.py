@@ -104,7 +104,7 @@ def compared(x, goals):
 @inlined
 def _evaluate(own, rules, sheet, info):
     """Write what ``fold`` measures, and the distances from the folded garment; returns the normalized performance."""
-    distance, info.peer_foldnet = compared(sheet.x, rules.goals)
+    distance, info.peer_foldnet = compared(sheet.unit, rules.goals)
     info.vertex_distance = distance / rules.root_area
     return evaluate_fold(own, rules, sheet, info)
 
@@ -171,8 +171,8 @@ class ClothFoldShirtEnv(ClothEnv):
     the grippers take by the left ends of waist and leg.
 
     The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
-    sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a batch have the same sizes;
-    ``randomize`` draws fabrics.
+    sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a batch have the same
+    proportions; ``randomize`` draws fabrics, and a factor on all lengths.
 
     $physics
 

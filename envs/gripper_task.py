@@ -251,13 +251,13 @@ class ManipulationTask(GripperTask):
     def working_area(self) -> tuple[NDArray, float]:
         return np.zeros(2), self.workspace * self.physics.side
 
-    def lie_flat(self, rng: np.random.Generator, away: float, turned: float) -> tuple[NDArray, NDArray, NDArray]:
+    def lie_flat(self, env: int, rng: np.random.Generator, away: float, turned: float) -> tuple[NDArray, NDArray, NDArray]:
         """Draw a flat sheet on the floor [m], (particles, 3), its center [m], (2,), and cosine and sine of its yaw, (2,).
 
         away: how far the center may lie from the origin along x and y, in sides.  turned: by how much the sheet may be [rad].
         """
         yaw, center = rng.uniform(-turned, turned), self.physics.side * rng.uniform(-away, away, 2)
-        flat = self.physics.mesh.rest_positions - self.physics.mesh.rest_positions.mean(axis=0)
+        flat = self.sizes()[env] * (self.physics.mesh.rest_positions - self.physics.mesh.rest_positions.mean(axis=0))
         c, s = np.cos(yaw), np.sin(yaw)
         x, y = c * flat[:, 0] - s * flat[:, 1] + center[0], s * flat[:, 0] + c * flat[:, 1] + center[1]
         return np.stack([x, y, flat[:, 2] - flat[:, 2].min() + ON_FLOOR], axis=1), center, np.array([c, s])

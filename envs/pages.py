@@ -109,9 +109,9 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "randomize": (
         "``{}``",
-        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, ``friction``, ``action_delay`` '
-        "(control steps), ``action_noise`` and ``observation_noise`` (standard deviations), and the camera and colors of pictures; "
-        "info has what was drawn",
+        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, ``size``, ``friction``, '
+        "``action_delay`` (control steps), ``action_noise`` and ``observation_noise`` (standard deviations), and the camera and "
+        "colors of pictures; info has what was drawn",
     ),
     "wind": (
         "``None``", 'the arguments of ``clothgym.Wind``, ``{"speed": [0, 2], "gust": 0.5}``: adds drag and lift per triangle',

@@ -62,7 +62,8 @@ def draw(task: Task, renderer: Renderer, mode: str, envs: Sequence[int], color: 
         from clothgym.render.heat import largest_at_particles  # imported here: training draws nothing
 
         mesh = task.physics.mesh
-        values = largest_at_particles(mesh, structural_strain(mesh, positions)) / np.float32(task.strain_shown)
+        strain = structural_strain(mesh, positions, task.simulation.size[list(envs)])
+        values = largest_at_particles(mesh, strain) / np.float32(task.strain_shown)
     return renderer.rgb_batch(positions, solids, markers, values)
 
 

@@ -1,4 +1,4 @@
-"""``randomize=``: each episode draws its fabric and friction, how late and how noisy actions and observations are, and its camera.
+"""``randomize=``: each episode draws its fabric, size and friction, delay and noise of actions and observations, and its camera.
 
 Policies meet delay and noise outside of a simulation (Peng et al. 2018, "Sim-to-real transfer of robotic control with dynamics
 randomization").  They are drawn from the environment's own generator, so an episode is the same in any batch.
@@ -16,7 +16,7 @@ from clothgym.checks import finite, shown
 from clothgym.envs.episode import DIVERGED, Fields
 from clothgym.envs.observing import CAMERA, PICTURES
 from clothgym.envs.physics import checked_ranges
-from clothgym.parameters import PROPERTIES
+from clothgym.parameters import PROPERTIES, SIZES
 
 if TYPE_CHECKING:
     from clothgym.envs.task import Task
@@ -27,18 +27,20 @@ OF_CAMERAS: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 OF_COLORS: dict[str, tuple[float, float]] = {"brightness": (0, 4), "hue": (-180, 180)}
 LIMITS: dict[str, tuple[float, float]] = {
-    "friction": (0, 10), "action_delay": (0, 100), "action_noise": (0, 10), "observation_noise": (0, 10), **OF_CAMERAS, **OF_COLORS,
+    "size": SIZES, "friction": (0, 10), "action_delay": (0, 100), "action_noise": (0, 10), "observation_noise": (0, 10),
+    **OF_CAMERAS, **OF_COLORS,
 }  # fmt: skip
 PREFIX = "randomization/"  # of the keys in info
 
 
 class Disturbances:
-    """Friction of the solids, delay and noise of the actions, noise, camera and colors of the observations, of a batch.
+    """Size of the sheets, friction of the solids, delay and noise of actions, noise, camera and colors of observations, of a batch.
 
     Attributes:
-        ranges: of those of ``LIMITS`` that are drawn: the coefficient ``friction`` of all solids; ``action_delay``, in control
-            steps; and standard deviations of normal noise: ``action_noise``, in each number of an action and control step, and
-            ``observation_noise``, in each number of the state vector, in its unit; and those of pictures, see ``views``.
+        ranges: of those of ``LIMITS`` that are drawn: ``size``, a factor on all lengths of the sheet; the coefficient ``friction``
+            of all solids; ``action_delay``, in control steps; and standard deviations of normal noise: ``action_noise``, in each
+            number of an action and control step, and ``observation_noise``, in each number of the state vector, in its unit; and
+            those of pictures, see ``views``.
         max_delay: the longest delay that can be drawn, in control steps.
     """
 
@@ -67,10 +69,16 @@ class Disturbances:
         drawn: Fields = [(name, float) for name in self.ranges]
         return [*drawn, ("last_actions", float, (self.max_delay + 1, actions))] if self.max_delay else drawn
 
+    def draw_size(self, own: Any, generator: np.random.Generator) -> None:
+        """Draw the size of an episode's sheet, from which its start follows, into its record."""
+        if "size" in self.ranges:
+            own["size"] = generator.uniform(*self.ranges["size"])
+
     def draw(self, own: Any, generator: np.random.Generator) -> None:
-        """Draw an episode's, into its record."""
+        """Draw an episode's, but for its size, into its record."""
         for name, (low, high) in self.ranges.items():
-            own[name] = generator.integers(int(low), int(high) + 1) if name == "action_delay" else generator.uniform(low, high)
+            if name != "size":
+                own[name] = generator.integers(int(low), int(high) + 1) if name == "action_delay" else generator.uniform(low, high)
 
     def applied(self, task: Task, actions: NDArray, envs: NDArray) -> NDArray:
         """What reaches the attachments in a control step: noisy actions of some steps ago, zeros in the first steps.

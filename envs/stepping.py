@@ -155,7 +155,8 @@ def mesh_arrays(mesh: ClothMesh, particles: NDArray) -> Mesh:
 class Sheet(NamedTuple):
     """One environment as a task's kernels see it, wherever it lies in memory.
 
-    x, v: [m], [m/s], (3, particles), contiguous.  holder: which attachment holds each particle, or -1, (particles,).
+    x, v: [m], [m/s], (3, particles), contiguous.  size: factor on the mesh's lengths.  unit: positions over the size, as of a sheet
+    of the mesh's own lengths [m], (3, particles).  holder: which attachment holds each particle, or -1, (particles,).
     attachments: where the attachments are, anchors first, then grippers [m], (attachments, 3).  openings: of their fingers,
     (attachments,).  holds: particles that each holds, (attachments,).
     pulls: of the sheet at the attachments [N], (attachments, 3), for tasks that ask for them.  air: the wind of each step [m/s],
@@ -164,6 +165,8 @@ class Sheet(NamedTuple):
 
     x: NDArray
     v: NDArray
+    size: float
+    unit: NDArray
     holder: NDArray
     attachments: NDArray
     openings: NDArray
@@ -220,38 +223,39 @@ def apply_actions(envs, actions, block, lane, rules, episode, air, outcome, targ
 
 
 def finish_step(
-    first, last, envs, block, lane, begins, x, v, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air, outcome,
-    info, terms, seen, more, bound, observation,
+    first, last, envs, block, lane, begins, x, v, size, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air,
+    outcome, info, terms, seen, more, bound, observation,
 ):  # fmt: skip
     """Score and observe environments ``envs[first:last]`` after a control step; or as their episodes begin, if it ``begins``.
 
-    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, holder, attachments, openings, blocked: a simulation's, see
+    block, lane: of each of ``envs``, see ``Layout.at``.  x, v, size, holder, attachments, openings, blocked: a simulation's, see
     ``state.View``.
     pulls: (len(envs), attachments, 3).  more: ``seen`` as numbers.
     """
     # room for one environment's ``Sheet``, used for one after the other
-    points, summary = np.empty((2, 3, holder.shape[1]), x.dtype), np.empty(SUMMARY, x.dtype)
+    points, summary = np.empty((3, 3, holder.shape[1]), x.dtype), np.empty(SUMMARY, x.dtype)
     holds = np.empty(attachments.shape[1], np.int64)
     for i in range(first, last):
         finish_one(
-            envs[i], block[i], lane[i], begins, x, v, holder, attachments, openings, blocked, pulls[i], mesh, rules, episode, air,
-            outcome, info, terms, seen, more, bound, observation, points, summary, holds,
+            envs[i], block[i], lane[i], begins, x, v, size, holder, attachments, openings, blocked, pulls[i], mesh, rules, episode,
+            air, outcome, info, terms, seen, more, bound, observation, points, summary, holds,
         )  # fmt: skip
 
 
 @uncounted
 def finish_one(
-    e, b, l, begins, x, v, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air, outcome, info, terms, seen,
-    more, bound, observation, points, summary, holds,
+    e, b, l, begins, x, v, size, holder, attachments, openings, blocked, pulls, mesh, rules, episode, air, outcome, info, terms,
+    seen, more, bound, observation, points, summary, holds,
 ):  # fmt: skip
     """The same for environment ``e`` in block ``b`` and lane ``l``; points, summary, holds: room for its ``Sheet``."""
     own, rule = episode[e], rules[0]
     # the sheet, gathered from wherever it lies in memory, and its summary
-    copy_points(x, v, b, l, points)
+    copy_points(x, v, size[b, l], b, l, points)
     count_holds(holder[b, :, l], holds)
     summarize(points[0], points[1], mesh.share, mesh.ends, mesh.inverse2, summary)
+    summary[STRETCH2] /= size[b, l] * size[b, l]
     held = holder[b, :, l], attachments[b, :, :, l], openings[b, :, l], holds
-    sheet = Sheet(points[0], points[1], *held, pulls, air[e], summary, mesh)
+    sheet = Sheet(points[0], points[1], size[b, l], points[2], *held, pulls, air[e], summary, mesh)
     # attachments stay where they are as an episode starts, and go on from where a solid has stopped them
     for k in range(attachments.shape[1]):
         if begins or blocked[b, k, l]:
@@ -320,11 +324,11 @@ def score(own, rule, sheet, out, info, terms):
 
 
 @uncounted
-def copy_points(x, v, b, l, points):
-    """Positions and velocities of one environment, in its block and lane, to (2, 3, particles)."""
+def copy_points(x, v, size, b, l, points):
+    """Positions, velocities, and positions over the size, of one environment, in its block and lane, to (3, 3, particles)."""
     for p in range(points.shape[2]):
         for c in range(3):
-            points[0, c, p], points[1, c, p] = x[b, c, p, l], v[b, c, p, l]
+            points[0, c, p], points[1, c, p], points[2, c, p] = x[b, c, p, l], v[b, c, p, l], x[b, c, p, l] / size
 
 
 @inlined

@@ -116,6 +116,7 @@ class Task:
         arguments: meaning of the task's own keywords, for the page, and of keywords with a different meaning in this task.
         ranges: least and greatest value of the fields of episodes, for ``set_state``; other fields may have any finite value.
         strain_shown: upper end of the colors of render_color="strain".
+        resizes: whether episodes can draw the size of the sheet: its start follows ``sizes``, and it is measured by ``Sheet.unit``.
         seen_from: camera position of films.
         simulation: the batch of sheets.
         sheet: rows and side as given.
@@ -154,6 +155,7 @@ class Task:
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     strain_shown: ClassVar[float] = 0.05
     seen_from: ClassVar[View | None] = None
+    resizes: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -202,11 +204,13 @@ class Task:
         check_ranges(fixed, self.randomize, method)
         if substeps is None:
             as_tuned = method.name == fixed.integrator and fixed.material == own.material
-            substeps = fixed.substeps if as_tuned and not self.randomize else "auto"
+            as_tuned &= not self.randomize and "size" not in self.disturbances.ranges
+            substeps = fixed.substeps if as_tuned else "auto"
         self.simulation = Simulation(
             fixed.mesh,
-            # substeps follow from the stiffest and lightest fabric that can be drawn, not from one that was
+            # substeps follow from the stiffest, lightest and smallest sheet that can be drawn, not from one that was
             material=most_demanding(fixed.material, self.randomize),
+            size=self.disturbances.ranges.get("size", (1.0,))[0],
             num_envs=num_envs,
             integrator=method,
             time_step=fixed.time_step,
@@ -224,6 +228,8 @@ class Task:
             on_divergence="ignore",  # a step's outcome says so
         )
         check_settling(self)
+        if "size" in self.disturbances.ranges and not self.resizes:
+            raise ValueError("randomize: no size in this task, whose targets suit one sheet; tasks that fold and flatten have it")
         if "friction" in self.disturbances.ranges and not self.simulation.colliders:
             raise ValueError("randomize: no friction in a task without solids")
         self.num_envs, self.threads = num_envs, self.simulation.threads
@@ -307,6 +313,10 @@ class Task:
     def step_seconds(self) -> float:
         """How long a step lasts in the simulation [s]."""
         return self.control_steps * self.physics.time_step
+
+    def sizes(self) -> NDArray[np.float64]:
+        """Factor on all lengths of each sheet that its episode has drawn, (num_envs,)."""
+        return self.episode["size"].copy() if "size" in self.disturbances.ranges else np.ones(self.num_envs)
 
     # --- what a task defines: start -----------------------------------------------------------------------------------
 
@@ -476,6 +486,7 @@ class Task:
             generator = self.generators.of(env, seed)
             self._begun[env] = True
             self._draw_material(env, options.get("material", {}))
+            self.disturbances.draw_size(self.episode[env], generator)
             if self.wind is not None:
                 self.air[env] = self.wind.series(generator, self.air.shape[1], self.physics.time_step)
             starts[k] = hooks.start(self, env, generator, options)
@@ -490,6 +501,8 @@ class Task:
             # the declared ranges were held against the integrator's bound at construction; one episode's fabric is now
             properties = {name: material[:, i] for i, name in enumerate(PROPERTIES)}
             simulation.set_parameters(envs, warn=warn, **properties)
+        if "size" in self.disturbances.ranges:
+            simulation.set_parameters(envs, warn=False, size=self.episode["size"][envs])
         if self.wind is not None:
             simulation.set_wind(self.air[envs, 0], envs)
         self._place_colliders(envs)
@@ -655,9 +668,9 @@ class Task:
 
         def work(first: int, last: int) -> None:
             self._finish_step(
-                first, last, envs, block, lane, begins, view.x, view.v, view.holder, view.attachments, view.openings, view.blocked,
-                pulls, mesh, self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen, self._more,
-                self.state_bound, self.observation,
+                first, last, envs, block, lane, begins, view.x, view.v, view.size, view.holder, view.attachments, view.openings,
+                view.blocked, pulls, mesh, self.rules, self.episode, self.air, self.outcome, self.info, self.terms, self.seen,
+                self._more, self.state_bound, self.observation,
             )  # fmt: skip
 
         _jit.run_spans(work, len(envs), min(self.threads, max(1, len(envs) // ENVS_A_THREAD)))

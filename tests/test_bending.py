@@ -22,7 +22,7 @@ def lanes_of(x, lanes):
 
 def no_springs(lanes, damping_time=0.0):
     """What forces scale with where hinges alone hold."""
-    return Elastic(np.zeros((NUM_KINDS, lanes)), np.full(lanes, B), np.full(lanes, damping_time))
+    return Elastic(np.zeros((NUM_KINDS, lanes)), np.full(lanes, B), np.full(lanes, damping_time), np.ones(lanes))
 
 
 def room(x):

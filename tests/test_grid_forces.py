@@ -30,6 +30,7 @@ from clothgym.integrators.base import Work, advance_velocities, kick_and_drift, 
 
 SHAPES = [(2, 2), (2, 3), (5, 2), (4, 7), (9, 9)]
 STIFFNESS = np.array([210, 190, 0, 90, 3, 2, 0.0])
+SIZE = 1.1
 
 
 def thrown(mesh, dtype, seed=0):
@@ -41,7 +42,7 @@ def thrown(mesh, dtype, seed=0):
 
 
 def properties(dtype, rigidity=1e-3):
-    return Elastic(STIFFNESS.astype(dtype)[:, None], np.full(1, rigidity, dtype), np.full(1, 2e-3, dtype))
+    return Elastic(STIFFNESS.astype(dtype)[:, None], np.full(1, rigidity, dtype), np.full(1, 2e-3, dtype), np.full(1, SIZE, dtype))
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -62,7 +63,7 @@ def test_a_particle_gets_the_bits_of_a_plain_loop_over_the_springs(shape):
         for i, j in ends:
             d, u = x[:, j, 0] - x[:, i, 0], v[:, j, 0] - v[:, i, 0]
             q = one / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2] + real(TINY))
-            g = (one - length * q) + tau * (u[0] * d[0] + u[1] * d[1] + u[2] * d[2]) * q * q
+            g = (one - length * real(SIZE) * q) + tau * (u[0] * d[0] + u[1] * d[1] + u[2] * d[2]) * q * q
             force = real(weights[i, j]) * real(STIFFNESS[kind]) * g * d
             expected[:, i] += force
             expected[:, j] -= force
@@ -80,14 +81,14 @@ def test_forces_and_products_are_those_of_lanes(shape, bending):
     scratch = scratch_for_forces(x, elements.offset)
     y = np.zeros_like(f)
     add_grid_forces(x, v, f, elements, elastic, scratch)
-    add_grid_products(x, v, y, elements, along, across, bend, scratch)
+    add_grid_products(x, v, y, elements, elastic.size, along, across, bend, scratch)
     if bending == "hinge":
         add_grid_hinge_forces(x, v, f, elements, elastic, scratch)
         add_grid_hinge_products(x, v, y, elements, bend, scratch)
     single = element_arrays(mesh, np.dtype(real), bending != "springs", any_order=True)
     row, f2, y2 = scratch_for_forces(x, np.zeros(0, np.int64)), np.zeros_like(f), np.zeros_like(f)
     add_lane_forces(x, v, f2, single, elastic, row)
-    add_lane_products(x, v, y2, single, along, across, bend, row)
+    add_lane_products(x, v, y2, single, elastic.size, along, across, bend, row)
     if bending == "hinge":
         add_hinge_forces(x, v, f2, single, elastic, row)
         add_hinge_products(x, v, y2, single, bend, row)

@@ -22,7 +22,12 @@ def thrown(lanes, real=np.float32):
 
 
 def properties(lanes):
-    rows = np.linspace(1, 2, NUM_KINDS)[:, None] * [150.0, 80.0], np.array([2e-4, 1e-4]), np.array([1e-3, 2e-3])
+    rows = (
+        np.linspace(1, 2, NUM_KINDS)[:, None] * [150.0, 80.0],
+        np.array([2e-4, 1e-4]),
+        np.array([1e-3, 2e-3]),
+        np.array([1.0, 0.9]),
+    )
     return Elastic(*(part[..., -lanes:].astype(np.float32) for part in rows))
 
 

@@ -15,14 +15,14 @@ from clothgym.mesh import BEND_X, BEND_Y, SHEAR, STRUCTURAL_X, STRUCTURAL_Y
 LIMIT = 0.1
 
 
-def limited(mesh, x, v, w, limit=LIMIT):
+def limited(mesh, x, v, w, limit=LIMIT, size=1.0):
     """What the kernel makes of one lane: positions, velocities and its report."""
     x, v, w = x.T[:, :, None].copy(), v.T[:, :, None].copy(), np.asarray(w, float)[:, None]
     real = np.dtype(np.float64)
     elements = element_arrays(mesh, real, hinged=False, any_order=False)
     topology = topology_of(mesh, elements, surface_arrays(mesh, real), "springs", regular=False)
     report = np.zeros((3, 1))
-    kernels_of(True, "lanes")["limit_strain"](x, v, w, topology, limit, report)
+    kernels_of(True, "lanes")["limit_strain"](x, v, w, topology, np.full(1, size), limit, report)
     return x[:, :, 0].T, v[:, :, 0].T, report[:, 0]
 
 
@@ -36,6 +36,12 @@ def test_a_spring_of_125_percent_comes_back_by_its_free_ends(w, ends):
     assert x[:, 0] == pytest.approx(ends, abs=1e-12)
     assert report[BEFORE] == pytest.approx(0.25) and report[AFTER] == pytest.approx(ends[1] - ends[0] - 1)
     assert report[USED] == (1 if any(w) else 100)
+
+
+def test_the_limit_is_of_the_rest_length_times_the_size():
+    x, _, report = limited(line_mesh(2), np.array([[0, 0, 0], [1.25, 0, 0]]), np.zeros((2, 3)), (0, 1), size=0.8)
+    assert x[:, 0] == pytest.approx((0, 0.88), abs=1e-12)
+    assert report[BEFORE] == pytest.approx(1.25 / 0.8 - 1) and report[AFTER] == pytest.approx(LIMIT)
 
 
 @pytest.mark.parametrize(("speed", "along"), [(0.5, (0.4, 0.4)), (-0.5, (0.0, -0.5))])

@@ -159,7 +159,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     ``integrators.base``.
     """
     # names for options and scratch
-    stiffness, rigidity, damping_time = elastic
+    stiffness, rigidity, damping_time, size = elastic
     t = x.dtype.type
     zero = t(0)
     lanes, scratch = x.shape[2], work.scratch
@@ -189,7 +189,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         if newton == 0:
             for l in range(lanes):
                 bend[l] = -rigidity[l] * h * h
-            add_spring_products(x, v, r, elements, across, across, bend, scratch)
+            add_spring_products(x, v, r, elements, size, across, across, bend, scratch)
             add_bend_products(x, v, r, elements, bend, scratch)
             for kind in range(stiffness.shape[0]):
                 for l in range(lanes):
@@ -216,7 +216,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
                 break
             # the search direction p, and q = (M + h D + h^2 K) p
             _next_direction(w, r, p, q, step)
-            add_spring_products(x, p, q, elements, along, across, bend, scratch)
+            add_spring_products(x, p, q, elements, size, along, across, bend, scratch)
             add_bend_products(x, p, q, elements, bend, scratch)
             # the step length rho / (p . q), zero for lanes that are done
             _sum_of_products(p, q, step)

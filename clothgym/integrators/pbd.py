@@ -43,19 +43,19 @@ def surely_allowed(o: Oscillators) -> float:
 
 
 @disjoint
-def _project_rigid(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, share, r, tiny):
+def _project_rigid(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, share, r, size, tiny):
     """Project one spring, in lanes: ``dp_i = k' w_i/(w_i + w_j) (|d| - r) d/|d|``, ``dp_j = -w_j/w_i dp_i`` (their section 3.3).
 
     d: the vector from i to j at the end of the substep, over h.  xi ... zj: components of both ends' places over h [m/s]; ui ...
     wj: of their velocities [m/s], which change by dp/h; mi, mj: inverse masses [1/kg]; all (lanes,).  share: k'.  r: rest length
-    over h [m/s].  tiny: see ``xpbd.TINY``.
+    of the mesh over h [m/s].  size: factor on it.  tiny: see ``xpbd.TINY``.
     """
     massless = xi.dtype.type(TINY)
     for l in range(xi.shape[0]):
         dx, dy, dz = (xj[l] - xi[l]) + (uj[l] - ui[l]), (yj[l] - yi[l]) + (vj[l] - vi[l]), (zj[l] - zi[l]) + (wj[l] - wi[l])
         d2 = dx * dx + dy * dy + dz * dz + tiny
         # the change of velocity of a unit of inverse mass, over d
-        s = share * (d2 - r * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + massless))
+        s = share * (d2 - r * size[l] * np.sqrt(d2)) / (d2 * (mi[l] + mj[l] + massless))
         ui[l] += mi[l] * s * dx
         vi[l] += mi[l] * s * dy
         wi[l] += mi[l] * s * dz
@@ -65,7 +65,7 @@ def _project_rigid(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, share
 
 
 @kernel
-def project_rigid_springs(y, u, w, springs, h, stretch, bend):
+def project_rigid_springs(y, u, w, springs, size, h, stretch, bend):
     """One pass over the springs, which changes u: remove the share ``stretch`` of each error, or ``bend`` for springs that bend.
 
     y, u: see ``xpbd.set_out``.  w [1/kg]: (particles, lanes).
@@ -80,7 +80,7 @@ def project_rigid_springs(y, u, w, springs, h, stretch, bend):
         share = bend if kind[s] > SHEAR else stretch
         _project_rigid(
             y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], share,
-            rest_length[s] * per_step, tiny,
+            rest_length[s] * per_step, size, tiny,
         )  # fmt: skip
 
 
@@ -115,7 +115,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     v* is the velocity after gravity, drag and the air.  As in ``xpbd``, velocities u stand for p: they change by dp/h.
     Arguments, shapes and units are those of ``integrators.base``.
     """
-    _, rigidity, damping_time = elastic
+    _, rigidity, damping_time, size = elastic
     t = x.dtype.type
     iterations, stretch, bend = options
     # bends are projected as in xpbd: rigid, without damping, and by the share k'
@@ -127,7 +127,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
     # v*; project the constraints; the new velocities and positions
     y, u = set_out(x, v, w, gravity, push, drag_rate, h, work)
     for _ in range(iterations):
-        project_rigid_springs(y, u, w, elements.springs, h, share_stretch, share_bend)
+        project_rigid_springs(y, u, w, elements.springs, size, h, share_stretch, share_bend)
         project_bends(y, u, w, elements.bends, h, inverse_alpha_tilde, gamma, share_bend, work.of_bends, work.scratch)
     arrive(x, v, h, work)
 

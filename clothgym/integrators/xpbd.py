@@ -136,11 +136,11 @@ def arrive(x, v, h, work):
 
 
 @disjoint
-def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, compliant, r, tiny, alpha_tilde, gamma):
+def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, compliant, r, size, tiny, alpha_tilde, gamma):
     """Project one spring, in lanes; all arrays (lanes,).
 
     xi ... zj: components of both ends' places over h [m/s]; ui ... wj: of their velocities [m/s]; mi, mj: inverse masses [1/kg].
-    compliant: one over the spring's weight.  r: rest length over h [m/s].  tiny: see ``TINY``.
+    compliant: one over the spring's weight.  r: rest length of the mesh over h [m/s].  size: factor on it.  tiny: see ``TINY``.
     """
     one = xi.dtype.type(1)
     for l in range(xi.shape[0]):
@@ -150,7 +150,7 @@ def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, compliant, 
         d2 = dx * dx + dy * dy + dz * dz + tiny
         g = gamma[l]
         # eq. 26: the error is |d| (C + gamma grad C . (x - x^n)), and delta lambda is over |d|, as it multiplies d below
-        error = d2 - r * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
+        error = d2 - r * size[l] * np.sqrt(d2) + g * (ux * dx + uy * dy + uz * dz)
         delta_lambda = error / (d2 * ((one + g) * (mi[l] + mj[l]) + compliant * alpha_tilde[l]))
         px, py, pz = delta_lambda * dx, delta_lambda * dy, delta_lambda * dz
         # u <- u + w grad C delta lambda
@@ -163,7 +163,7 @@ def _project(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, compliant, 
 
 
 @apart
-def project_springs(y, u, w, springs, h, alpha_tilde, gamma):
+def project_springs(y, u, w, springs, size, h, alpha_tilde, gamma):
     """A single pass over the springs, which changes u: eq. 26 with lambda = 0.
 
     y, u: see ``set_out``.  w [1/kg]: (particles, lanes).  alpha_tilde: ``1/(k h^2)`` [1/kg], (kinds, lanes).  gamma: ``tau/h``,
@@ -171,7 +171,7 @@ def project_springs(y, u, w, springs, h, alpha_tilde, gamma):
     """
     # a single environment has its own loop: loops over one lane are slow
     if y.shape[2] == 1:
-        _project_springs_of_one(merged(y), merged(u), w[:, 0], springs, h, alpha_tilde[:, 0], gamma[0])
+        _project_springs_of_one(merged(y), merged(u), w[:, 0], springs, size[0], h, alpha_tilde[:, 0], gamma[0])
         return
     # spring by spring, each in all lanes
     ends, rest_length, kind, weight = springs
@@ -183,12 +183,12 @@ def project_springs(y, u, w, springs, h, alpha_tilde, gamma):
         j = ends[s, 1]
         _project(
             y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], one / weight[s],
-            rest_length[s] * per_step, tiny, alpha_tilde[kind[s]], gamma,
+            rest_length[s] * per_step, size, tiny, alpha_tilde[kind[s]], gamma,
         )  # fmt: skip
 
 
 @kernel
-def _project_springs_of_one(y, u, w, springs, h, alpha_tilde, gamma):
+def _project_springs_of_one(y, u, w, springs, size, h, alpha_tilde, gamma):
     """``project_springs`` for one environment: y, u (3, particles), w (particles,), alpha_tilde (kinds,)."""
     ends, rest_length, kind, weight = springs
     one, per_step = y.dtype.type(1), y.dtype.type(1) / h
@@ -202,7 +202,7 @@ def _project_springs_of_one(y, u, w, springs, h, alpha_tilde, gamma):
         d2 = dx * dx + dy * dy + dz * dz + tiny
         compliant = one / weight[s]
         # eq. 26 as in ``_project``, and the change of velocities
-        error = d2 - rest_length[s] * per_step * np.sqrt(d2) + gamma * (ux * dx + uy * dy + uz * dz)
+        error = d2 - rest_length[s] * per_step * size * np.sqrt(d2) + gamma * (ux * dx + uy * dy + uz * dz)
         delta_lambda = error / (d2 * ((one + gamma) * (w[i] + w[j]) + compliant * alpha_tilde[kind[s]]))
         px, py, pz = delta_lambda * dx, delta_lambda * dy, delta_lambda * dz
         u[0, i] += w[i] * px
@@ -214,7 +214,9 @@ def _project_springs_of_one(y, u, w, springs, h, alpha_tilde, gamma):
 
 
 @disjoint
-def _project_with_memory(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, weight, r, tiny, inverse_alpha_tilde, gamma, lam):
+def _project_with_memory(
+    xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj, weight, r, size, tiny, inverse_alpha_tilde, gamma, lam
+):  # fmt: skip
     """``_project`` with a multiplier, ``lam`` [kg m/s], (lanes,), which it updates; all arrays (lanes,)."""
     one = xi.dtype.type(1)
     for l in range(xi.shape[0]):
@@ -225,7 +227,7 @@ def _project_with_memory(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj,
         g = gamma[l]
         # eq. 26 over alpha~: (C + gamma grad C . (x - x^n))/alpha~, and delta lambda
         k = weight * inverse_alpha_tilde[l]
-        error = k * (length - r + g * (ux * dx + uy * dy + uz * dz) * inverse)
+        error = k * (length - r * size[l] + g * (ux * dx + uy * dy + uz * dz) * inverse)
         delta_lambda = (error - lam[l]) / (k * (one + g) * (mi[l] + mj[l]) + one)
         lam[l] += delta_lambda
         # u <- u + w grad C delta lambda, with grad C = d/|d|
@@ -239,7 +241,7 @@ def _project_with_memory(xi, yi, zi, xj, yj, zj, ui, vi, wi, uj, vj, wj, mi, mj,
 
 
 @kernel
-def project_springs_with_memory(y, u, w, springs, h, inverse_alpha_tilde, gamma, lam):
+def project_springs_with_memory(y, u, w, springs, size, h, inverse_alpha_tilde, gamma, lam):
     """One of several passes over the springs: eq. 26 with the multipliers ``lam`` over h [kg m/s], (springs, lanes).
 
     inverse_alpha_tilde: ``k h^2`` [kg], (kinds, lanes).  The equation is multiplied by it, so that a stiffness of zero is no
@@ -254,7 +256,7 @@ def project_springs_with_memory(y, u, w, springs, h, inverse_alpha_tilde, gamma,
         j = ends[s, 1]
         _project_with_memory(
             y0[i], y1[i], y2[i], y0[j], y1[j], y2[j], u0[i], u1[i], u2[i], u0[j], u1[j], u2[j], w[i], w[j], weight[s],
-            rest_length[s] * per_step, tiny, inverse_alpha_tilde[kind[s]], gamma, lam[s],
+            rest_length[s] * per_step, size, tiny, inverse_alpha_tilde[kind[s]], gamma, lam[s],
         )  # fmt: skip
 
 
@@ -264,7 +266,7 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
 
     v* is the velocity after gravity, drag and the air.  Arguments, shapes and units are those of ``integrators.base``.
     """
-    stiffness, rigidity, damping_time = elastic
+    stiffness, rigidity, damping_time, size = elastic
     springs, bends = elements.springs, elements.bends
     one = x.dtype.type(1)
     lanes = x.shape[2]
@@ -284,14 +286,14 @@ def substep(x, v, w, elements, elastic, drag_rate, gravity, push, h, options, pl
         gamma[l] = damping_time[l] / h
     if iterations == 1:
         # a single pass: lambda is zero
-        project_springs(y, u, w, springs, h, alpha_tilde, gamma)
+        project_springs(y, u, w, springs, size, h, alpha_tilde, gamma)
         project_bends(y, u, w, bends, h, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
     else:
         # several passes: lambda starts from zero, and accumulates
         work.of_springs[:] = 0
         work.of_bends[:] = 0
         for _ in range(iterations):
-            project_springs_with_memory(y, u, w, springs, h, inverse_alpha_tilde, gamma, work.of_springs)
+            project_springs_with_memory(y, u, w, springs, size, h, inverse_alpha_tilde, gamma, work.of_springs)
             project_bends(y, u, w, bends, h, inverse_alpha_tilde_bend, gamma, one, work.of_bends, work.scratch)
     # the new velocities, and positions with them
     arrive(x, v, h, work)
