@@ -133,8 +133,8 @@ def oscillators(
     if wrong.any():
         worst = int(np.argmax(wrong))
         raise ValueError(
-            f"particle {worst} stands for {mesh.area[worst]:.3g} m^2: its mass, or one over it, is beyond {free_w.dtype.name}: "
-            "change the size of the sheet, or its density"
+            f"particle {worst} stands for {size**2 * mesh.area[worst]:.3g} m^2: its mass, or one over it, is beyond "
+            f"{free_w.dtype.name}: change the size of the sheet, or its density"
         )
     return Oscillators(
         positions=size * mesh.rest_positions,
@@ -218,7 +218,9 @@ def refuse_properties(integrator: Integrator, mesh: ClothMesh, before: NDArray, 
 def refuse_sizes(integrator: Integrator, size: NDArray) -> None:
     """Refuse sizes that a matrix which all environments share cannot have, (num_envs,), with a ValueError."""
     if integrator.prepare is not None and np.any(size != 1):
-        raise ValueError(f"{integrator.name} factorizes one matrix, of the mesh as it is: no other size; make a mesh of that size")
+        raise ValueError(
+            f"{integrator.name} factorizes one matrix, of the mesh as it is, and takes no size but 1: make a mesh of that size"
+        )
 
 
 def refusal(integrator: Integrator, name: str) -> str:

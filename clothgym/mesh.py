@@ -131,6 +131,25 @@ class ClothMesh:
         rows, columns = self.grid_shape
         return 0, columns - 1, (rows - 1) * columns, rows * columns - 1
 
+    def scaled(self, size: float) -> ClothMesh:
+        """The same sheet with all lengths at rest multiplied by a size.
+
+        Raises:
+            ValueError: a size that is not positive and finite.
+        """
+        size = positive("size", size)
+        springs, hinges = self.springs, self.hinges
+        # skip springs of triangles store their energy per curvature: their weight is one over an area
+        weight = np.where(springs.kind == OPPOSITE, springs.weight / size**2, springs.weight)
+        return replace(
+            self,
+            size=(size * self.size[0], size * self.size[1]),
+            rest_positions=frozen(size * self.rest_positions),
+            springs=springs._replace(rest_length=frozen(size * springs.rest_length), weight=frozen(weight)),
+            area=frozen(size**2 * self.area),
+            hinges=hinges._replace(slopes=frozen(hinges.slopes / size)),
+        )
+
     def with_rest_angles(self, angle: float = 0.0, edges: ArrayLike | None = None, above: float = 0.0) -> ClothMesh:
         """The same sheet with another rest angle between the two triangles at some of its edges.
 

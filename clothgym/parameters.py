@@ -78,9 +78,9 @@ def fabric_rows(
 ) -> dict[str, NDArray[np.float64]]:
     """The arrays of a ``state.Fabric`` without the fields, (envs, ...), from properties on a mesh, (envs, properties).
 
-    hinged, isotropic: of the model of bending, see ``bending.Bending``; without hinges skip springs resist.
-    size: factors on the mesh's lengths, (envs,).  All arrays are for elements of the mesh as it is: the energy of skip springs and
-    of the quadratic model falls with the square of the size, and the mass of a triangle rises with it.  air_density: [kg/m^3].
+    hinged, isotropic: of the model of bending, see ``bending.Bending``; without hinges skip springs resist.  size: factors on the
+    mesh's lengths, (envs,).  All arrays are for elements of the mesh as it is: the coefficients of skip springs and of the
+    quadratic model fall with the square of the size, and the mass of a triangle grows with that square.  air_density: [kg/m^3].
 
     Raises:
         ValueError: no spring network on this mesh has these moduli.

@@ -66,6 +66,10 @@ ENVIRONMENTS = {
         "ClothFoldShirt",
         "Fold a T-shirt on the floor in half, left over right, with two grippers.",
     ),
+    "ClothFoldShirt-Hard-v0": (
+        "ClothFoldShirtHard",
+        "Fold a T-shirt of another size and fabric in each episode, turned by any angle, in half, left over right.",
+    ),
     "ClothFlatten-v0": (
         "ClothFlatten",
         "Spread a crumpled sheet on the floor with two grippers and release it.",
@@ -95,9 +99,8 @@ ENVIRONMENTS = {
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
     "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 680, "ClothCanonicalize-v0": 680, "ClothFold-v0": 210,
-    "ClothFold-Hard-v0": 280,
-    "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280,
-    "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
+    "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110,
+    "ClothFoldShirt-Hard-v0": 130, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280, "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
     "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,
 }  # fmt: skip
 ACTORS = ("noop", "random", "expert")  # in every environment, in addition to policies of training runs

@@ -77,6 +77,7 @@ CLIPS = {
     "ClothFold-v0": Clip("ClothFold-v0", look="wool_tropical"),
     "ClothFold-Hard-v0": Clip("ClothFold-Hard-v0", look="silk", policy="expert"),
     "ClothFoldShirt-v0": Clip("ClothFoldShirt-v0", look="polyester_tropical"),
+    "ClothFoldShirt-Hard-v0": Clip("ClothFoldShirt-Hard-v0", look="polyester", policy="expert"),
     "ClothFlattenShirt-v0": Clip("ClothFlattenShirt-v0", seed=4, look="cotton_broad", policy="expert", speed=2),
     "ClothCanonicalize-v0": Clip("ClothCanonicalize-v0", seed=FIRST_HELD_OUT + 2, look="cotton_broad", policy="expert", speed=2),
     "ClothFoldGoal-v0": Clip("ClothFoldGoal-v0", look="polyester"),
@@ -122,7 +123,7 @@ def taken(clip: Clip) -> Take:
         episode = played(clip.name, clip.seed)
     task = episode.task
     step = task.physics.time_step
-    return Take(task.physics.mesh, step, task.camera(), task.strain_shown, until_rest(episode.moments[:: clip.speed], step))
+    return Take(task.mesh_of(0), step, task.camera(), task.strain_shown, until_rest(episode.moments[:: clip.speed], step))
 
 
 def until_rest(shots: list[Moment], step: float) -> list[Moment]:

@@ -127,7 +127,7 @@ class Episode(NamedTuple):
     def painter(self, size: int, antialias: int, color: str = "fabric") -> Callable[[Moment], NDArray[np.uint8]]:
         """What draws its moments, by a camera that has the sheet in sight in all of them."""
         # and solids and goals, but not grippers, which withdraw
-        mesh, start = self.task.physics.mesh, self.moments[0]
+        mesh, start = self.task.mesh_of(0), self.moments[0]
         seen = [corners([*start.solids, *(marker for marker in start.markers if marker.kind == "sphere")])]
         camera = framed(self.task.camera(), np.concatenate([*(moment.positions for moment in self.moments), *seen]))
         uv = mesh.rest_positions[:, :2]

@@ -13,7 +13,7 @@ from clothgym.envs.flatten_shirt import ClothFlattenShirtEnv
 from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldHardEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv
-from clothgym.envs.fold_shirt import ClothFoldShirtEnv
+from clothgym.envs.fold_shirt import ClothFoldShirtEnv, ClothFoldShirtHardEnv
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.hang import ClothHangEnv, ClothHangHardEnv
 from clothgym.envs.hook import ClothHookEnv, ClothHookHardEnv
@@ -37,6 +37,7 @@ ClothFlingVectorEnv = batched(ClothFlingEnv)
 ClothFoldGoalHardVectorEnv = batched(ClothFoldGoalHardEnv)
 ClothFoldGoalVectorEnv = batched(ClothFoldGoalEnv)
 ClothFoldHardVectorEnv = batched(ClothFoldHardEnv)
+ClothFoldShirtHardVectorEnv = batched(ClothFoldShirtHardEnv)
 ClothFoldShirtVectorEnv = batched(ClothFoldShirtEnv)
 ClothFoldVectorEnv = batched(ClothFoldEnv)
 ClothHangHardVectorEnv = batched(ClothHangHardEnv)
@@ -51,8 +52,9 @@ __all__ = [
     "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenShirtEnv", "ClothFlattenShirtVectorEnv",
     "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv", "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv",
     "ClothFoldGoalEnv", "ClothFoldGoalHardEnv", "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv",
-    "ClothFoldHardVectorEnv", "ClothFoldShirtEnv", "ClothFoldShirtVectorEnv", "ClothFoldVectorEnv", "ClothHangEnv",
-    "ClothHangHardEnv", "ClothHangHardVectorEnv", "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv",
-    "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv", "ClothReachVectorEnv", "ClothStrainEnv",
-    "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation", "Physics", "Task", "TaskState",
+    "ClothFoldHardVectorEnv", "ClothFoldShirtEnv", "ClothFoldShirtHardEnv", "ClothFoldShirtHardVectorEnv",
+    "ClothFoldShirtVectorEnv", "ClothFoldVectorEnv", "ClothHangEnv", "ClothHangHardEnv", "ClothHangHardVectorEnv",
+    "ClothHangVectorEnv", "ClothHookEnv", "ClothHookHardEnv", "ClothHookHardVectorEnv", "ClothHookVectorEnv", "ClothReachEnv",
+    "ClothReachVectorEnv", "ClothStrainEnv", "ClothStrainVectorEnv", "ClothVectorEnv", "GripperTask", "Kernels", "Observation",
+    "Physics", "Task", "TaskState",
 ]  # fmt: skip

@@ -32,7 +32,7 @@ LARGEST_SEED = 2**128 - 1  # as large as what NumPy draws where none is given
 Fields = Sequence[tuple[Any, ...]]  # (name, type) or (name, type, shape)
 
 
-VERSION = 2  # of the format of files
+VERSION = 3  # of the format of files
 LAST = "last "  # begins the names of what a state remembers of the last step's info
 
 

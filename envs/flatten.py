@@ -22,6 +22,7 @@ from clothgym.envs.scoring import ENOUGH_REST, falloff, follow, holds_nothing
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.taking import EDGES, LIFTED, NEXT, OPPOSITE, neighbors_of, observe_next
+from clothgym.envs.targets import ON_FLOOR
 from clothgym.envs.throws import NUMBERS, Hands, throw_of
 from clothgym.mesh import grid
 
@@ -283,7 +284,10 @@ class FlattenTask(SpreadingTask):
     def begin(self, env: int, rng: np.random.Generator, options: Mapping[str, Any]) -> NDArray:
         side = self.physics.side
         sheets = self.sheets()
-        x = sheets[int(rng.integers(len(sheets)))] * self.sizes()[env]
+        size = self.sizes()[env]
+        x = sheets[int(rng.integers(len(sheets)))] * size
+        if size != 1:  # the lowest particles stay on the floor
+            x[:, 2] += ON_FLOOR - x[:, 2].min()
         # mirrored, turned and moved
         x = x if rng.uniform() < 0.5 else self.mirrored(x)
         yaw = rng.uniform(-np.pi, np.pi)

@@ -95,7 +95,8 @@ def flatten_picks(task: Any) -> NDArray:
     diagonals, one across the other.  It makes no choice among corners: except for the side of the corners, its actions are a smooth
     function of their positions and of time.  A flat sheet is left alone.
     """
-    n, side, half = task.num_envs, task.physics.side, task.workspace * task.physics.side
+    n, half = task.num_envs, task.workspace * task.physics.side
+    side = task.physics.side * task.sizes()[:, None]
     p = task.simulation.positions[:, task.corners, :2].astype(np.float64)
     actions = np.ones((n, 2, 5))
     number = task.episode["step"] // STEPS
@@ -223,15 +224,15 @@ def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, 
     apart = np.stack([-ahead, ahead]) * taut / 2
     low = x[ends, 2].min()
     far = x[corners[OPPOSITE[edge]]].mean(axis=0)
-    if own["raised"].min() <= LIFTED[1] * side:
+    if own["raised"].min() <= LIFTED[1] * size * side:
         first = LIFT_AT if throwing is None else throwing.throw.along[0]
-        return rising(_to(first * side * out + (0, 0, LIFT * side) + apart, tips), tips, taut, SPEED), -np.ones(2)
+        return rising(_to(first * side * out + (0, 0, LIFT * size * side) + apart, tips), tips, taut, SPEED), -np.ones(2)
     # the tips keep the edge taut
     keep = (middle + apart - tips) * 10
     # begin as the far edge swings outward, or hangs still
     swing, reach = float(v[corners[OPPOSITE[edge]]].mean(axis=0) @ out), float((far - middle) @ out)
     sways = speed > CALM or (speed > 0.2 and (swing < 0 or reach < -0.02))
-    waits = middle[2] > LIFTED[1] * side - 0.01 if throwing is None else not throwing.begun
+    waits = middle[2] > LIFTED[1] * size * side - 0.01 if throwing is None else not throwing.begun
     if waits and aim is not None:
         # first to where it is laid down from, turned as it should lie
         way = (aim.far + HUNG * out - middle) * (1, 1, 0) if throwing is None else ((aim.near - middle) @ along) * along

@@ -112,7 +112,7 @@ class ClothFlattenShirtEnv(ClothEnv):
 
     The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
     along shoulders, sleeves and sides, and open at neck, hem and cuffs.  L is its width from cuff to cuff, 0.76 m.  All
-    environments have the same sizes; ``randomize`` draws fabrics and sizes.
+    environments of a batch have the same proportions; ``randomize`` draws fabrics, and a factor on all lengths.
 
     $physics
 

@@ -309,7 +309,7 @@ class FoldingTask(DirectedTask, ManipulationTask):
             now = ~found & ~np.logical_and.reduce(length(x[:, goals] - x[:, taken]) < EXPERT_MET * side, axis=1)
             found |= now
             for k, (particle, goal) in enumerate(stage):
-                lift = EXPERT_ARC / 2 * length(rest[particle] - rest[goal])
+                lift = EXPERT_ARC / 2 * self.sizes()[now] * length(rest[particle] - rest[goal])
                 actions[now, k, 0:2], actions[now, k, 2:4] = x[now, particle, :2] / half, began[now, goal, :2] / half
                 actions[now, k, 4] = 2 * lift / side - 1
         return np.clip(actions, -1, 1).reshape(self.num_envs, -1)

@@ -1,8 +1,8 @@
-"""ClothFoldShirt-v0: fold a T-shirt, shorts or trousers on the floor in half, left over right."""
+"""ClothFoldShirt-v0 and ClothFoldShirt-Hard-v0: fold a T-shirt, shorts or trousers on the floor in half, left over right."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, ClassVar
@@ -47,6 +47,10 @@ def garment_named(name: str, sizes: Mapping[str, float] | None = None) -> Garmen
 @lru_cache(maxsize=64)
 def _garment(name: str, sizes: tuple[tuple[str, float], ...]) -> Garment:
     return make(name, SPACING, sizes=SIZES[name] | dict(sizes))
+
+
+# what episodes of the harder task draw
+HARD = {"size": [0.85, 1.15], "density": [0.1, 0.2], "bend_rigidity": [3e-7, 3e-6], "friction": [0.3, 0.7]}
 
 
 # --- the ideal folds, and the measures of others ------------------------------------------------------------------------------
@@ -161,6 +165,21 @@ class FoldShirtTask(FoldingTask):
         return {**super().constants(), "goals": folded(self.garment), "root_area": root_area}
 
 
+class FoldShirtHardTask(FoldShirtTask):
+    """The task of ``ClothFoldShirt-Hard-v0``, see ``ClothFoldShirtHardEnv``.
+
+    Args:
+        randomize: as all tasks take it; ``HARD`` by default.
+    """
+
+    acting_steps = 90
+    away = 0.25
+    turned = np.pi
+
+    def __init__(self, num_envs: int, randomize: Mapping[str, Sequence[float]] = HARD, **kwargs: Any) -> None:
+        super().__init__(num_envs, randomize=randomize, **kwargs)
+
+
 class ClothFoldShirtEnv(ClothEnv):
     """Fold a T-shirt on the floor in half, left over right, with two grippers.
 
@@ -201,3 +220,29 @@ class ClothFoldShirtEnv(ClothEnv):
     """
 
     task_class = FoldShirtTask
+
+
+class ClothFoldShirtHardEnv(ClothEnv):
+    """Fold a T-shirt of another size and fabric in each episode, turned by any angle, in half, left over right.
+
+    ## Description
+    This task differs from ``ClothFoldShirt-v0`` in its start, its time, 90 steps, and in what episodes draw, the default of
+    ``randomize``: the size of the shirt, 0.85 to 1.15 times that of ``ClothFoldShirt-v0``; its weight, 100 to 200 g/m^2; its
+    bending rigidity, 0.3 to 3 uN m; and the friction of the floor, 0.3 to 0.7.  These replace the values below, and those of a
+    ``fabric`` of your own; a ``randomize`` of your own replaces all four ranges.  ``info`` has what was drawn, the observations
+    have no number for it.
+
+    $physics
+
+    ## Rewards
+    As in ``ClothFoldShirt-v0``.
+
+    ## Evaluation
+    As in ``ClothFoldShirt-v0``, with the same ``info``.  Errors are those of the shirt over its size.
+
+    ## Starting State
+    The shirt's center is up to 0.25 L from the origin along x and y, and it is turned by any angle.  The grippers are open,
+    displaced from the points that they take by up to 0.1 L along x and y and by 0.2 to 0.35 L upward.
+    """
+
+    task_class = FoldShirtHardTask

@@ -109,7 +109,7 @@ COMMON: dict[str, tuple[str, str]] = {
     ),
     "randomize": (
         "``{}``",
-        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, ``size``, ``friction``, '
+        'ranges from which each episode draws material properties, ``{"density": [0.1, 0.2]}``, $sized``friction``, '
         "``action_delay`` (control steps), ``action_noise`` and ``observation_noise`` (standard deviations), and the camera and "
         "colors of pictures; info has what was drawn",
     ),
@@ -224,6 +224,7 @@ def arguments_of(task_class: type[Task]) -> list[str]:
         "$substeps": str(physics.substeps),
         "$air_density": f"{physics.air_density:g}",
         "$strain_shown": f"{100 * task_class.strain_shown:g}",
+        "$sized": "``size``, " if task_class.resizes else "",
         "$direction": getattr(task_class, "direction", ""),
         "$picks": str(getattr(task_class, "picks", "")),
         "$throws": str(getattr(task_class, "throws", "")),

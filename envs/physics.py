@@ -170,31 +170,31 @@ def checked_wind(properties: Mapping[str, Any]) -> Wind:
     return Wind(**properties)
 
 
-def check_ranges(physics: Physics, ranges: Mapping[str, tuple[float, float]], integrator: Integrator) -> None:
-    """Refuse ranges that the integrator or the sheet cannot have."""
+def check_ranges(physics: Physics, ranges: Mapping[str, tuple[float, float]], integrator: Integrator, smallest: float) -> None:
+    """Refuse ranges that the integrator or the sheet cannot have; smallest: size of a sheet, a factor."""
     if physics.mesh.shape is None and "shear_stiffness" in ranges:
         raise ValueError("randomize: shear_stiffness has no effect on a sheet of triangles; give a range of stretch_stiffness")
     for name in ranges:
         if name in integrator.shared | integrator.ignored:
             raise ValueError(f"randomize: {refusal(integrator, name)}")
-    check_springs_exist(physics, ranges)
+    check_springs_exist(physics, ranges, smallest)
 
 
-def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse ranges of which some corner is a fabric that no spring network on this sheet has."""
-    if not ranges:
+def check_springs_exist(physics: Physics, ranges: Mapping[str, tuple[float, float]], smallest: float) -> None:
+    """Refuse ranges of which some corner is a fabric that no spring network on this sheet, or on the smallest, has."""
+    if not ranges and smallest == 1:
         return
     values = [sorted(set(ranges.get(name, (getattr(physics.material, name),)))) for name in PROPERTIES]
     for corner in product(*values):
         fabric = Material(**dict(zip(PROPERTIES, corner)))
         stretch, shear, bend = fabric.stretch_stiffness, fabric.shear_stiffness, fabric.bend_rigidity
-        spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend))
+        spring_stiffness(physics.mesh, np.array(stretch), np.array(shear), np.array(bend) / min(smallest, 1.0) ** 2)
 
 
 def checked_material_option(
-    material: Any, physics: Physics, ranges: Mapping[str, tuple[float, float]], simulation: Simulation
+    material: Any, physics: Physics, ranges: Mapping[str, tuple[float, float]], simulation: Simulation, smallest: float
 ) -> dict[str, float]:
-    """Properties of one episode's fabric, given as such or by a preset's name; ranges: of those that are drawn.
+    """Properties of one episode's fabric, given as such or by a preset's name; ranges: of those that are drawn; smallest: size.
 
     Raises:
         ValueError: they are none that an episode can have.
@@ -214,7 +214,7 @@ def checked_material_option(
         plain[name] = number(f"reset option material: {name}", value)
         if name in method.ignored or (name in method.shared and simulation.num_envs > 1):
             raise ValueError(f"reset option material: {refusal(method, name)}")
-    check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in plain.items()}})
+    check_springs_exist(physics, {**ranges, **{name: (value, value) for name, value in plain.items()}}, smallest)
     return plain
 
 

@@ -69,13 +69,18 @@ class Disturbances:
         drawn: Fields = [(name, float) for name in self.ranges]
         return [*drawn, ("last_actions", float, (self.max_delay + 1, actions))] if self.max_delay else drawn
 
+    @property
+    def smallest(self) -> float:
+        """The smallest size that can be drawn."""
+        return self.ranges.get("size", (1.0, 1.0))[0]
+
     def draw_size(self, own: Any, generator: np.random.Generator) -> None:
         """Draw the size of an episode's sheet, from which its start follows, into its record."""
         if "size" in self.ranges:
             own["size"] = generator.uniform(*self.ranges["size"])
 
     def draw(self, own: Any, generator: np.random.Generator) -> None:
-        """Draw an episode's, but for its size, into its record."""
+        """Draw everything else of an episode into its record."""
         for name, (low, high) in self.ranges.items():
             if name != "size":
                 own[name] = generator.integers(int(low), int(high) + 1) if name == "action_delay" else generator.uniform(low, high)

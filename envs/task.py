@@ -38,6 +38,7 @@ from clothgym.envs.settling import check as check_settling
 from clothgym.envs.settling import restricted_to, settle
 from clothgym.envs.stepping import IN_NUMPY, Kernels, compiled, mesh_arrays
 from clothgym.exclusive import CallGuard, exclusive
+from clothgym.guards import refuse_sizes
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, PROPERTIES, of_material
@@ -116,7 +117,7 @@ class Task:
         arguments: meaning of the task's own keywords, for the page, and of keywords with a different meaning in this task.
         ranges: least and greatest value of the fields of episodes, for ``set_state``; other fields may have any finite value.
         strain_shown: upper end of the colors of render_color="strain".
-        resizes: whether episodes can draw the size of the sheet: its start follows ``sizes``, and it is measured by ``Sheet.unit``.
+        resizes: whether episodes can draw the size of the sheet: its start and its measures follow ``sizes``, or ``Sheet.unit``.
         seen_from: camera position of films.
         simulation: the batch of sheets.
         sheet: rows and side as given.
@@ -201,7 +202,8 @@ class Task:
         if air_density is None:
             air_density = fixed.air_density if wind is None else AIR_DENSITY
         method = integrators.get(integrator if integrator is not None else fixed.integrator)
-        check_ranges(fixed, self.randomize, method)
+        check_ranges(fixed, self.randomize, method, self.disturbances.smallest)
+        refuse_sizes(method, np.array(self.disturbances.ranges.get("size", (1.0,))))
         if substeps is None:
             as_tuned = method.name == fixed.integrator and fixed.material == own.material
             as_tuned &= not self.randomize and "size" not in self.disturbances.ranges
@@ -210,7 +212,7 @@ class Task:
             fixed.mesh,
             # substeps follow from the stiffest, lightest and smallest sheet that can be drawn, not from one that was
             material=most_demanding(fixed.material, self.randomize),
-            size=self.disturbances.ranges.get("size", (1.0,))[0],
+            size=self.disturbances.smallest,
             num_envs=num_envs,
             integrator=method,
             time_step=fixed.time_step,
@@ -229,7 +231,7 @@ class Task:
         )
         check_settling(self)
         if "size" in self.disturbances.ranges and not self.resizes:
-            raise ValueError("randomize: no size in this task, whose targets suit one sheet; tasks that fold and flatten have it")
+            raise ValueError("randomize: no size in this task: its start and its measures are of one sheet (Task.resizes)")
         if "friction" in self.disturbances.ranges and not self.simulation.colliders:
             raise ValueError("randomize: no friction in a task without solids")
         self.num_envs, self.threads = num_envs, self.simulation.threads
@@ -317,6 +319,11 @@ class Task:
     def sizes(self) -> NDArray[np.float64]:
         """Factor on all lengths of each sheet that its episode has drawn, (num_envs,)."""
         return self.episode["size"].copy() if "size" in self.disturbances.ranges else np.ones(self.num_envs)
+
+    def mesh_of(self, env: int) -> ClothMesh:
+        """The mesh in the size of an environment's sheet."""
+        size = float(self.simulation.size[env])
+        return self.physics.mesh if size == 1 else self.physics.mesh.scaled(size)
 
     # --- what a task defines: start -----------------------------------------------------------------------------------
 
@@ -497,12 +504,11 @@ class Task:
     def _begin(self, envs: NDArray, warn: bool) -> None:
         """Put fabric, air, solids and attachments of environments as their episodes have drawn them, and observe them."""
         simulation, material = self.simulation, self.episode["material"][envs]
-        if not np.array_equal(material, simulation.parameters[envs]):
+        size = self.sizes()[envs].astype(simulation.dtype)
+        if not np.array_equal(material, simulation.parameters[envs]) or not np.array_equal(size, simulation.size[envs]):
             # the declared ranges were held against the integrator's bound at construction; one episode's fabric is now
             properties = {name: material[:, i] for i, name in enumerate(PROPERTIES)}
-            simulation.set_parameters(envs, warn=warn, **properties)
-        if "size" in self.disturbances.ranges:
-            simulation.set_parameters(envs, warn=False, size=self.episode["size"][envs])
+            simulation.set_parameters(envs, warn=warn, size=size, **properties)
         if self.wind is not None:
             simulation.set_wind(self.air[envs, 0], envs)
         self._place_colliders(envs)
@@ -528,7 +534,9 @@ class Task:
                 raise ValueError(f"no reset option {name!r}{guess} (there are: {', '.join(self.reset_options)})")
         checked = {name: value for name, value in options.items() if name in self.reset_options}
         if "material" in options:
-            checked["material"] = checked_material_option(options["material"], self.physics, self.randomize, self.simulation)
+            checked["material"] = checked_material_option(
+                options["material"], self.physics, self.randomize, self.simulation, self.disturbances.smallest
+            )
         self.check_options(checked)
         return checked
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from clothgym.envs import garment_scores
-from clothgym.envs.fold_shirt import SIZES, SPACING, compared, folded, garment_named
+from clothgym.envs.fold_shirt import HARD, SIZES, SPACING, compared, folded, garment_named
 from clothgym.garments import random_garment
 from clothgym.geometry.intersections import find_intersections
 
@@ -149,3 +149,27 @@ def test_sizes_that_no_garment_has_are_refused():
     for value in (3.0, [0.7], "a"):
         with pytest.raises(ValueError, match="sizes: length.*must be"):
             gym.make(ID, sizes={"length": value})
+
+
+def test_the_harder_task_draws_size_and_fabric_and_turns_the_shirt_by_any_angle():
+    env = gym.make_vec("clothgym:ClothFoldShirt-Hard-v0", num_envs=40).unwrapped
+    _, info = env.reset(seed=1)
+    for name, (low, high) in HARD.items():
+        drawn = info[f"randomization/{name}"]
+        assert drawn.min() >= low and drawn.max() <= high and np.ptp(drawn) > 0.8 * (high - low), name
+    # cuff to cuff, as it lies
+    ends = env.task.simulation.positions[:, [env.task.garment.key_points[f"sleeve_top_{side}"] for side in ("left", "right")]]
+    across = (ends[:, 1] - ends[:, 0])[:, :2]
+    rest = np.diff(
+        env.task.physics.mesh.rest_positions[
+            [env.task.garment.key_points["sleeve_top_left"], env.task.garment.key_points["sleeve_top_right"]]
+        ],
+        axis=0,
+    )
+    assert np.linalg.norm(across, axis=1) == pytest.approx(info["randomization/size"] * np.linalg.norm(rest), rel=1e-3)
+    angles = np.arctan2(across[:, 1], across[:, 0])
+    assert np.histogram(angles, bins=4, range=(-np.pi, np.pi))[0].min() >= 4
+    # it is a default: without it the shirt is that of the easier task
+    plain = gym.make_vec("clothgym:ClothFoldShirt-Hard-v0", num_envs=1, randomize={}).unwrapped
+    assert not [name for name in plain.reset(seed=1)[1] if name.startswith("randomization")]
+    assert plain.task.simulation.size.tolist() == [1.0]

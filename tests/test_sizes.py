@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 import clothgym  # noqa: F401
-from clothgym import Material, Simulation, grid
+from clothgym import Material, Plane, Simulation, grid
 from clothgym.envs.fold import ideals
+from clothgym.envs.fold_shirt import folded
 from clothgym.triangles import triangle_mesh
 
 SIZE = 1.2
@@ -45,14 +46,24 @@ def assert_alike(sized, large):
 def test_a_mesh_with_a_size_moves_as_one_that_was_made_in_it(name):
     sized, large = both("grid", integrator=name, substeps=METHODS[name], bending="hinge")
     assert_alike(sized, large)
-    # so does the bound of its substeps
-    assert sized.largest_substep()[0] == pytest.approx(large.largest_substep()[0], rel=1e-6)
 
 
 @pytest.mark.parametrize("bending", ["springs", "quadratic", "hinge"])
 @pytest.mark.parametrize(("kind", "num_envs"), [("grid", 1), ("triangles", 1), ("triangles", 17)])
 def test_so_it_does_with_any_model_of_bending_and_any_layout(kind, num_envs, bending):
-    assert_alike(*both(kind, num_envs, substeps=60, bending=bending, strain_limit=0.02 if bending == "hinge" else None))
+    sized, large = both(kind, num_envs, substeps=60, bending=bending, strain_limit=0.02 if bending == "hinge" else None)
+    # the bound of their substeps, too
+    assert sized.largest_substep()[0] == pytest.approx(large.largest_substep()[0], rel=1e-6)
+    assert_alike(sized, large)
+
+
+@pytest.mark.parametrize("kind", ["grid", "triangles"])
+def test_a_mesh_made_in_a_size_is_the_mesh_scaled(kind):
+    scaled, large = made(kind, 1.0).scaled(SIZE), made(kind, SIZE)
+    for one, other in [*zip(scaled.springs, large.springs), *zip(scaled.hinges, large.hinges)]:
+        assert np.allclose(one, other, rtol=1e-9, atol=1e-12)
+    assert np.allclose(scaled.area, large.area) and scaled.size == pytest.approx(large.size)
+    assert np.allclose(scaled.rest_positions, large.rest_positions)
 
 
 def test_several_passes_of_xpbd_know_the_size():
@@ -93,6 +104,28 @@ def test_sizes_that_cannot_be_are_refused(size, method, said):
     with pytest.raises(ValueError, match=said):
         simulation.set_parameters(size=size)
     assert simulation.size.tolist() == [1.0]
+
+
+def test_a_size_that_is_refused_leaves_the_fabric_as_it_is():
+    simulation = Simulation(SQUARE, FABRIC)
+    with pytest.raises(ValueError, match="size=3"):
+        simulation.set_parameters(density=0.3, size=3.0)
+    assert simulation.parameters[0, 0] == FABRIC.density
+
+
+def test_a_large_sheet_comes_to_rest_on_the_floor_and_does_not_pass_through_itself():
+    """With strict contact, folded over: layers stay apart by the thickness, in any size."""
+    mesh = grid(9, 9, 0.4, 0.4)
+    for size in (0.8, 1.25):
+        floor = Plane(friction=0.5, thickness=0.005)
+        simulation = Simulation(mesh, FABRIC, size=size, colliders=[floor], self_collision="strict")
+        x = size * mesh.rest_positions
+        start = np.stack([np.abs(x[:, 0]), x[:, 1], 0.02 + np.where(x[:, 0] < 0, 0.03, 0) + 0.03 * (x[:, 0] == 0) / 2], axis=1)
+        simulation.reset(positions=start)
+        simulation.step(60)
+        assert simulation.intersections().tolist() == [0]
+        assert simulation.positions[..., 2].min() > 0.004 and simulation.penetration()[0] == 0
+        assert np.abs(simulation.strain()).max() < 0.1
 
 
 # --- tasks ----------------------------------------------------------------------------------------------------------------------
@@ -143,11 +176,13 @@ def test_coverage_is_of_the_flat_sheet_of_that_size(size):
     env = batch("ClothFlatten-v0", num_envs=1, sizes=(size, size))
     env.reset(seed=1)
     state = env.get_state()
-    state.simulation.positions[0] = size * env.task.physics.mesh.rest_positions + (0, 0, 0.005)
+    # folded in half over the middle line: half of it is covered
+    x = size * env.task.physics.mesh.rest_positions
+    state.simulation.positions[0] = np.stack([np.abs(x[:, 0]), x[:, 1], 0.005 + 0.005 * (x[:, 0] > 0)], axis=1)
     state.simulation.velocities[...] = 0
     env.set_state(state)
     env.step(np.ones((1, 8)))
-    assert env.task.episode["coverage"][0] == pytest.approx(1, abs=0.02)
+    assert env.task.episode["coverage"][0] == pytest.approx(0.5, abs=0.02)
 
 
 def test_the_strain_of_a_sheet_at_rest_is_zero_in_any_size():
@@ -164,6 +199,54 @@ def test_experts_fold_sheets_of_other_sizes(env_id):
     while not env.task.episode["over"].all():
         ends.append(env.step(env.task.expert())[4]["is_success"])
     assert np.any(ends, axis=0).sum() >= 3
+
+
+@pytest.mark.parametrize("size", [0.8, 1.25])
+def test_the_expert_flattens_sheets_of_other_sizes(size):
+    env = batch("ClothFlatten-v0", num_envs=4, sizes=(size, size), physics="true")
+    env.reset(seed=5)
+    covered = np.zeros(4)
+    while not env.task.episode["over"].all():
+        covered = np.fmax(covered, env.step(env.task.expert())[4]["coverage"])
+    assert (covered > 0.9).sum() >= 3
+
+
+def test_a_fold_of_a_small_shirt_has_the_error_of_its_size_in_real_millimeters():
+    env = batch("ClothFoldShirt-v0", num_envs=1, sizes=(0.8, 0.8), settling="at_once")
+    env.reset(seed=1)
+    assert env.task.episode["error"][0] == pytest.approx(env.task.rules["unfolded"][0], rel=0.01)
+    state = env.get_state()
+    state.simulation.positions[0] = 0.8 * folded(env.task.garment)[0] + (0, 0, 0.005)
+    env.set_state(state)
+    env.step(np.zeros((1, 8)))
+    assert env.task.episode["error"][0] < 0.02
+
+
+def test_substeps_follow_from_the_smallest_sheet_of_the_range():
+    usual, small = (batch(sizes=sizes, num_envs=1, physics="true").task.simulation for sizes in ((1, 1.25), (0.8, 1.25)))
+    assert small.substeps == pytest.approx(usual.substeps / 0.8, rel=0.05)
+
+
+def test_a_size_of_the_simulation_is_put_back_by_a_reset():
+    env = gym.make_vec("clothgym:ClothFold-v0", num_envs=2, physics="fast").unwrapped
+    env.reset(seed=1)
+    env.task.simulation.set_parameters(size=[1.1, 0.9], warn=False)
+    env.reset(seed=1)
+    assert env.task.simulation.size.tolist() == [1.0, 1.0]
+
+
+def test_a_reset_that_changes_fabric_and_size_is_refused_whole():
+    """A rigidity that skip springs can have on a sheet of usual size, and not on a smaller one."""
+    stiff = {"material": {"bend_rigidity": 1e-3}}
+    batch(sizes=(1.0, 1.0), num_envs=1, bending="springs").reset(seed=2, options=stiff)
+    env = batch(sizes=(0.8, 0.8), num_envs=1, bending="springs")
+    env.reset(seed=1)
+    before = env.get_state()
+    with pytest.raises(ValueError, match="no springs on cells"):
+        env.reset(seed=2, options=stiff)
+    assert np.array_equal(env.get_state().simulation.positions, before.simulation.positions)
+    with pytest.raises(ValueError, match="projective_dynamics"):
+        batch(sizes=(1.0, 1.2), integrator="projective_dynamics")
 
 
 def test_tasks_whose_targets_suit_one_sheet_refuse_to_draw_it():

@@ -126,6 +126,9 @@ class EpisodeStage(Stage):
         self.played: list[tuple[Any, NDArray, float]] = []
         self.info: Mapping[str, Any] = {}
         self.notes.pop("evaluation", None)
+        mesh = self.env.task.mesh_of(0)
+        if mesh is not self.recording.mesh:  # a sheet of another size
+            self.recording = replace(self.recording, mesh=mesh, frames=[])
         self.recording.frames[:] = [self._look()]
 
     def advance(self) -> Frame:

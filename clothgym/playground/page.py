@@ -321,13 +321,15 @@ class Page:
 
     def _see(self) -> None:
         """Show the stage's recording from its own camera."""
-        self.show = Show()
+        self.show, self._seen = Show(), self.stage.recording
         self.client.tell("open", scene_of(self.stage.recording))
         self._stale, self._read_at = True, -READ_EVERY
         if isinstance(self.stage, SceneStage):
             self.controls.fill(self.stage)
 
     def _draw(self) -> None:
+        if self.stage.recording is not self._seen:  # an episode with a sheet of another size
+            self._see()
         frames, now, controls = self.stage.recording.frames, time.monotonic(), self.controls
         self.moment = min(self.moment, self._last)
         frame = frames[self.moment]

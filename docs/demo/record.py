@@ -111,7 +111,7 @@ def record(name: str) -> Recorded:
     # every so many frames, and the last
     kept = np.unique(np.r_[np.arange(0, len(sheets), stride), len(sheets) - 1])
     sheets, things, infos = ([one[k] for k in kept] for one in (sheets, things, infos))
-    mesh, camera, about = task.physics.mesh, task.camera(), policy.about
+    mesh, camera, about = task.mesh_of(0), task.camera(), policy.about
     shape, place, holes = grid_of(mesh)
     solids, centers = tracks(things)
     header = {
