@@ -13,7 +13,7 @@ from clothgym.collisions.solids.shapes import R_FRICTION
 from clothgym.playground import hands, link
 from clothgym.playground.controls import AGAIN, CLICKS, PRESETS
 from clothgym.playground.episode import OFFSETS, EpisodeStage, Learnt
-from clothgym.playground.exporting import save_demonstration
+from clothgym.playground.exporting import save_demonstration, strain_shares
 from clothgym.playground.gallery import REPLAY, Gallery, committed_policies, policies_of
 from clothgym.playground.page import Page
 from clothgym.playground.recording import Recording
@@ -295,6 +295,21 @@ def test_an_environment_is_played_by_its_expert_and_its_frames_are_the_environme
     assert stage.over and stage.advance() is stage.frame
     told = f"Success: a score of {info['normalized_performance']:.2f}, and a return of {total:.2f}."
     assert stage.notes["evaluation"] == told
+
+
+def test_a_sheet_of_another_size_is_shown_as_one_that_is_not_stretched():
+    visitor, client = page("ClothFoldShirt-Hard-v0")
+    widths = []
+    for seed in (1, 2):
+        turned(visitor, seed=seed, play="reset")
+        recording, sheet = visitor.stage.recording, client.sheets[0]
+        # the browser measures strain between the flat sheet's points that it was told
+        flat, triangles = np.reshape(client.opened["uv"], (-1, 2)), np.reshape(client.opened["triangles"], (-1, 3))
+        now, rest = (np.linalg.norm(x[triangles[:, 0]] - x[triangles[:, 1]], axis=1) for x in (sheet, flat))
+        assert np.median(np.abs(now / rest - 1)) < 1e-3  # at seams the layers are apart
+        assert strain_shares(recording, sheet).max() < 0.2
+        widths.append(recording.mesh.size[0])
+    assert abs(widths[1] - widths[0]) > 0.01
 
 
 @pytest.mark.parametrize("env_id", ["ClothReach-v0", "ClothDrapeGripper-v0"])
