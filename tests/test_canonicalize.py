@@ -44,11 +44,15 @@ def test_the_coverage_is_that_of_the_outline_and_the_front_has_to_be_up(yaw, shi
 def test_the_expert_turns_an_edge_by_the_angle_that_is_left_to_where_it_should_lie():
     task = gym.make(ID).unwrapped.task
     # the line of the sleeves, its right end in the first gripper, lies toward +y: a quarter turn to -x is left
-    aim = _aim(task, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0]))
+    aim = _aim(task, 0, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0]))
     points = {name: REST[particle] for name, particle in SHIRT.key_points.items()}
     assert aim.angle == pytest.approx(np.pi / 2)
     assert _turned(np.array([0.0, 1.0, 0.0]), aim.angle) == pytest.approx([-1, 0, 0])
     assert aim.near == pytest.approx([0, points["sleeve_top_left"][1], 0], abs=1e-6)
     assert aim.far == pytest.approx([0, points["waist_left"][1], 0], abs=1e-6)
+    # a larger shirt lies farther out
+    large = gym.make(ID, randomize={"size": [1.25, 1.25]}).unwrapped
+    large.reset(seed=1)
+    assert _aim(large.task, 0, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0])).near == pytest.approx(1.25 * aim.near)
     square = gym.make("clothgym:ClothFlatten-v0").unwrapped.task
-    assert _aim(square, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0])) is None
+    assert _aim(square, 0, np.array([3, 2]), 2, np.array([0.0, 1.0, 0.0])) is None

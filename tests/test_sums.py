@@ -276,7 +276,7 @@ def test_a_state_of_an_older_version_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("clothgym.state.VERSION", 1)
     gliding().get_state().save(tmp_path / "old.npz")
     monkeypatch.undo()
-    with pytest.raises(ValueError, match=r"old\.npz.*its format has version 1, this clothgym reads version 2"):
+    with pytest.raises(ValueError, match=r"old\.npz.*its format has version 1, this clothgym reads version 3"):
         State.load(tmp_path / "old.npz")
 
 
