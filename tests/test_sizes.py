@@ -66,6 +66,14 @@ def test_a_mesh_made_in_a_size_is_the_mesh_scaled(kind):
     assert np.allclose(scaled.rest_positions, large.rest_positions)
 
 
+def test_a_storm_stops_a_large_sheet_relative_to_the_air_as_it_stops_one_that_was_made_large():
+    """The bound of the air's force, which follows from the mass and the area at rest."""
+    sized, large = both("triangles", substeps=60, wind=(500.0, 0.0, 300.0), on_divergence="ignore")
+    for simulation in (sized, large):
+        simulation.step()
+    assert np.allclose(sized.velocities, large.velocities, rtol=0, atol=1e-6 * np.abs(large.velocities).max())
+
+
 def test_several_passes_of_xpbd_know_the_size():
     assert_alike(*both("triangles", integrator={"name": "xpbd", "iterations": 3}, substeps=80))
 
