@@ -8,6 +8,8 @@ import clothgym  # noqa: F401
 from clothgym import Material, Plane, Simulation, grid
 from clothgym.envs.fold import ideals
 from clothgym.envs.fold_shirt import folded
+from clothgym.envs.gripper_task import UNEVEN
+from clothgym.envs.targets import ON_FLOOR
 from clothgym.triangles import triangle_mesh
 
 SIZE = 1.2
@@ -55,6 +57,13 @@ def test_so_it_does_with_any_model_of_bending_and_any_layout(kind, num_envs, ben
     # the bound of their substeps, too
     assert sized.largest_substep()[0] == pytest.approx(large.largest_substep()[0], rel=1e-6)
     assert_alike(sized, large)
+
+
+def test_stiff_hinges_need_the_substeps_of_the_sheet_that_was_made_in_the_size():
+    stiff = Material.preset("cotton", bend_rigidity=1.0)
+    sized, large = both("triangles", material=stiff, substeps="auto", bending="hinge")
+    soft, _ = both("triangles", substeps="auto", bending="hinge")
+    assert sized.substeps == large.substeps > 1.5 * soft.substeps
 
 
 @pytest.mark.parametrize("kind", ["grid", "triangles"])
@@ -191,6 +200,20 @@ def test_coverage_is_of_the_flat_sheet_of_that_size(size):
     env.set_state(state)
     env.step(np.ones((1, 8)))
     assert env.task.episode["coverage"][0] == pytest.approx(0.5, abs=0.02)
+
+
+def test_crumpled_sheets_of_other_sizes_begin_on_the_floor():
+    env = batch("ClothFlatten-v0", num_envs=4)
+    env.reset(seed=1)
+    assert env.task.simulation.positions[..., 2].min(axis=1) == pytest.approx(ON_FLOOR, abs=UNEVEN)
+
+
+def test_goals_of_a_fold_are_as_far_away_as_the_sheet_is_large():
+    env = batch("ClothFoldGoal-v0", num_envs=8)
+    env.reset(seed=1)
+    own, corners = env.task.episode, env.task.simulation.positions[:, env.task.physics.mesh.corners]
+    way = np.linalg.norm((own["goal"] - corners)[..., :2], axis=2).max(axis=1)
+    assert np.ptp(env.task.sizes()) > 0.1 and way == pytest.approx(own["width"], rel=1e-4)
 
 
 def test_the_strain_of_a_sheet_at_rest_is_zero_in_any_size():
