@@ -130,8 +130,8 @@ def test_a_size_that_is_refused_leaves_the_fabric_as_it_is():
     assert simulation.parameters[0, 0] == FABRIC.density
 
 
-def test_a_large_sheet_comes_to_rest_on_the_floor_and_does_not_pass_through_itself():
-    """With strict contact, folded over: layers stay apart by the thickness, in any size."""
+def test_sheets_of_other_sizes_come_to_rest_on_the_floor_and_do_not_pass_through_themselves():
+    """Folded over, with strict contact and a floor."""
     mesh = grid(9, 9, 0.4, 0.4)
     for size in (0.8, 1.25):
         floor = Plane(friction=0.5, thickness=0.005)
@@ -251,6 +251,12 @@ def test_a_fold_of_a_small_shirt_has_the_error_of_its_size_in_real_millimeters()
     env.set_state(state)
     env.step(np.zeros((1, 8)))
     assert env.task.episode["error"][0] < 0.02
+    # at the end in millimeters, of a shirt of 0.8 L
+    info = {}
+    while not env.task.episode["over"].all():
+        info = env.step(np.zeros((1, 8)))[4]
+    side = 0.8 * env.task.physics.side
+    assert info["fold_error_mm"][0] == pytest.approx(1000 * side * info["fold_error"][0], rel=1e-6) and info["overlap"][0] > 0.8
 
 
 def test_substeps_follow_from_the_smallest_sheet_of_the_range():
