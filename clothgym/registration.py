@@ -82,9 +82,17 @@ ENVIRONMENTS = {
         "ClothFlattenShirt",
         "Spread a crumpled T-shirt on the floor with two grippers and release it.",
     ),
+    "ClothFlattenShirt-Hard-v0": (
+        "ClothFlattenShirtHard",
+        "Spread a crumpled T-shirt of another size and fabric in each episode on the floor and release it.",
+    ),
     "ClothCanonicalize-v0": (
         "ClothCanonicalize",
         "Spread a crumpled T-shirt on the floor in its canonical pose: about the origin, front up, neck toward +y.",
+    ),
+    "ClothCanonicalize-Hard-v0": (
+        "ClothCanonicalizeHard",
+        "Spread a crumpled T-shirt of another size and fabric in each episode in its canonical pose.",
     ),
     "ClothFling-v0": (
         "ClothFling",
@@ -98,7 +106,8 @@ ENVIRONMENTS = {
 # length of the longest episode of each id, in steps
 LONGEST = {
     "ClothReach-v0": 40, "ClothDrape-v0": 145, "ClothDrapeGripper-v0": 160, "ClothStrain-v0": 150, "ClothFlatten-v0": 340,
-    "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 680, "ClothCanonicalize-v0": 680, "ClothFold-v0": 210,
+    "ClothFlatten-Hard-v0": 360, "ClothFlattenShirt-v0": 680, "ClothFlattenShirt-Hard-v0": 680, "ClothCanonicalize-v0": 680,
+    "ClothCanonicalize-Hard-v0": 680, "ClothFold-v0": 210,
     "ClothFold-Hard-v0": 280, "ClothFoldGoal-v0": 120, "ClothFoldGoal-Hard-v0": 150, "ClothFoldShirt-v0": 110,
     "ClothFoldShirt-Hard-v0": 130, "ClothHang-v0": 230, "ClothHang-Hard-v0": 280, "ClothHook-v0": 250, "ClothHook-Hard-v0": 310,
     "ClothFling-v0": 340, "ClothFling-Hard-v0": 360,

@@ -4,12 +4,12 @@ if __name__ != "clothgym.envs":
     # with the repository's root on sys.path a bare `import envs` would make a second copy of every class
     raise ImportError("this folder is the package clothgym.envs: write `import clothgym.envs`")
 
-from clothgym.envs.canonicalize import ClothCanonicalizeEnv
+from clothgym.envs.canonicalize import ClothCanonicalizeEnv, ClothCanonicalizeHardEnv
 from clothgym.envs.drape import ClothDrapeEnv
 from clothgym.envs.drape_gripper import ClothDrapeGripperEnv
 from clothgym.envs.episode import TaskState
 from clothgym.envs.flatten import ClothFlattenEnv, ClothFlattenHardEnv
-from clothgym.envs.flatten_shirt import ClothFlattenShirtEnv
+from clothgym.envs.flatten_shirt import ClothFlattenShirtEnv, ClothFlattenShirtHardEnv
 from clothgym.envs.fling import ClothFlingEnv, ClothFlingHardEnv
 from clothgym.envs.fold import ClothFoldEnv, ClothFoldHardEnv
 from clothgym.envs.fold_goal import ClothFoldGoalEnv, ClothFoldGoalHardEnv
@@ -26,10 +26,12 @@ from clothgym.envs.strain import ClothStrainEnv, ClothStrainVectorEnv
 from clothgym.envs.task import Task
 from clothgym.envs.vector import ClothVectorEnv, batched
 
+ClothCanonicalizeHardVectorEnv = batched(ClothCanonicalizeHardEnv)
 ClothCanonicalizeVectorEnv = batched(ClothCanonicalizeEnv)
 ClothDrapeGripperVectorEnv = batched(ClothDrapeGripperEnv)
 ClothDrapeVectorEnv = batched(ClothDrapeEnv)
 ClothFlattenHardVectorEnv = batched(ClothFlattenHardEnv)
+ClothFlattenShirtHardVectorEnv = batched(ClothFlattenShirtHardEnv)
 ClothFlattenShirtVectorEnv = batched(ClothFlattenShirtEnv)
 ClothFlattenVectorEnv = batched(ClothFlattenEnv)
 ClothFlingHardVectorEnv = batched(ClothFlingHardEnv)
@@ -47,9 +49,10 @@ ClothHookVectorEnv = batched(ClothHookEnv)
 ClothReachVectorEnv = batched(ClothReachEnv)
 
 __all__ = [
-    "ClothCanonicalizeEnv", "ClothCanonicalizeVectorEnv",
+    "ClothCanonicalizeEnv", "ClothCanonicalizeHardEnv", "ClothCanonicalizeHardVectorEnv", "ClothCanonicalizeVectorEnv",
     "ClothDrapeEnv", "ClothDrapeGripperEnv", "ClothDrapeGripperVectorEnv", "ClothDrapeVectorEnv", "ClothEnv", "ClothFlattenEnv",
-    "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenShirtEnv", "ClothFlattenShirtVectorEnv",
+    "ClothFlattenHardEnv", "ClothFlattenHardVectorEnv", "ClothFlattenShirtEnv", "ClothFlattenShirtHardEnv",
+    "ClothFlattenShirtHardVectorEnv", "ClothFlattenShirtVectorEnv",
     "ClothFlattenVectorEnv", "ClothFlingEnv", "ClothFlingHardEnv", "ClothFlingHardVectorEnv", "ClothFlingVectorEnv", "ClothFoldEnv",
     "ClothFoldGoalEnv", "ClothFoldGoalHardEnv", "ClothFoldGoalHardVectorEnv", "ClothFoldGoalVectorEnv", "ClothFoldHardEnv",
     "ClothFoldHardVectorEnv", "ClothFoldShirtEnv", "ClothFoldShirtHardEnv", "ClothFoldShirtHardVectorEnv",

@@ -1,4 +1,4 @@
-"""ClothCanonicalize-v0: spread a crumpled T-shirt on the floor in one pose: about the origin, front up, neck toward +y."""
+"""ClothCanonicalize-v0 and ClothCanonicalize-Hard-v0: spread a crumpled T-shirt in one pose, front up, its neck toward +y."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from clothgym.envs.coverage import CELL, FINE_CELL, shared_area
 from clothgym.envs.episode import Fields
 from clothgym.envs.flatten import improvement, is_measured, measure_raised, note_coverage
 from clothgym.envs.flatten_shirt import SHIRT, FlattenShirtTask, evaluate_shirt
+from clothgym.envs.fold_shirt import ShirtsDrawn
 from clothgym.envs.single import ClothEnv
 
 ENOUGH_UP = 0.9  # share of the front panel that looks up, in a success
@@ -58,6 +59,10 @@ class CanonicalizeTask(FlattenShirtTask):
         return SHIRT.mesh.rest_positions[self.corners, :2]
 
 
+class CanonicalizeHardTask(ShirtsDrawn, CanonicalizeTask):
+    """The task of ``ClothCanonicalize-Hard-v0``, see ``ClothCanonicalizeHardEnv``."""
+
+
 class ClothCanonicalizeEnv(ClothEnv):
     """Spread a crumpled T-shirt on the floor in its canonical pose: about the origin, front up, neck toward +y.
 
@@ -93,3 +98,27 @@ class ClothCanonicalizeEnv(ClothEnv):
     """
 
     task_class = CanonicalizeTask
+
+
+class ClothCanonicalizeHardEnv(ClothEnv):
+    """Spread a crumpled T-shirt of another size and fabric in each episode in its canonical pose.
+
+    ## Description
+    This task differs from ``ClothCanonicalize-v0`` in what episodes draw, the default of ``randomize``: the size of the shirt, 0.85
+    to 1.15 times the usual one; its weight, 100 to 200 g/m^2; its bending rigidity, 0.3 to 3 uN m; and the friction of the floor,
+    0.3 to 0.7.  These replace the values below, and those of a ``fabric`` of your own; a ``randomize`` of your own replaces all
+    four ranges.  ``info`` has what was drawn, the observations have no number for it.
+
+    $physics
+
+    ## Rewards
+    As in ``ClothCanonicalize-v0``.
+
+    ## Evaluation
+    As in ``ClothCanonicalize-v0``, with the same ``info``.  Areas and distances are those of the shirt over its size.
+
+    ## Starting State
+    As in ``ClothCanonicalize-v0``, with crumpled shirts of the size that was drawn.
+    """
+
+    task_class = CanonicalizeHardTask

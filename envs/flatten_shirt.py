@@ -1,4 +1,4 @@
-"""ClothFlattenShirt-v0: spread a crumpled T-shirt on the floor."""
+"""ClothFlattenShirt-v0 and ClothFlattenShirt-Hard-v0: spread a crumpled T-shirt on the floor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from clothgym.envs import garment_scores
 from clothgym.envs.coverage import softgym_area
 from clothgym.envs.episode import Fields
 from clothgym.envs.flatten import FlattenTask, evaluate_spread
-from clothgym.envs.fold_shirt import SPACING, FoldShirtTask, garment_named
+from clothgym.envs.fold_shirt import SPACING, FoldShirtTask, ShirtsDrawn, garment_named
 from clothgym.envs.garment_scores import funnels
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.rumpled import CRUMPLED_SHIRTS, stored
@@ -103,6 +103,10 @@ class FlattenShirtTask(FlattenTask):
         return GripperTask.expert_picks(self)  # that of ``ClothFlatten-v0`` is for squares
 
 
+class FlattenShirtHardTask(ShirtsDrawn, FlattenShirtTask):
+    """The task of ``ClothFlattenShirt-Hard-v0``, see ``ClothFlattenShirtHardEnv``."""
+
+
 class ClothFlattenShirtEnv(ClothEnv):
     """Spread a crumpled T-shirt on the floor with two grippers and release it.
 
@@ -144,3 +148,27 @@ class ClothFlattenShirtEnv(ClothEnv):
     """
 
     task_class = FlattenShirtTask
+
+
+class ClothFlattenShirtHardEnv(ClothEnv):
+    """Spread a crumpled T-shirt of another size and fabric in each episode on the floor and release it.
+
+    ## Description
+    This task differs from ``ClothFlattenShirt-v0`` in what episodes draw, the default of ``randomize``: the size of the shirt, 0.85
+    to 1.15 times the usual one; its weight, 100 to 200 g/m^2; its bending rigidity, 0.3 to 3 uN m; and the friction of the floor,
+    0.3 to 0.7.  These replace the values below, and those of a ``fabric`` of your own; a ``randomize`` of your own replaces all
+    four ranges.  ``info`` has what was drawn, the observations have no number for it.
+
+    $physics
+
+    ## Rewards
+    As in ``ClothFlattenShirt-v0``.
+
+    ## Evaluation
+    As in ``ClothFlattenShirt-v0``, with the same ``info``.  Areas and distances are those of the shirt over its size.
+
+    ## Starting State
+    As in ``ClothFlattenShirt-v0``, with crumpled shirts of the size that was drawn.
+    """
+
+    task_class = FlattenShirtHardTask

@@ -17,6 +17,7 @@ from clothgym.envs.fold import FoldingTask, evaluate_fold
 from clothgym.envs.gripper_task import PHYSICS
 from clothgym.envs.physics import MEDIAN, chosen_fabric
 from clothgym.envs.single import ClothEnv
+from clothgym.envs.task import Task
 from clothgym.garments import RANGES, USUAL_THICKNESS, Garment, make
 from clothgym.mesh import ClothMesh
 
@@ -165,19 +166,23 @@ class FoldShirtTask(FoldingTask):
         return {**super().constants(), "goals": folded(self.garment), "root_area": root_area}
 
 
-class FoldShirtHardTask(FoldShirtTask):
-    """The task of ``ClothFoldShirt-Hard-v0``, see ``ClothFoldShirtHardEnv``.
+class ShirtsDrawn(Task):
+    """What harder tasks with T-shirts share: episodes draw the shirt and the floor.
 
     Args:
         randomize: as all tasks take it; ``HARD`` by default.
     """
 
+    def __init__(self, num_envs: int, randomize: Mapping[str, Sequence[float]] = HARD, **kwargs: Any) -> None:
+        super().__init__(num_envs, randomize=randomize, **kwargs)
+
+
+class FoldShirtHardTask(ShirtsDrawn, FoldShirtTask):
+    """The task of ``ClothFoldShirt-Hard-v0``, see ``ClothFoldShirtHardEnv``."""
+
     acting_steps = 90
     away = 0.25
     turned = np.pi
-
-    def __init__(self, num_envs: int, randomize: Mapping[str, Sequence[float]] = HARD, **kwargs: Any) -> None:
-        super().__init__(num_envs, randomize=randomize, **kwargs)
 
 
 class ClothFoldShirtEnv(ClothEnv):

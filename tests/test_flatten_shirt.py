@@ -1,4 +1,4 @@
-"""ClothFlattenShirt-v0: its starts, its evaluation of shirts made here, and the edges between the points that its expert takes."""
+"""ClothFlattenShirt-v0 and -Hard-v0: starts, evaluation of shirts made here, and edges between the points that the expert takes."""
 
 import gymnasium as gym
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 
 from clothgym.envs import garment_scores
 from clothgym.envs.flatten_shirt import SHIRT, facing_up
+from clothgym.envs.fold_shirt import HARD
 from clothgym.envs.rumpled import CRUMPLED_SHIRTS, stored
 from clothgym.geometry.intersections import find_intersections
 
@@ -95,3 +96,17 @@ def test_edges_between_corners_are_the_hem_the_sides_and_the_line_of_the_sleeves
     assert (hem, sleeves) == pytest.approx((tall, tall), abs=1e-6) and (left, right) == pytest.approx((wide, wide), abs=1e-6)
     corners = ["waist_left", "waist_right", "sleeve_top_left", "sleeve_top_right"]
     assert task.corners.tolist() == [SHIRT.key_points[name] for name in corners]
+
+
+@pytest.mark.parametrize("env_id", ["clothgym:ClothFlattenShirt-Hard-v0", "clothgym:ClothCanonicalize-Hard-v0"])
+def test_a_flat_shirt_of_the_drawn_size_is_a_success_of_the_harder_tasks(env_id):
+    env = gym.make_vec(env_id, num_envs=40).unwrapped
+    _, info = env.reset(seed=3)
+    for name, (low, high) in HARD.items():
+        drawn = info[f"randomization/{name}"]
+        assert drawn.min() >= low and drawn.max() <= high and np.ptp(drawn) > 0.8 * (high - low), name
+    size = info["randomization/size"][0]
+    flat = evaluated(turned(REST * size, 0.0), env_id=env_id)
+    assert flat["randomization/size"] == size != 1
+    assert flat["is_success"] and flat["coverage"] == pytest.approx(1, abs=0.01)
+    assert flat["peer/funnels"] < 0.01
