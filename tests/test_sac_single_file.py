@@ -133,6 +133,50 @@ def test_nets_see_the_named_observations_and_zero_for_the_others(single):
         single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["wind"]))}, None)
 
 
+def test_a_run_that_starts_from_a_policy_acts_as_it_does_on_the_average_of_what_it_does_not_see(single):
+    import clothgym
+
+    config = {"env": "ClothFlatten-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
+    config["env_kwargs"] = {"action_mode": "throw", "rows": 9, "physics": "fast"}
+    chosen = {"n_envs": 2, "sees": ["coverage"], "critics": 5, "net_arch": [128, 128], "starts_from": "ClothFlatten-v0"}
+    run = single.Run(config | {"hyperparameters": single.asdict(options(single, **chosen))}, None)
+    # the other task has its own places for the same names, and here fewer numbers in front of them
+    policy, here = clothgym.policies.load("ClothFlatten-v0", "sac_scratch"), run.env.task.observation_slices
+    there, (shift, _) = policy.make().unwrapped.task.observation_slices, policy.normalization
+    own, others = np.zeros((9, run.now["observation"].shape[1]), np.float32), np.tile(shift, (9, 1))
+    own[:, here["coverage"]] = others[:, there["coverage"]] = np.linspace(0.1, 1.0, 9)[:, None]
+    others[:, there["acting_left"]] = shift[there["acting_left"]]
+    assert run.acts(None, own) == pytest.approx(policy(others), abs=1e-5)
+    # the first decisions are its own with noise, and observations are not normalized anew
+    drawn, numbers = run.choose(at_random=True), run.normalizer.numbers()
+    assert np.abs(drawn - run.acts(None, run.now["observation"])).mean() < 0.25
+    assert run.normalizer.numbers()[0] == pytest.approx(numbers[0]) and run.normalizer.count == 0
+
+
+def test_policies_that_a_run_cannot_start_from_are_refused(single):
+    def begun(**chosen):
+        arguments = {"sees": ["coverage"], "critics": 5, "starts_from": "ClothFlatten-v0"} | chosen
+        env = arguments.pop("env", "ClothFlatten-v0")
+        args = single.Args(env=env, env_kwargs='{"action_mode": "throw"}', options=json.dumps(arguments))
+        return single.Run(args.config | {"timesteps": 1000}, None)
+
+    for chosen, message in (
+        ({"sees": []}, "starts_from needs normalized observations, and sees"),
+        ({"normalize": False}, "starts_from needs normalized observations, and sees"),
+        ({"starts_from": 3}, "starts_from 3: must be an id"),
+        ({"starts_from": "ClothFlattenShirt-v0"}, "no policy of 'ClothFlattenShirt-v0' is committed"),
+        (
+            {"starts_from": "ClothFling-v0", "sees": ["coverage", "acting_left"], "net_arch": [64]},
+            r"layers of \[128, 128, .*\], not of \[64, ",
+        ),
+        ({"starts_from": "ClothReach-v0"}, "ClothReach-v0 does not observe coverage, which sees names"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            begun(**chosen)
+    with pytest.raises(FileNotFoundError, match="nowhere.npz"):
+        begun(starts_from="nowhere.npz")
+
+
 def test_a_buffer_draws_from_the_last_transitions(single):
     replay, rng = single.Replay(10, *SIZES), np.random.default_rng(0)
     for first in range(0, 16, 4):

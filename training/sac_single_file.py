@@ -52,6 +52,8 @@ NOISY_EPISODES = 200  # of the final evaluation with noise, at most
 LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
 KEEPS = ("last", "best")
+SPREAD = 1e-4  # added to the variances by which observations are normalized
+CRITICS_FIRST = 1_000  # updates before a policy changes that a run begins with: critics do not know it yet
 MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sheets, and is not to learn from it to stand still
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
@@ -90,6 +92,7 @@ class Options:
     keeps: str = "last"  # of the policies that were evaluated on the way; "best" where scores differ much between evaluations
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
+    starts_from: str = ""  # an id, whose committed policy of this script the run begins with, or the file of another policy
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
 
@@ -139,7 +142,11 @@ class Args:
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
         _of_their_types(chosen)
-        free = {"normalize", "sees", "keeps"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        if chosen["starts_from"]:
+            if not chosen["sees"] or not chosen["normalize"]:
+                raise ValueError("--options: starts_from needs normalized observations, and sees: the names of what carries over")
+            first_policy(chosen["starts_from"])
+        free = {"normalize", "sees", "keeps", "starts_from"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
@@ -157,6 +164,10 @@ def _of_their_types(chosen: dict[str, Any]) -> None:
         if name == "sees":
             if type(value) not in (list, tuple) or not all(isinstance(one, str) for one in value):
                 raise ValueError(f"--options: sees {value!r}: must be a list of names")
+            continue
+        if name == "starts_from":
+            if not isinstance(value, str):
+                raise ValueError(f"--options: starts_from {value!r}: must be an id, or the name of a file")
             continue
         if name == "keeps":
             if value not in KEEPS:
@@ -317,16 +328,17 @@ class Agent:
 class Normalizer:
     """Running mean and variance of all observations so far (Chan et al. 1979).
 
-    seen: 1 for each number of an observation that the nets see, and 0 for the others, whose normalized value is 0.
+    seen: 1 for each number of an observation that the nets see, and 0 for the others, whose normalized value is 0.  fixed: whether
+    it stays as it is.
     """
 
-    def __init__(self, size: int, active: bool, seen: NDArray | None = None) -> None:
-        self.mean, self.variance, self.count, self.active = np.zeros(size), np.ones(size), 0.0, active
+    def __init__(self, size: int, active: bool, seen: NDArray | None = None, fixed: bool = False) -> None:
+        self.mean, self.variance, self.count, self.active, self.fixed = np.zeros(size), np.ones(size), 0.0, active, fixed
         self.seen = np.ones(size) if seen is None else seen
 
     def see(self, observation: NDArray) -> None:
         """observation: (any, numbers)."""
-        if not self.active or not len(observation):
+        if self.fixed or not self.active or not len(observation):
             return
         count, away = len(observation), observation.mean(axis=0, dtype=float) - self.mean
         total = self.count + count
@@ -338,7 +350,7 @@ class Normalizer:
         """What is subtracted from observations, and what they are then multiplied by; None where they are left as they are."""
         if not self.active:
             return None
-        return self.mean.astype(np.float32), (self.seen / np.sqrt(self.variance + 1e-4)).astype(np.float32)
+        return self.mean.astype(np.float32), (self.seen / np.sqrt(self.variance + SPREAD)).astype(np.float32)
 
     def __call__(self, observation: NDArray) -> Any:
         import torch
@@ -388,6 +400,14 @@ class Replay:
 # --- the run ------------------------------------------------------------------------------------------------------------------
 
 
+def first_policy(name: str) -> Any:
+    """The committed policy of an id, as this script learned it, or that of a file."""
+    from clothgym.policies import load, read
+    from clothgym.registration import ENVIRONMENTS
+
+    return load(name, ALGO) if name in ENVIRONMENTS else read(name)
+
+
 class Run:
     """A learner on its batch of environments.
 
@@ -416,7 +436,7 @@ class Run:
         numbers, actions = self.now["observation"].shape[1], self.env.single_action_space.shape[0]
         space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
         self.agent = Agent(numbers, actions, self.options, space)
-        self.normalizer = Normalizer(numbers, self.options.normalize, self.seen_numbers(numbers))
+        self.normalizer = Normalizer(numbers, self.options.normalize, self.seen_numbers(numbers), bool(self.options.starts_from))
         self.replay = Replay(self.options.buffer_size, numbers, actions, picture)
         if (size := sum(rows.nbytes for rows in self.replay.rows.values())) > files.LARGEST:
             much = f"{size / 2**30:.1f} GiB, and a checkpoint holds {files.LARGEST / 2**30:.0f}"
@@ -428,6 +448,8 @@ class Run:
         self.collecting = 0.0 if state is None else float(state["times"]["collecting_seconds"])
         if state is not None:
             self.restore(state)
+        elif self.options.starts_from:
+            self.begin_as(first_policy(self.options.starts_from))
 
     def seen_numbers(self, count: int) -> NDArray | None:
         """Which numbers of an observation the nets see, as ``Normalizer`` takes it.
@@ -445,6 +467,34 @@ class Run:
         for name in names:
             seen[slices[name]] = 1
         return seen
+
+    def begin_as(self, policy: Any) -> None:
+        """Act as another task's policy does where what the nets see is there too, by name, and the rest as on average there.
+
+        Raises:
+            ValueError: it is of other nets or actions, or does not see all that these nets see.
+        """
+        import torch
+
+        source, slices = policy.make().unwrapped.task.observation_slices, self.env.task.observation_slices
+        whose, nets, actions = policy.about["env"], self.agent.policy[::2], self.env.single_action_space.shape[0]
+        if missing := set(self.options.sees) - set(source):
+            raise ValueError(f"starts_from: {whose} does not observe {', '.join(sorted(missing))}, which sees names")
+        sizes = [weight.shape[1] for weight, _ in policy.layers]
+        if (wanted := [*self.options.net_arch, actions]) != sizes or not policy.squashed or policy.normalization is None:
+            raise ValueError(f"starts_from: the policy of {whose} has layers of {sizes}, not of {wanted}, or is of another script")
+        # the means of actions; their noise is new
+        for number, (layer, (weight, bias)) in enumerate(zip(nets, policy.layers)):
+            layer.bias.data[: len(bias)] = torch.tensor(bias)
+            for name in self.options.sees if number == 0 else ():
+                layer.weight.data[: len(bias), slices[name]] = torch.tensor(weight[source[name]].T)
+            if number:
+                layer.weight.data[: len(bias)] = torch.tensor(weight.T)
+        # observations are normalized as they were there
+        shift, factor = policy.normalization
+        for name in self.options.sees:
+            self.normalizer.mean[slices[name]] = shift[source[name]]
+            self.normalizer.variance[slices[name]] = 1 / factor[source[name]].astype(float) ** 2 - SPREAD
 
     def seeds(self) -> list[int]:
         """Of the first environment and of torch, others after other numbers of steps."""
@@ -497,7 +547,8 @@ class Run:
                 self.agent.set_rate(options.learning_rate * max(1 - self.done / self.config["timesteps"], LEAST_RATE))
                 for batch in self.minibatches():
                     self.updates += 1
-                    self.agent.update(batch, with_policy=self.updates % options.policy_delay == 0)
+                    is_turn = self.updates % options.policy_delay == 0
+                    self.agent.update(batch, with_policy=is_turn and self.updates > (CRITICS_FIRST if options.starts_from else 0))
             self.keep(action, *stepping.result())
             self.set_multiplier()
             self.done += options.n_envs * self.env.task.control_steps
@@ -525,7 +576,7 @@ class Run:
 
         observation = self.now["observation"]
         self.normalizer.see(observation[~self.settling])
-        if at_random:
+        if at_random and not self.options.starts_from:
             return self.rng.uniform(-1, 1, (len(observation), *self.env.single_action_space.shape)).astype(np.float32)
         with torch.no_grad():
             return self.agent.act(self.seen(self.now))[0].numpy()
