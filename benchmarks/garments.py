@@ -9,6 +9,8 @@ Sections of ``results/garments.json``:
   garments; garments that were refused; those with intersections at rest, by the exact count; seconds to make one.
 * frames: processor time of a control step of 1/60 s for each environment [ms], of a T-shirt and of a grid of as many particles that
   lie on the floor, without self-collision and with the strict one.  Springs are structural and shear springs, or edges.
+* states: the same of T-shirts with strict self-collision that lie, are folded in half, hang from their shoulders, or have been
+  crumpled: lifted at a sleeve and dropped.
 """
 
 from __future__ import annotations
@@ -20,6 +22,8 @@ import numpy as np
 from cases import Case, Row, fill, parsed, table
 
 from clothgym import Plane, Simulation, grid
+from clothgym.envs.coverage import FINE_CELL, covered_area
+from clothgym.envs.garment_scores import flat_area
 from clothgym.garments import RANGES, random_garment, tshirt
 from clothgym.geometry.intersections import count_intersections
 from clothgym.geometry.regions import smallest_angle
@@ -27,7 +31,12 @@ from clothgym.mesh import SHEAR
 
 RESULT = Path(__file__).parent / "results" / "garments.json"
 GARMENTS, SPACINGS, BATCHES = 200, (0.02, 0.03), (1, 16)
+STATES = ("lying", "folded", "hanging", "crumpled")
 LYING, TIMED = 30, 10  # control steps until it lies, and that are timed
+HANGING, CRUMPLED = ("shoulder_left", "shoulder_right"), ("sleeve_top_left",)
+FOLDED = ("sleeve_top_left", "sleeve_bottom_left", "waist_left")
+FOLDING = 60  # control steps in which the left half is laid on the right one
+LIFTED, FALLEN = 60, 90  # control steps for which it hangs, and after which it has come to rest on the floor
 
 
 def meshes(kind: str, spacing: float, garments: int) -> Row:
@@ -57,7 +66,43 @@ def lying(sheet: str, spacing: float, num_envs: int, self_collision: str | bool)
         self_collision=self_collision, threads=1,
     )  # fmt: skip
     cloth.step(LYING)
-    times = []
+    return timed(cloth)
+
+
+def shirts(state: str, num_envs: int) -> Row:
+    """T-shirts of the default sizes in one of ``STATES``, each environment's a little moved, so that they differ."""
+    garment = tshirt(SPACINGS[0])
+    mesh, points = garment.mesh, garment.key_points
+    x = mesh.rest_positions.copy()
+    if state in ("hanging", "crumpled"):
+        # upright, its front toward -y
+        x = x[:, [0, 2, 1]] * (1, -1, 1) + (0, 0, 0.8)
+    anchors = {"hanging": HANGING, "folded": FOLDED, "crumpled": CRUMPLED}.get(state, ())
+    held = [points[name] for name in anchors]
+    cloth = Simulation(
+        mesh, num_envs=num_envs, bending="quadratic", colliders=[Plane(point=(0, 0, -0.01), friction=0.5)],
+        self_collision="strict", anchors=held, threads=1,
+    )  # fmt: skip
+    moved = np.random.default_rng(0).uniform(0, 0.001, (num_envs, 1, 3)) * (1, 1, 0)
+    cloth.reset(positions=x + moved)
+    for step in range(FOLDING if state == "folded" else 0):
+        # along half circles, over the garment
+        angle = np.pi * (step + 1) / FOLDING
+        ahead = x[held] * (np.cos(angle), 1, 1) + np.abs(x[held, :1]) * (0, 0, np.sin(angle)) + (0, 0, SPACINGS[0] / 4)
+        cloth.move_anchors(ahead + moved)
+        cloth.step()
+    if state == "crumpled":
+        cloth.step(LIFTED)
+    if state in ("crumpled", "folded"):
+        cloth.release()
+    cloth.step({"hanging": LIFTED, "crumpled": FALLEN}.get(state, LYING))
+    layers = covered_area(np.ascontiguousarray(cloth.positions[0].T), mesh.triangles, FINE_CELL) / flat_area(garment)
+    return {"covers": float(layers)} | timed(cloth)
+
+
+def timed(cloth: Simulation) -> Row:
+    """What its control steps cost from now on."""
+    mesh, num_envs, times = cloth.mesh, cloth.num_envs, []
     for _ in range(TIMED):
         start = time.process_time()
         cloth.step()
@@ -78,10 +123,10 @@ def main() -> None:
         (lying, {"sheet": sheet, "spacing": spacing, "num_envs": batch, "self_collision": mode})
         for spacing in SPACINGS for batch in BATCHES for mode in (False, "strict") for sheet in ("tshirt", "grid")
     ]  # fmt: skip
-    results = fill(
-        RESULT, {"meshes": made, "frames": frames}, args.select, args.fresh, {"time_step": 1 / 60, "bending": "quadratic"}
-    )
-    for section in ("meshes", "frames"):
+    states: list[Case] = [(shirts, {"state": state, "num_envs": batch}) for batch in BATCHES for state in STATES]
+    sections = {"meshes": made, "frames": frames, "states": states}
+    results = fill(RESULT, sections, args.select, args.fresh, {"time_step": 1 / 60, "bending": "quadratic"})
+    for section in sections:
         print(table(results.get(section, [])), end="\n\n")
 
 
