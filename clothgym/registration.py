@@ -84,7 +84,7 @@ ENVIRONMENTS = {
     ),
     "ClothFlattenShirt-Hard-v0": (
         "ClothFlattenShirtHard",
-        "Spread a crumpled T-shirt of another size and fabric in each episode on the floor and release it.",
+        "Spread a crumpled T-shirt on the floor and release it; each episode draws its size and fabric.",
     ),
     "ClothCanonicalize-v0": (
         "ClothCanonicalize",
@@ -92,7 +92,7 @@ ENVIRONMENTS = {
     ),
     "ClothCanonicalize-Hard-v0": (
         "ClothCanonicalizeHard",
-        "Spread a crumpled T-shirt of another size and fabric in each episode in its canonical pose.",
+        "Spread a crumpled T-shirt in its canonical pose; each episode draws its size and fabric.",
     ),
     "ClothFling-v0": (
         "ClothFling",

@@ -122,6 +122,7 @@ def _from_scratch(env_id: str) -> list[tuple[str, str]]:
         return []
     config = results.read_config(results.RUNS / runs[0]["run"], begun=False)
     said = {**config["env_kwargs"], **config["curriculum"].get("env_kwargs", {})}
+    said |= {"starts_from": config["started_from"]["env"]} if "started_from" in config else {}
     recipe = ", ".join(f"`{name}={value!r}`" for name, value in said.items())
     success = statistics.median(row["success_rate"] for row in runs)
     command, steps = f"`python training/sac_single_file.py --env {env_id}`", f"{config['timesteps'] / 1e6:.2f} M control steps"

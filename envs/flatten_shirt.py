@@ -151,15 +151,19 @@ class ClothFlattenShirtEnv(ClothEnv):
 
 
 class ClothFlattenShirtHardEnv(ClothEnv):
-    """Spread a crumpled T-shirt of another size and fabric in each episode on the floor and release it.
+    """Spread a crumpled T-shirt on the floor and release it; each episode draws its size and fabric.
 
     ## Description
     This task differs from ``ClothFlattenShirt-v0`` in what episodes draw, the default of ``randomize``: the size of the shirt, 0.85
     to 1.15 times the usual one; its weight, 100 to 200 g/m^2; its bending rigidity, 0.3 to 3 uN m; and the friction of the floor,
     0.3 to 0.7.  These replace the values below, and those of a ``fabric`` of your own; a ``randomize`` of your own replaces all
-    four ranges.  ``info`` has what was drawn, the observations have no number for it.
+    four ranges.  ``info`` has what was drawn, the observations have no number for it.  L stays 0.76 m for all sizes: places and
+    observations are in this unit.
 
     $physics
+
+    ## Observation Space
+    As in ``ClothFlattenShirt-v0``.
 
     ## Rewards
     As in ``ClothFlattenShirt-v0``.
@@ -168,7 +172,7 @@ class ClothFlattenShirtHardEnv(ClothEnv):
     As in ``ClothFlattenShirt-v0``, with the same ``info``.  Areas and distances are those of the shirt over its size.
 
     ## Starting State
-    As in ``ClothFlattenShirt-v0``, with crumpled shirts of the size that was drawn.
+    As in ``ClothFlattenShirt-v0``: the same 32 crumpled shirts, of the usual fabric, scaled to the size that was drawn.
     """
 
     task_class = FlattenShirtHardTask

@@ -15,7 +15,7 @@ from clothgym.registration import ENVIRONMENTS
 
 every_id = pytest.mark.parametrize("env_id", list(ENVIRONMENTS))
 STANDARD = [env_id for env_id in ENVIRONMENTS if "-Hard" not in env_id]
-# a harder tier differs in its sheet and its start alone, and a goal environment gives parts of its state vector
+# a harder tier differs in its sheet, its start and what it draws alone, and a goal environment gives parts of its state vector
 TASKS = [env_id for env_id in ENVIRONMENTS if "-Hard" not in env_id and "Goal" not in env_id]
 every_task = pytest.mark.parametrize("env_id", TASKS)
 # of what all tasks share, on a grid and on triangles; and on those whose tasks override a part of it, see OVERRIDDEN

@@ -133,48 +133,67 @@ def test_nets_see_the_named_observations_and_zero_for_the_others(single):
         single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["wind"]))}, None)
 
 
+def started(single, env="ClothFlattenShirt-v0", env_kwargs="{}", **chosen):
+    """A run that begins with the committed policy of ClothFlatten-v0."""
+    options = {"n_envs": 2, "sees": ["coverage"], "critics": 5, "starts_from": "ClothFlatten-v0", **chosen}
+    args = single.Args(env=env, env_kwargs=env_kwargs, options=json.dumps(options))
+    return single.Run(args.config, None)
+
+
 def test_a_run_that_starts_from_a_policy_acts_as_it_does_on_the_average_of_what_it_does_not_see(single):
     import clothgym
 
-    config = {"env": "ClothFlatten-v0", "seed": 0, "threads": 1, "timesteps": 10**6, "curriculum": {}}
-    config["env_kwargs"] = {"action_mode": "throw", "rows": 9, "physics": "fast"}
-    chosen = {"n_envs": 2, "sees": ["coverage"], "critics": 5, "net_arch": [128, 128], "starts_from": "ClothFlatten-v0"}
-    run = single.Run(config | {"hyperparameters": single.asdict(options(single, **chosen))}, None)
-    # the other task has its own places for the same names, and here fewer numbers in front of them
-    policy, here = clothgym.policies.load("ClothFlatten-v0", "sac_scratch"), run.env.task.observation_slices
-    there, (shift, _) = policy.make().unwrapped.task.observation_slices, policy.normalization
-    own, others = np.zeros((9, run.now["observation"].shape[1]), np.float32), np.tile(shift, (9, 1))
-    own[:, here["coverage"]] = others[:, there["coverage"]] = np.linspace(0.1, 1.0, 9)[:, None]
-    others[:, there["acting_left"]] = shift[there["acting_left"]]
-    assert run.acts(None, own) == pytest.approx(policy(others), abs=1e-5)
-    # the first decisions are its own with noise, and observations are not normalized anew
-    drawn, numbers = run.choose(at_random=True), run.normalizer.numbers()
+    run, policy = started(single), clothgym.policies.load("ClothFlatten-v0", "sac_scratch")
+    here, there = run.env.task.observation_slices["coverage"], policy.make().unwrapped.task.observation_slices["coverage"]
+    own = np.random.default_rng(0).normal(size=(9, run.now["observation"].shape[1])).astype(np.float32)
+    others = np.tile(policy.normalization[0], (9, 1))
+    own[:, here] = others[:, there] = np.linspace(0.1, 1.0, 9)[:, None]
+    assert here != there and run.acts(None, own) == pytest.approx(policy(others), abs=1e-5)
+    # the first decisions are its own with noise, and do not move the normalization
+    numbers = run.normalizer.numbers()
+    drawn = run.choose(at_random=True)
     assert np.abs(drawn - run.acts(None, run.now["observation"])).mean() < 0.25
-    assert run.normalizer.numbers()[0] == pytest.approx(numbers[0]) and run.normalizer.count == 0
+    assert np.array_equal(run.normalizer.numbers(), numbers)
+    assert run.config["started_from"]["env"] == "ClothFlatten-v0" and len(run.config["started_from"]["sha256"]) == 64
+
+
+def test_critics_learn_first_where_a_run_starts_from_a_policy_and_a_resumed_run_goes_on_with_its_own(single, monkeypatch):
+    monkeypatch.setattr(single, "CRITICS_FIRST", 4)
+    kwargs = '{"action_mode": "throw", "rows": 9, "physics": "fast"}'
+    chosen = {"updates": 4, "random_decisions": 2, "batch_size": 8, "buffer_size": 100, "timesteps": 1200}
+    run = started(single, "ClothFlatten-v0", kwargs, **chosen)
+    steps, weights = run.steps(), run.agent.policy[0].weight
+    first = weights.detach().clone()
+    for _ in range(2):
+        next(steps)
+    assert run.updates == 4 and weights.equal(first)
+    next(steps)
+    assert run.updates == 8 and not weights.equal(first)
+    state = run.state({"training_seconds": 1.0, "core_seconds": 1.0, "collecting_seconds": 1.0})
+    again = single.Run(run.config, state)
+    assert again.agent.policy[0].weight.equal(weights) and np.array_equal(again.normalizer.numbers(), run.normalizer.numbers())
+    again.choose(at_random=False)
+    assert np.array_equal(again.normalizer.numbers(), run.normalizer.numbers())
+    # a run whose first policy is another one by now, and that had no checkpoint yet
+    with pytest.raises(ValueError, match="ClothFlatten-v0 has changed since the run began"):
+        single.Run(run.config | {"started_from": {"sha256": "0" * 64}}, None)
 
 
 def test_policies_that_a_run_cannot_start_from_are_refused(single):
-    def begun(**chosen):
-        arguments = {"sees": ["coverage"], "critics": 5, "starts_from": "ClothFlatten-v0"} | chosen
-        env = arguments.pop("env", "ClothFlatten-v0")
-        args = single.Args(env=env, env_kwargs='{"action_mode": "throw"}', options=json.dumps(arguments))
-        return single.Run(args.config | {"timesteps": 1000}, None)
-
+    throw = '{"action_mode": "throw"}'
     for chosen, message in (
-        ({"sees": []}, "starts_from needs normalized observations, and sees"),
-        ({"normalize": False}, "starts_from needs normalized observations, and sees"),
-        ({"starts_from": 3}, "starts_from 3: must be an id"),
-        ({"starts_from": "ClothFlattenShirt-v0"}, "no policy of 'ClothFlattenShirt-v0' is committed"),
+        ({"sees": ["coverage", "speed"]}, "policy of ClothFlatten-v0 did not see 'speed', which sees lists"),
+        ({"net_arch": [64]}, r"has layers of \[128, 128, 17\], not of \[64, 17\]"),
+        ({"starts_from": "ClothFling-v0", "sees": ["grippers"]}, "policy of ClothFling-v0 did not see 'grippers'"),
+        ({"starts_from": "ClothFoldGoal-v0"}, "has goals or pictures"),
+        ({"env_kwargs": '{"obs_mode": "depth", "privileged": true}', "buffer_size": 100}, "has goals or pictures"),
         (
-            {"starts_from": "ClothFling-v0", "sees": ["coverage", "acting_left"], "net_arch": [64]},
-            r"layers of \[128, 128, .*\], not of \[64, ",
+            {"env": "ClothFlatten-v0", "env_kwargs": '{"action_mode": "velocity"}', "net_arch": [128, 128]},
+            "has layers of .* 17.*, not of .* 8",
         ),
-        ({"starts_from": "ClothReach-v0"}, "ClothReach-v0 does not observe coverage, which sees names"),
     ):
         with pytest.raises(ValueError, match=message):
-            begun(**chosen)
-    with pytest.raises(FileNotFoundError, match="nowhere.npz"):
-        begun(starts_from="nowhere.npz")
+            started(single, **({"env_kwargs": throw} | chosen))
 
 
 def test_a_buffer_draws_from_the_last_transitions(single):
@@ -513,6 +532,11 @@ WRONG = {
     '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
     '--options {"keeps":"first"}': "--options: keeps 'first': must be last or best",
     '--options {"critics":1}': "--options: critics 1: must be from 2 to 100",
+    '--options {"starts_from":"ClothFlatten-v0"}': "--options: starts_from needs normalized observations, and sees",
+    '--options {"starts_from":3}': "--options: starts_from 3: must be an id, or the name of a file",
+    '--options {"starts_from":"ClothFlaten-v0","sees":["coverage"],"normalize":true}': "did you mean 'ClothFlatten-v0'",
+    '--options {"starts_from":"ClothHook-Hard-v0","sees":["coverage"],"normalize":true}': "no policy of this script is",
+    '--options {"starts_from":"nowhere.npz","sees":["coverage"],"normalize":true}': "--options: starts_from: ",
     '--options {"n_steps":2}': "--options: no n_steps (there are: timesteps, n_envs",
     "--run taken": "taken holds a run already: go on with --resume taken",
     "--resume taken": "is a run of ppo, which train.py goes on with",

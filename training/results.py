@@ -58,6 +58,8 @@ def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
     found: dict[tuple[str, str], list[Result]] = {}
     for one in results:
         more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
+        if "started_from" in one:
+            more["starts_from"] = one["started_from"]["env"]
         label = ", ".join([LABELS[one["learner"]], *(f"`{name}={value!r}`" for name, value in more.items())])
         found.setdefault((one["env"], label), []).append(one)
     return found

@@ -13,7 +13,8 @@ Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="dept
 alone, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", 2018).
 
 The environments step in a thread of their own while the nets are updated from the transitions before.
-Rates depend on counts of steps, not on time, so the same command again gives the same policy, on any number of cores.
+A run may begin with another task's policy, as far as both see the same (``starts_from``).  Rates depend on counts of steps, not on
+time, so the same command again gives the same policy, on any number of cores.
 
 The folder holds what ``train.py`` leaves: config.json, checkpoint.pt, one a minute, with the replay buffer, progress.jsonl,
 policy.npz (of states; a policy of pictures is in the checkpoint alone), evaluation.json, learning_curve.png and policy.gif.  A run
@@ -22,6 +23,7 @@ that goes on begins new episodes.
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections import deque
@@ -53,7 +55,7 @@ LEAST_RATE = 0.05  # share of the learning rate that is left at the end
 EPISODES = 200  # training episodes whose mean is shown, and whose mean cost sets the multiplier
 KEEPS = ("last", "best")
 SPREAD = 1e-4  # added to the variances by which observations are normalized
-CRITICS_FIRST = 1_000  # updates before a policy changes that a run begins with: critics do not know it yet
+CRITICS_FIRST = 1_000  # updates of the critics alone, where a run begins with a given policy, which they do not know yet
 MOST_EXCESS = 1.0  # of a mean cost over its limit: an untrained policy tears sheets, and is not to learn from it to stand still
 # the least and the largest value of each number, and of each entry of net_arch
 LIMITS = {
@@ -92,7 +94,7 @@ class Options:
     keeps: str = "last"  # of the policies that were evaluated on the way; "best" where scores differ much between evaluations
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
-    starts_from: str = ""  # an id, whose committed policy of this script the run begins with, or the file of another policy
+    starts_from: str = ""  # id of a task with whose committed policy of this script the run begins, or a policy file
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
 
@@ -142,10 +144,12 @@ class Args:
             raise ValueError(f"--options: no {', '.join(sorted(unknown))} (there are: {', '.join(Options.__dataclass_fields__)})")
         chosen = asdict(Options(**options))
         _of_their_types(chosen)
+        started = {}
         if chosen["starts_from"]:
             if not chosen["sees"] or not chosen["normalize"]:
                 raise ValueError("--options: starts_from needs normalized observations, and sees: the names of what carries over")
-            first_policy(chosen["starts_from"])
+            policy, digest = first_policy(chosen["starts_from"])
+            started = {"started_from": {"env": policy.about["env"], "seed": policy.about.get("seed"), "sha256": digest}}
         free = {"normalize", "sees", "keeps", "starts_from"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
@@ -155,7 +159,7 @@ class Args:
             "clothgym": clothgym.__version__, "env": self.env, "algo": ALGO, "clone": {}, "env_kwargs": kwargs,
             "num_envs": chosen["n_envs"], "timesteps": chosen["timesteps"], "seed": self.seed, "threads": 1,
             "curriculum": curriculum, "hyperparameters": chosen,
-        }  # fmt: skip
+        } | started  # fmt: skip
 
 
 def _of_their_types(chosen: dict[str, Any]) -> None:
@@ -400,12 +404,24 @@ class Replay:
 # --- the run ------------------------------------------------------------------------------------------------------------------
 
 
-def first_policy(name: str) -> Any:
-    """The committed policy of an id, as this script learned it, or that of a file."""
-    from clothgym.policies import load, read
-    from clothgym.registration import ENVIRONMENTS
+def first_policy(name: str) -> tuple[Any, str]:
+    """The committed policy of an id, as this script learned it, or that of a file; and the hash of its file.
 
-    return load(name, ALGO) if name in ENVIRONMENTS else read(name)
+    Raises:
+        ValueError: there is none.
+    """
+    from clothgym.policies import FOLDER, available, read
+
+    path = Path(name).expanduser()
+    if path.suffix != ".npz":
+        env_id = checked_id(name)
+        if ALGO not in available().get(env_id, []):
+            raise ValueError(f"--options: starts_from {name}: no policy of this script is committed for it; name the file of one")
+        path = FOLDER / f"{env_id}_{ALGO}.npz"
+    try:
+        return read(path), hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ValueError(f"--options: starts_from: {error}") from None
 
 
 class Run:
@@ -449,7 +465,10 @@ class Run:
         if state is not None:
             self.restore(state)
         elif self.options.starts_from:
-            self.begin_as(first_policy(self.options.starts_from))
+            policy, digest = first_policy(self.options.starts_from)
+            if digest != config["started_from"]["sha256"]:
+                raise ValueError(f"starts_from: {self.options.starts_from} has changed since the run began; begin another run")
+            self.begin_as(policy)
 
     def seen_numbers(self, count: int) -> NDArray | None:
         """Which numbers of an observation the nets see, as ``Normalizer`` takes it.
@@ -472,26 +491,37 @@ class Run:
         """Act as another task's policy does where what the nets see is there too, by name, and the rest as on average there.
 
         Raises:
-            ValueError: it is of other nets or actions, or does not see all that these nets see.
+            ValueError: it is of other nets or actions, of another kind of observation, or did not see all that these nets see.
         """
         import torch
 
+        about, actions = policy.about, self.env.single_action_space.shape[0]
+        sizes, wanted = [weight.shape[1] for weight, _ in policy.layers], [*self.options.net_arch, actions]
+        begins = f"starts_from: the policy of {about['env']}"
+        if self.keys or policy.keys:
+            advice = "a run begins with a policy of plain states, or with none, {'starts_from': ''}"
+            raise ValueError(f"{begins} or the run has goals or pictures: {advice}")
+        if sizes != wanted or not policy.squashed or policy.normalization is None:
+            raise ValueError(f"{begins} has layers of {sizes}, not of {wanted}, or is not of this script")
+        for name in ("action_mode", "frame"):
+            one, other = (kwargs.get(name) for kwargs in (about["env_kwargs"], self.config["env_kwargs"]))
+            if one != other:
+                raise ValueError(f"{begins} has {name}={one!r}, the run {other!r}: its actions or observations mean something else")
         source, slices = policy.make().unwrapped.task.observation_slices, self.env.task.observation_slices
-        whose, nets, actions = policy.about["env"], self.agent.policy[::2], self.env.single_action_space.shape[0]
-        if missing := set(self.options.sees) - set(source):
-            raise ValueError(f"starts_from: {whose} does not observe {', '.join(sorted(missing))}, which sees names")
-        sizes = [weight.shape[1] for weight, _ in policy.layers]
-        if (wanted := [*self.options.net_arch, actions]) != sizes or not policy.squashed or policy.normalization is None:
-            raise ValueError(f"starts_from: the policy of {whose} has layers of {sizes}, not of {wanted}, or is of another script")
+        shift, factor = policy.normalization
+        for name in self.options.sees:
+            if name not in source or not factor[source[name]].all():
+                raise ValueError(f"{begins} did not see {name!r}, which sees lists")
+            if (one := len(factor[source[name]])) != (other := slices[name].stop - slices[name].start):
+                raise ValueError(f"{begins} saw {one} numbers of {name!r}, here there are {other}")
         # the means of actions; their noise is new
-        for number, (layer, (weight, bias)) in enumerate(zip(nets, policy.layers)):
+        for number, (layer, (weight, bias)) in enumerate(zip(self.agent.policy[::2], policy.layers)):
             layer.bias.data[: len(bias)] = torch.tensor(bias)
             for name in self.options.sees if number == 0 else ():
                 layer.weight.data[: len(bias), slices[name]] = torch.tensor(weight[source[name]].T)
             if number:
                 layer.weight.data[: len(bias)] = torch.tensor(weight.T)
         # observations are normalized as they were there
-        shift, factor = policy.normalization
         for name in self.options.sees:
             self.normalizer.mean[slices[name]] = shift[source[name]]
             self.normalizer.variance[slices[name]] = 1 / factor[source[name]].astype(float) ** 2 - SPREAD
@@ -624,6 +654,7 @@ class Run:
         if self.pictured:
             return None
         own = {"env": config["env"], "env_kwargs": config["env_kwargs"], "learner": ALGO, "seed": config["seed"]}
+        own |= {name: config[name] for name in ("started_from",) if name in config}
         return self.agent.exported(own | about, self.keys, self.normalizer)
 
     def acts(self, env: Any, observations: Any) -> NDArray:
@@ -737,7 +768,8 @@ def train(args: Args) -> None:
     noisy = score(run_episodes(config["env"], run.noisy, seeds, **config["env_kwargs"]))
     said = {name: noisy[name] for name in ("episodes", "success_rate", "success_rate_ci95", "normalized_performance")}
     print(f"with noise: success {said['success_rate']:.3f}, performance {said['normalized_performance']:.3f}")
-    about = learning.conclude(record, acting(run, policy), args.final_episodes, {"with_noise": said})
+    more = {"with_noise": said} | {name: config[name] for name in ("started_from",) if name in config}
+    about = learning.conclude(record, acting(run, policy), args.final_episodes, more)
     if policy is not None:
         policy.about |= about
         policy.save(folder / learning.POLICY)
