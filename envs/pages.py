@@ -28,6 +28,7 @@ from clothgym.envs.pick_place import STEPS
 from clothgym.envs.stepping import Kernels
 from clothgym.envs.task import OPTIONS, Task
 from clothgym.material import PRESETS, Material
+from clothgym.registration import ENVIRONMENTS
 
 if TYPE_CHECKING:
     from clothgym.envs.single import TaskHolder
@@ -139,6 +140,14 @@ def keywords_of(task_class: type[Task]) -> dict[str, Any]:
     return found
 
 
+def _takers(name: str) -> list[str]:
+    """The first two ids whose tasks take a keyword."""
+    from clothgym import envs  # imported here: it imports this module
+
+    tasks = {env_id: getattr(envs, f"{start}Env").task_class for env_id, (start, _) in ENVIRONMENTS.items()}
+    return [env_id for env_id, task_class in tasks.items() if name in keywords_of(task_class)][:2]
+
+
 def check_keywords(env: TaskHolder, given: Mapping[str, Any]) -> None:
     """Refuse keywords that an environment's task does not take.
 
@@ -151,6 +160,8 @@ def check_keywords(env: TaskHolder, given: Mapping[str, Any]) -> None:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
+            if others := _takers(name):
+                hint = f", which {' and '.join(others)} take{'s' if len(others) == 1 else ''}"
             raise TypeError(
                 f"{type(env).__name__} got an unexpected keyword argument {name!r}{hint} (there are: {', '.join(known)})"
             )

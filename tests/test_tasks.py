@@ -233,6 +233,8 @@ def test_own_keywords_of_a_task_are_listed_as_valid():
         gym.make("clothgym:ClothDrapeGripper-v0", gripers=1)
     with pytest.raises(TypeError, match="there are: threshold, cost_penalty, strain_limit, integrator, rows, side, fabric"):
         gym.make_vec("clothgym:ClothStrain-v0", num_envs=2, treshold=1)
+    with pytest.raises(TypeError, match="'garment', which ClothFoldShirt-v0 and ClothFoldShirt-Hard-v0 take .there"):
+        gym.make("clothgym:ClothFold-v0", garment="tshirt")
 
 
 @two_tasks
