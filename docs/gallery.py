@@ -81,10 +81,10 @@ CLIPS = {
     "ClothFlattenShirt-v0": Clip("ClothFlattenShirt-v0", seed=4, look="cotton_broad", policy="expert", speed=2),
     "ClothCanonicalize-v0": Clip("ClothCanonicalize-v0", seed=FIRST_HELD_OUT + 2, look="cotton_broad", policy="expert", speed=2),
     "ClothFlattenShirt-Hard-v0": Clip(
-        "ClothFlattenShirt-Hard-v0", seed=FIRST_HELD_OUT, look="cotton_broad", policy="expert", speed=2
+        "ClothFlattenShirt-Hard-v0", seed=FIRST_HELD_OUT + 1, look="cotton_broad", policy="expert", speed=2
     ),
     "ClothCanonicalize-Hard-v0": Clip(
-        "ClothCanonicalize-Hard-v0", seed=FIRST_HELD_OUT, look="cotton_broad", policy="expert", speed=2
+        "ClothCanonicalize-Hard-v0", seed=FIRST_HELD_OUT + 1, look="cotton_broad", policy="expert", speed=2
     ),
     "ClothFoldGoal-v0": Clip("ClothFoldGoal-v0", look="polyester"),
     "ClothFlatten-v0": Clip("ClothFlatten-v0", look="polyester_faille", speed=3),
