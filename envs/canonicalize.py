@@ -113,7 +113,9 @@ class ClothCanonicalizeHardEnv(ClothEnv):
     $physics
 
     ## Observation Space
-    As in ``ClothCanonicalize-v0``.
+    $observations
+
+    ``corners``, ``coverage`` and ``next`` are those of ``ClothCanonicalize-v0``.
 
     ## Rewards
     As in ``ClothCanonicalize-v0``.

@@ -163,7 +163,9 @@ class ClothFlattenShirtHardEnv(ClothEnv):
     $physics
 
     ## Observation Space
-    As in ``ClothFlattenShirt-v0``.
+    $observations
+
+    ``corners`` and ``next`` are those of ``ClothFlattenShirt-v0``.
 
     ## Rewards
     As in ``ClothFlattenShirt-v0``.
