@@ -104,11 +104,8 @@ class ClothCanonicalizeHardEnv(ClothEnv):
     """Spread a crumpled T-shirt in its canonical pose; each episode draws its size and fabric.
 
     ## Description
-    This task differs from ``ClothCanonicalize-v0`` in what episodes draw, the default of ``randomize``: the size of the shirt, 0.85
-    to 1.15 times the usual one; its weight, 100 to 200 g/m^2; its bending rigidity, 0.3 to 3 uN m; and the friction of the floor,
-    0.3 to 0.7.  These replace the values below, and those of a ``fabric`` of your own; a ``randomize`` of your own replaces all
-    four ranges.  ``info`` has what was drawn, the observations have no number for it.  L stays 0.76 m for all sizes: places and
-    observations are in this unit.
+    This task differs from ``ClothCanonicalize-v0`` in what episodes draw: sizes, fabrics and the friction of the floor, as in
+    ``ClothFlattenShirt-Hard-v0``.
 
     $physics
 

@@ -182,7 +182,7 @@ def test_critics_learn_first_where_a_run_starts_from_a_policy_and_a_resumed_run_
 def test_policies_that_a_run_cannot_start_from_are_refused(single):
     throw = '{"action_mode": "throw"}'
     for chosen, message in (
-        ({"sees": ["coverage", "speed"]}, "policy of ClothFlatten-v0 did not see 'speed', which sees lists"),
+        ({"sees": ["coverage", "speed"]}, "policy of ClothFlatten-v0 did not see 'speed', which the option sees lists"),
         ({"net_arch": [64]}, r"has layers of \[128, 128, 17\], not of \[64, 17\]"),
         ({"starts_from": "ClothFling-v0", "sees": ["grippers"]}, "policy of ClothFling-v0 did not see 'grippers'"),
         ({"starts_from": "ClothFoldGoal-v0"}, "has goals or pictures"),

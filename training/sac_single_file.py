@@ -511,7 +511,7 @@ class Run:
         shift, factor = policy.normalization
         for name in self.options.sees:
             if name not in source or not factor[source[name]].all():
-                raise ValueError(f"{begins} did not see {name!r}, which sees lists")
+                raise ValueError(f"{begins} did not see {name!r}, which the option sees lists")
             if (one := len(factor[source[name]])) != (other := slices[name].stop - slices[name].start):
                 raise ValueError(f"{begins} saw {one} numbers of {name!r}, here there are {other}")
         # the means of actions; their noise is new
