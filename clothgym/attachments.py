@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym._jit import apart, callees_of, kernel, run_spans, specialize
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, positive, spread, vector
-from clothgym.collisions import COLLIDER_ROWS, SCRATCH_ROWS, Solids, keep_out, stop_at_solids
+from clothgym.collisions import Solids, keep_out, probe_of, stop_at_solids
 from clothgym.elements import Elastic, Topology, scratch_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
@@ -194,8 +194,13 @@ class Attachments:
         """Begin a control step of blocks ``first`` to ``last`` with the lag of the last one, see ``settle_lag``."""
         settle_lag(first, last, lag, behind, self.holder, self.anchors, self.limits[:, REACH2], w, free_w)
 
-    def steer(self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids) -> None:
-        """Begin a control step of blocks ``first`` to ``last``: grips, and velocities of held particles, see ``steer``."""
+    def steer(
+        self, first: int, last: int, x: NDArray, v: NDArray, w: NDArray, free_w: NDArray, solids: Solids, lag: NDArray
+    ) -> None:  # fmt: skip
+        """Begin a control step of blocks ``first`` to ``last``: grips, and velocities of held particles, see ``steer``.
+
+        lag: of held particles [m], (blocks, 3, particles, lanes), or of no blocks without strict contact.
+        """
         # what grippers take hold of now is carried, and kept out of solids, from this step on
         if self.grippers:
             move_fingers(first, last, x, w, free_w, self.x, self.opening, self.wanted, self.holder, self.limits, self.anchors)
@@ -204,8 +209,8 @@ class Attachments:
         if len(solids.colliders) and self.count:
             allowed = self.allowed
             bar_blocks(
-                first, last, x, self.x, self.targets, self.holder, self.limits, self.anchors, time_step, solids.rows, solids.shapes,
-                allowed, self.blocked,
+                first, last, x, lag, self.x, self.targets, self.holder, self.limits, self.anchors, time_step, solids.solid, allowed,
+                self.blocked,
             )  # fmt: skip
         steer_blocks(first, last, x, v, self.x, allowed, self.holder, self.limits, self.anchors, time_step)
 
@@ -397,17 +402,36 @@ def steer(x, v, tips, targets, holder, limits, anchors, time_step):
 
 
 @kernel
-def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step, colliders, shapes, allowed, blocked):
+def keep_held_out(k, x, lag, holder, way, l, time_step, solid, b, probe):
+    """Change the way of attachment k in lane l of block b so that no particle which it holds ends deeper in a solid than it began,
+    nor does where it goes that lags.  Returns whether it was changed; way: [m], (3,); the rest as in ``bar_blocks``."""
+    start, changed = probe.start, False
+    for p in range(x.shape[2]):
+        if holder[b, p, l] != k:
+            continue
+        for c in range(3):
+            start[c] = x[b, c, p, l]
+        changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, probe)
+        # contact may have held it back: it catches up
+        if lag.shape[0] > 0 and (lag[b, 0, p, l] != 0 or lag[b, 1, p, l] != 0 or lag[b, 2, p, l] != 0):
+            for c in range(3):
+                start[c] += lag[b, c, p, l]
+            changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, probe)
+    return changed
+
+
+@kernel
+def bar_blocks(first, last, x, lag, tips, targets, holder, limits, anchors, time_step, solid, allowed, blocked):
     """Write to ``allowed`` where each attachment may go in this control step without entering a solid, or carrying particles into
     it.
 
-    If nothing is in its way this is its target.  tips, targets, allowed: [m], (blocks, attachments, 3, lanes).  blocked: (blocks,
-    attachments, lanes).  colliders, shapes: see ``collisions.Solids``.
+    If nothing is in its way this is its target.  lag: of held particles [m], see ``settle_lag``; of no blocks where there is none.
+    tips, targets, allowed: [m], (blocks, attachments, 3, lanes).  blocked: (blocks, attachments, lanes).  solid: a
+    ``collisions.Solid``.
     """
-    # scratch: a point and a collider in a single lane; position and displacement of the attachment
     one = x.dtype.type(1)
-    point, rows, scratch = np.empty((3, 1, 1), x.dtype), np.empty((COLLIDER_ROWS, 1), x.dtype), np.empty((SCRATCH_ROWS, 1), x.dtype)
-    tip, way, left = np.empty(3, x.dtype), np.empty(3, x.dtype), np.empty(3, x.dtype)
+    probe = probe_of(x)
+    start, way, tried = probe.start, probe.way, probe.tried
     for b in range(first, last):
         for k in range(tips.shape[1]):
             for l in range(x.shape[3]):
@@ -415,32 +439,23 @@ def bar_blocks(first, last, x, tips, targets, holder, limits, anchors, time_step
                 held = k < anchors.shape[0] and holder[b, anchors[k], l] == k
                 length2 = one - one
                 for c in range(3):
-                    tip[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
-                    way[c] = targets[b, k, c, l] - tip[c]
+                    start[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
+                    way[c] = targets[b, k, c, l] - start[c]
                     length2 += way[c] * way[c]
                     allowed[b, k, c, l] = targets[b, k, c, l]
                 slow = one / max(np.sqrt(length2) / (time_step * limits[k, SPEED]), one)
                 for c in range(3):
                     way[c] *= slow
                 # shorten or deflect it for the attachment itself, and then for each particle that it holds
-                changed = stop_at_solids(tip, way, colliders[b], shapes, l, time_step, point, rows, scratch)
-                for p in range(x.shape[2]):
-                    if holder[b, p, l] == k:
-                        for c in range(3):
-                            tip[c] = x[b, c, p, l]
-                        changed |= keep_out(tip, way, colliders[b], shapes, l, time_step, point, rows, scratch)
+                changed = stop_at_solids(start, way, solid.rows[b], solid.shapes, l, time_step, probe)
+                changed |= keep_held_out(k, x, lag, holder, way, l, time_step, solid, b, probe)
                 # solids that push back in turn may push into each other, as in a sharp corner: then it stays
                 if changed:
                     for c in range(3):
-                        tip[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
-                        left[c] = way[c]
-                    caught = keep_out(tip, left, colliders[b], shapes, l, time_step, point, rows, scratch)
-                    for p in range(x.shape[2]):
-                        if holder[b, p, l] == k and not caught:
-                            for c in range(3):
-                                tip[c] = x[b, c, p, l]
-                            caught = keep_out(tip, left, colliders[b], shapes, l, time_step, point, rows, scratch)
-                    if caught:
+                        start[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
+                        tried[c] = way[c]
+                    caught = keep_out(start, tried, solid.rows[b], solid.shapes, l, time_step, probe)
+                    if caught or keep_held_out(k, x, lag, holder, tried, l, time_step, solid, b, probe):
                         way[:] = 0
                 # where it leads
                 blocked[b, k, l] = changed

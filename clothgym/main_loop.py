@@ -18,6 +18,7 @@ from clothgym import limiting
 from clothgym._jit import callees_of, placeholder, specialize, uncounted
 from clothgym.bending import Bending
 from clothgym.collisions.self.step import kernels_of as self_contact_kernels
+from clothgym.collisions.solids.owner import Solid
 from clothgym.collisions.solids.sheet_contact import kernels_of as contact_kernels
 from clothgym.elements import Elastic
 from clothgym.forces import add_air_forces
@@ -80,13 +81,6 @@ class Schedule(NamedTuple):
     plan: tuple[NDArray, ...]
     work_shape: tuple[int, int, int]
     limit: float
-
-
-class Solid(NamedTuple):
-    """Solids as kernels see them: what all environments share, and a block's rows, (blocks, colliders, COLLIDER_ROWS, lanes)."""
-
-    shapes: Any
-    rows: NDArray
 
 
 class Outcome(NamedTuple):

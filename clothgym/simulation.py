@@ -36,7 +36,7 @@ from clothgym.integrators import Integrator
 from clothgym.integrators.base import Preparation
 from clothgym.layout import Layout
 from clothgym.limiting import Limiting, checked_limit
-from clothgym.main_loop import MainLoop, Motion, Outcome, Schedule, Solid, compiled
+from clothgym.main_loop import MainLoop, Motion, Outcome, Schedule, compiled
 from clothgym.material import Material
 from clothgym.mesh import ClothMesh
 from clothgym.parameters import AIR_DENSITY, changed, check_properties, checked_size, fabric_rows, inverse_masses, of_material
@@ -216,9 +216,9 @@ class Simulation:
         self.turn.check_consistent()
         chosen = None if envs is None else self.layout.alone(envs, self.integrator.name)
         self._prepare()
-        schedule, sheet = self._schedule, self._contact.sheet if self._contact.options is not None else ()
+        schedule, solids = self._schedule, self._solids.solid
+        sheet, lag = self._contact.at(solids), self._contact.lag
         motion, outcome = Motion(self._x, self._v, self._w, self._remainders), Outcome(self._limited, self._diverged)
-        solids = Solid(self._solids.shapes, self._solids.rows)
 
         def work(first: int, last: int) -> None:
             blocks = slice(first, last)
@@ -226,7 +226,7 @@ class Simulation:
             if self._contact.strict:
                 memory = self._contact.sheet.memory
                 self._attachments.take_up_lag(first, last, memory.lag, memory.behind, self._w, self._free_w)
-            self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids)
+            self._attachments.steer(first, last, self._x, self._v, self._w, self._free_w, self._solids, lag)
             if held is not None:
                 self._contact.let_go(held, self._attachments.holder[blocks], blocks)
             self._advance(first, last, motion, self._topology, self._fabric, solids, sheet, schedule, outcome)

@@ -437,6 +437,25 @@ def test_what_fingers_take_in_a_step_is_kept_out_of_the_floor_in_that_step():
     assert s.positions[0, 12, 2] == pytest.approx(0, abs=1e-5)
 
 
+def test_what_lags_is_kept_out_of_the_floor_where_it_will_have_caught_up():
+    """It is 2 cm above the floor and lags by 1.5 cm, so its gripper may go down by the rest."""
+    s = simulation(
+        grippers=[Gripper(position=(*REST[12, :2], 0.03), reach=0.02, closing_time=1e-3)], colliders=[Plane()],
+        self_collision="strict", gravity=(0, 0, 0),
+    )  # fmt: skip
+    s.reset(positions=REST + (0, 0, 0.02))
+    s.grippers.move([[[*REST[12, :2], 0.03]]], [[0]])
+    s.step()
+    state = s.get_state()
+    state.self_contact["lag"][0, 12, 2] = -0.015
+    s.set_state(state)
+    for _ in range(3):
+        s.grippers.move([[[*REST[12, :2], 0.012]]], [[0]])
+        s.step()
+    assert s.positions[0, 12, 2] == pytest.approx(0, abs=1e-5)
+    assert s.grippers.positions[0, 0, 2] == pytest.approx(0.025, abs=1e-5)
+
+
 @pytest.mark.parametrize("reach", [0.01, 0.2])
 @pytest.mark.parametrize("slope", [0.3, 0.6])
 def test_a_gripper_that_is_told_into_a_sharp_corner_stays_out_of_both_walls(slope, reach):

@@ -9,13 +9,16 @@ from folded import SIDE, sheet, three_layers
 
 import clothgym
 from clothgym import contact_memory
+from clothgym.collisions import Solid, Solids
 from clothgym.collisions.self.broad_phase import Reach, enclose, far_leaves
 from clothgym.collisions.self.gap_constraints import enforce_gaps
 from clothgym.collisions.self.impulses import FASTEST, _correct
 from clothgym.collisions.self.query import query
 from clothgym.collisions.self.query_scratch import LEAF_PAIRS, Found, scratch_for_queries
 from clothgym.collisions.self.topology import pairs_of
+from clothgym.collisions.solids.attachment_contact import probe_of
 from clothgym.contact_memory import C_SIZE, G_SIZE, REPORT_SIZE
+from clothgym.layout import Layout
 from clothgym.starts import MANEUVERS
 
 
@@ -419,6 +422,26 @@ def test_an_anchor_that_would_pull_cloth_through_cloth_stops_and_lags():
     np.testing.assert_allclose(simulation.positions[0, 0], targets[0, 0], atol=1e-3)
 
 
+@pytest.mark.parametrize(("speed", "across", "depth"), [(0.5, 0.12, 1e-4), (2.0, 0.2, 1e-3)])
+def test_an_anchor_does_not_press_cloth_into_the_floor(speed, across, depth):
+    """A corner is laid on the sheet and pressed against it; without what deflects the jam the sheet goes 2.7 and 13 mm deep."""
+    mesh = sheet(13)
+    floor = clothgym.Plane((0, 0, 0))
+    simulation = clothgym.Simulation(mesh, anchors=[0], anchor_speed=speed, self_collision="strict", colliders=[floor])
+    simulation.reset(positions=mesh.rest_positions - mesh.rest_positions.min(axis=0) + [0, 0, 0.005])
+    targets, deepest, lags = simulation.attachment_positions, 0.0, []
+    for place in [(0.0, 0.0, 0.15), (across, across, 0.1), (across, across, -0.05), (across + 0.1, across, -0.05)]:
+        targets[0, 0] = place
+        for _ in range(30):
+            simulation.move_anchors(targets)
+            simulation.step()
+            lowest = simulation.positions[0, :, 2].min()
+            deepest = max(deepest, -lowest)
+            lags.append(simulation.self_contacts.lag[0])
+    assert deepest < depth and simulation.intersections()[0] == 0
+    assert max(lags[:60]) < 1e-6 < 1e-3 < max(lags[60:])
+
+
 def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
     """What a jam keeps from substep to substep would grow for ever: a vertex hits a triangle at 1000 m/s."""
     real = np.float32
@@ -433,11 +456,12 @@ def test_a_contact_takes_no_more_speed_in_a_substep_than_there_is():
 
 
 Jam = namedtuple("Jam", "old lag report members planes constraints behind")
-Scratch = namedtuple("Scratch", "halvings zone wish before_zone zone_before mean squares")
+JammedSheet = namedtuple("JammedSheet", "memory solid")
+Scratch = namedtuple("Scratch", "halvings zone wish before_zone zone_before mean squares probe")
 H = 0.5  # substep [s]
 
 
-def enforced(x, moves, w, pairs=((0, 1, 1.0),), limit=np.inf):
+def enforced(x, moves, w, pairs=((0, 1, 1.0),), limit=np.inf, solids=()):
     """What becomes of the moves of vertices, of their velocities, which are moves / H, and of the lag, (vertices, 3) each.
 
     pairs: the upper and the lower vertex of each gap constraint along z, and the share of their distance that it keeps.
@@ -454,9 +478,11 @@ def enforced(x, moves, w, pairs=((0, 1, 1.0),), limit=np.inf):
         old[None], np.zeros((1, 3, n, 1), real), np.zeros((1, 1, REPORT_SIZE)), members, planes, count, np.zeros((1, 1), real)
     )
     rows, whole = (np.empty((6, n), real) for _ in range(2)), (np.empty(n, np.int64) for _ in range(3))
-    scratch = Scratch(next(whole), next(whole), *rows, next(whole), np.empty(6), np.full(n, limit**2, real))
+    scratch = Scratch(next(whole), next(whole), *rows, next(whole), np.empty(6), np.full(n, limit**2, real), probe_of(old))
     outside, active = np.ones(n, np.bool_), np.arange(len(pairs), dtype=np.int32)
-    enforce_gaps(now, v, np.array(w, real)[:, None], memory, 0, 0, outside, active, len(pairs), scratch, real(H), True)
+    colliders = Solids(Layout(1, 1, 1, "lanes"), solids, H, np.dtype(real))
+    sheet = JammedSheet(memory, Solid(colliders.shapes, colliders.described()[None, :, :, None].astype(real)))
+    enforce_gaps(now, v, np.array(w, real)[:, None], sheet, 0, 0, outside, active, len(pairs), scratch, real(H), True)
     return (now - old)[..., 0].T, v[..., 0].T, memory.lag[0, ..., 0].T
 
 
@@ -501,6 +527,15 @@ def test_a_jam_moves_no_farther_than_its_limits_and_as_what_is_attached():
         np.testing.assert_allclose(moved[:2, 2], way, atol=1e-7)
         assert v[1, 2] * H == pytest.approx(way, abs=1e-7)
         np.testing.assert_allclose(lag[0], (0, 0, -8e-4 - way), atol=1e-7)
+    # a floor under the other one deflects both, and the attached one lags; below a roof that comes down to it they stay
+    floor, down = clothgym.Plane((0, 0, 0.5)), [(3e-4, 0, -8e-4), (0, 0, 2e-4), (0, 0, 0)]
+    moved, v, lag = enforced(x, down, [0, 1, 1], solids=[floor])
+    np.testing.assert_allclose(moved[:2], [(3e-4, 0, 0)] * 2, atol=1e-7)
+    np.testing.assert_allclose(v[1] * H, (3e-4, 0, 0), atol=1e-7)
+    np.testing.assert_allclose(lag[0], (0, 0, -8e-4), atol=1e-7)
+    moved, _, lag = enforced(x, down, [0, 1, 1], solids=[floor, clothgym.Plane((0, 0, 0.5), (-1, 0, -0.5))])
+    assert not moved[:2].any()
+    np.testing.assert_allclose(lag[0], down[0], atol=1e-7)
     # two that do not move alike stay, and lag
     moved, _, lag = enforced(x, moves, [0, 0, 1])
     assert not moved[:2].any()

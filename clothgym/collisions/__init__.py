@@ -19,16 +19,13 @@ thickness is not promised, nor that a start with intersections is untangled.
 """
 
 from clothgym.collisions.self.owner import SelfCollision, SelfContacts
-from clothgym.collisions.solids.attachment_contact import keep_out, stop_at_solids
+from clothgym.collisions.solids.attachment_contact import keep_out, probe_of, stop_at_solids
 from clothgym.collisions.solids.mesh_collider import MeshCollider
-from clothgym.collisions.solids.owner import Solids
+from clothgym.collisions.solids.owner import Solid, Solids
 from clothgym.collisions.solids.penetration import Contacts
-from clothgym.collisions.solids.shapes import COLLIDER_ROWS, Box, Capsule, Collider, Plane, Sphere
-from clothgym.collisions.solids.signed_distance import SCRATCH_ROWS
+from clothgym.collisions.solids.shapes import Box, Capsule, Collider, Plane, Sphere
 
 __all__ = [
-    "COLLIDER_ROWS",
-    "SCRATCH_ROWS",
     "Box",
     "Capsule",
     "Collider",
@@ -37,8 +34,10 @@ __all__ = [
     "Plane",
     "SelfCollision",
     "SelfContacts",
+    "Solid",
     "Solids",
     "Sphere",
     "keep_out",
+    "probe_of",
     "stop_at_solids",
 ]  # fmt: skip

@@ -46,7 +46,7 @@ def clamp_displacements(x, v, w, sheet, scratch, block, h):
             due, violated = evaluate_constraints(x, memory, block, l, active[:number])
             # jammed constraints are enforced without a query, which would find the same again
             if violated and not due:
-                enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h, False)
+                enforce_gaps(x, v, w, sheet, block, l, outside, active, number, scratch, h, False)
                 # vertices that stayed in place or moved as a zone have left the common motion, and so perhaps their limits
                 due = _any_beyond(x, memory.start[block], memory.limits[block], sheet.pairs.samples, l)
         # a query at the certified positions gives new bounds
@@ -206,7 +206,7 @@ def _query_again(x, v, w, sheet, scratch, block, l, h, outside):
             _clamp(x, v, memory, block, l, h, scratch.p, limits, held, zero, zero, zero)
             outside[:] = True
             active = memory.active[block, l, :constraints]
-            enforce_gaps(x, v, w, memory, block, l, outside, active, list_active(members, outside, active), scratch, h, True)
+            enforce_gaps(x, v, w, sheet, block, l, outside, active, list_active(members, outside, active), scratch, h, True)
         note_lag(w, memory, block, l)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from clothgym._jit import inlined, kernel, uncounted
 from clothgym.collisions.self.narrow_phase import GROUP_JAMMED
+from clothgym.collisions.solids.attachment_contact import keep_out
 from clothgym.contact_memory import G_GROUP, G_KEPT, G_NUMBER, G_OWN, G_VERTICES, REPORT_CLAMPED, REPORT_LAG
 
 PATIENCE = 4  # evaluations of all gap constraints after which a query, which gives the vertices new bounds, is cheaper
@@ -88,7 +89,7 @@ def evaluate_constraints(x, memory, block, l, active):
 
 
 @uncounted
-def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h, bounded):
+def enforce_gaps(x, v, w, sheet, block, l, outside, active, number, scratch, h, bounded):
     """Enforce the gap constraints of lane l: halve the moves of the vertices of each violated one since the last certified
     positions, up to ``HALVINGS`` times, then leave them in place.  Their neighbors may follow.  What stays in place then moves as a
     whole, where it can, see ``_move_zones``.
@@ -97,6 +98,7 @@ def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h,
     are outside their bounds; becomes which have been moved, too, (particles,).  scratch: a ``query_scratch.QueryScratch``.  h: the
     substep [s].  bounded: whether zones stay within their vertices' limits, ``scratch.squares``; otherwise the caller tests them.
     """
+    memory = sheet.memory
     members, planes, constraints = memory.members[block, l], memory.planes[block, l], active.shape[0]
     # mark the violated constraints as jammed
     again = False
@@ -126,7 +128,7 @@ def enforce_gaps(x, v, w, memory, block, l, outside, active, number, scratch, h,
             spread |= others
         if spread:
             number = list_active(members, outside, active)
-    _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded)
+    _move_zones(x, v, w, sheet, block, l, outside, scratch, h, bounded)
     note_lag(w, memory, block, l)
 
 
@@ -163,7 +165,7 @@ def _halve_moves(t, x, v, w, memory, block, l, outside, scratch):
 
 
 @uncounted
-def _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded):
+def _move_zones(x, v, w, sheet, block, l, outside, scratch, h, bounded):
     """Move what would stay in place: each zone, vertices that gap constraints join, by one displacement, which keeps its gaps:
 
         d = sum_p m_p d_p / sum_p m_p,   u = sum_p m_p u_p / sum_p m_p,
@@ -172,6 +174,7 @@ def _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded):
     keeps its momentum (impact zones: Provot, "Collision and self-collision handling in cloth model dedicated to design garments",
     1997; here without their rotation).  If it stayed in place, the cloth around it would hang from it as from a nail.
     """
+    memory = sheet.memory
     members, constraints, old = memory.members[block, l], memory.constraints[block, l], memory.old[block]
     zone, wish = scratch.zone, scratch.wish
     # the vertices that would stay in place, each with the number of its zone; at first, each is one
@@ -203,13 +206,14 @@ def _move_zones(x, v, w, memory, block, l, outside, scratch, h, bounded):
     # one after the other: each begins and ends without a violated constraint
     for root in range(zone.shape[0]):
         if zone[root] == root:
-            _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded)
+            _move_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded)
 
 
 @uncounted
-def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
+def _move_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
     """Move one zone.  It takes in what it would violate a gap constraint with.  All of it is left where it was if that does not
     end, if its attached vertices do not move alike, or if a gap in it is so small that rounding counts."""
+    memory = sheet.memory
     lag, zone, before, zone_before = memory.lag[block], scratch.zone, scratch.before_zone, scratch.zone_before
     # what to return to
     for p in range(zone.shape[0]):
@@ -219,7 +223,7 @@ def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
     # place it, until it runs into nothing
     moves, grows, growths = True, True, 0
     while moves and grows:
-        moves = _place_zone(root, x, v, w, memory.old[block], l, outside, scratch, h, bounded)
+        moves = _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded)
         if moves:
             apart, grows = _take_in(root, x, memory, block, l, zone)
             growths += 1
@@ -238,10 +242,11 @@ def _move_zone(root, x, v, w, memory, block, l, outside, scratch, h, bounded):
 
 
 @uncounted
-def _place_zone(root, x, v, w, old, l, outside, scratch, h, bounded):
+def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
     """Place a zone: x <- old + d, v <- u, with the means of ``_move_zones``, or with the displacement of an attached vertex, if it
-    has one, and u = d / h.  Returns whether it may move: its attached vertices move alike, and all numbers are finite."""
-    zone, wish, mean = scratch.zone, scratch.wish, scratch.mean
+    has one, and u = d / h.  Returns whether it may move: its attached vertices move alike and press none of the others into a
+    solid, and all numbers are finite."""
+    old, zone, wish, mean = sheet.memory.old[block], scratch.zone, scratch.wish, scratch.mean
     held, alike, total, limit = -1, True, 0.0, np.inf
     mean[:] = 0.0
     # the sums over free vertices, the least limit, and the first attached vertex
@@ -267,6 +272,9 @@ def _place_zone(root, x, v, w, old, l, outside, scratch, h, bounded):
             mean[k] *= share
     if not (alike and square < np.inf):
         return False
+    # what is between an attachment and a solid stops it
+    if held >= 0 and not _keep_zone_out(root, mean, old, w, l, zone, sheet.solid, block, scratch.probe, h):
+        return False
     for p in range(zone.shape[0]):
         if zone[p] == root:
             outside[p] = True
@@ -275,6 +283,30 @@ def _place_zone(root, x, v, w, old, l, outside, scratch, h, bounded):
                 if w[p, l] > 0:
                     v[k, p, l] = mean[3 + k]
     return True
+
+
+@uncounted
+def _keep_zone_out(root, mean, old, w, l, zone, solid, block, probe, h):
+    """Deflect a zone's displacement, and so its velocity, where it would carry a free vertex deeper into a solid.  Returns whether
+    it may go there: not between solids that push back in turn."""
+    start, way, changed, again = probe.start, probe.way, False, True
+    for k in range(3):
+        way[k] = mean[k]
+    # the second time nothing may change it
+    for _ in range(2):
+        again = False
+        for p in range(zone.shape[0]):
+            if zone[p] == root and w[p, l] > 0:
+                for k in range(3):
+                    start[k] = old[k, p, l]
+                again |= keep_out(start, way, solid.rows[block], solid.shapes, l, h - h, probe)
+        changed |= again
+        if not again:
+            break
+    if changed:
+        for k in range(3):
+            mean[k], mean[3 + k] = way[k], way[k] / h
+    return not again
 
 
 @uncounted

@@ -22,6 +22,7 @@ from clothgym.collisions.self.query_scratch import Found, scratch_for_queries
 from clothgym.collisions.self.spread import spread_out
 from clothgym.collisions.self.step import PUSH, Memory, Setting, Sheet
 from clothgym.collisions.self.topology import Pairs, pairs_of
+from clothgym.collisions.solids.owner import Solid
 from clothgym.contact_memory import (
     C_SIZE,
     G_SIZE,
@@ -140,13 +141,22 @@ class SelfCollision:
         real = dtype.type
         friction, push, tolerance = real(self.options.friction), real(PUSH), real(TOLERANCE * self.thickness)
         setting = Setting(self.options.mode == "strict", dtype == np.float32, friction, push, tolerance)
-        self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype))
+        self.sheet = Sheet(pairs, reach, setting, memory_of(layout, mesh.num_particles, dtype), ())
         self.check(mesh.rest_positions[None], np.zeros(1, np.int64))
 
     @property
     def strict(self) -> bool:
         """Whether sheets are kept from passing through themselves."""
         return self.options is not None and self.options.mode == "strict"
+
+    def at(self, solid: Solid) -> Any:
+        """``sheet`` with the solids as they are now."""
+        return () if self.options is None else self.sheet._replace(solid=solid)
+
+    @property
+    def lag(self) -> NDArray:
+        """Lag of attached particles [m], (blocks, 3, particles, lanes), of no blocks where contact holds nothing back."""
+        return self.sheet.memory.lag if self.strict else np.zeros((0, 3, 0, 0), self.dtype)
 
     def check(self, positions: NDArray, envs: NDArray) -> None:
         """Refuse starts that strict mode cannot keep apart; positions: of ``envs``, (envs, particles, 3), or one sheet for all [m].

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from clothgym._jit import apart
 from clothgym.collisions.self.topology import NODE_LEAVES
+from clothgym.collisions.solids.attachment_contact import Probe, probe_of
 
 BATCH = 256  # pairs of primitives that are judged at a time
 LEAF_PAIRS = 3 * NODE_LEAVES  # pairs of leaves in a batch, for each leaf; one node may add ``NODE_LEAVES`` for each
@@ -36,7 +37,7 @@ class QueryScratch(NamedTuple):
     than its reach a query looks around each vertex [m]; bounds, limits: see ``narrow_phase`` [m]; squares: of the limits [m^2];
     held: whether attached; halvings, zone: see ``gap_constraints``, all (particles,).  wish: displacements and velocities that
     vertices would have without gap constraints; before_zone: positions and velocities before a zone moves, both (6,
-    particles); zone_before: the zones then, (particles,).  mean: of a zone, (6,).
+    particles); zone_before: the zones then, (particles,).  mean: of a zone, (6,).  probe: for distances to solids.
     normals, kinds: see ``contact_normals.SmoothSheet``.  faces: unit normals of triangles, (3, triangles).
     gradients, smallest: see ``spread``, (6, triangles), (triangles,).
     near: positions relative to the first particle [m], extras [m], and the largest extra [m] and stretch around each vertex, in
@@ -64,6 +65,7 @@ class QueryScratch(NamedTuple):
     before_zone: NDArray
     zone_before: NDArray
     mean: NDArray
+    probe: Probe
     normals: NDArray
     kinds: NDArray
     faces: NDArray
@@ -105,7 +107,8 @@ def scratch_for_queries(pairs, contacts):
     return QueryScratch(
         np.empty((n, 3)), np.empty((n, 3)), np.zeros(n), np.empty(n), np.empty(n), np.empty(n, real), np.empty(n, np.bool_),
         np.empty(n, np.int64), np.empty(n, np.int64), np.empty((6, n), real), np.empty((6, n), real), np.empty(n, np.int64),
-        np.empty(6), np.empty((n, 3)), np.zeros(n, np.uint8), np.empty((3, triangles)), np.empty((6, triangles)),
+        np.empty(6), probe_of(contacts), np.empty((n, 3)), np.zeros(n, np.uint8), np.empty((3, triangles)),
+        np.empty((6, triangles)),
         np.empty(triangles), np.empty((6, n), single), np.empty(edges, single), np.empty((2, triangles), single),
         np.zeros(near // 8 * 8 + 8, np.bool_), np.empty(pairs.near.primitives.shape[0], np.bool_), np.empty((6, leaves)),
         np.empty((4, leaves)), np.empty(leaves), np.empty((6, pairs.tree.nodes.shape[0])), np.empty((room, 2), whole),

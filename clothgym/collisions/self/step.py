@@ -115,12 +115,14 @@ class Setting(NamedTuple):
 
 
 class Sheet(NamedTuple):
-    """What the kernels need: the mesh's pairs, the distances of a query, the options and the memory."""
+    """What the kernels need: the mesh's pairs, the distances of a query, the options, the memory, and the solids, a
+    ``solids.owner.Solid``."""
 
     pairs: Pairs
     reach: Reach
     setting: Setting
     memory: Memory
+    solid: Any
 
 
 @inlined

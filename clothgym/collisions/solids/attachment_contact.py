@@ -1,4 +1,4 @@
-"""Contact of attachments with solids: points that are moved from outside, and stop at surfaces.
+"""Contact with solids of attachments, and of what they take along: points that are moved from outside, and stop at surfaces.
 
 A point follows its displacement until it meets a solid.  At the surface, without the thickness that cloth keeps, it loses the
 inward part of what remains, and slides on with the rest.  Solids that move push it along.  A point that starts inside a solid may
@@ -7,24 +7,53 @@ stay as deep as it is.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from clothgym._jit import apart, kernel
 from clothgym.collisions.solids.shapes import COLLIDER_ROWS, R_THICKNESS, R_VELOCITY
-from clothgym.collisions.solids.signed_distance import S_CONTACT, S_SPOT, lay_out, measure, normal_to_world, to_axes
+from clothgym.collisions.solids.signed_distance import S_CONTACT, S_SPOT, SCRATCH_ROWS, lay_out, measure, normal_to_world, to_axes
 
 STEPS = 20  # largest number of steps along a displacement
 SHORTEST = 1 / 16  # least share of the displacement in a step: a thinner wall may be missed
 AT_SURFACE = 1e-5  # distance below which a point is at the surface [m]
 
 
+class Probe(NamedTuple):
+    """Scratch for one point in one lane.
+
+    start, way: the point and its displacement [m]; tried: another displacement; end: where it leads, all (3,).  point, rows,
+    scratch: of the distance to a solid, (3, 1, 1), (COLLIDER_ROWS, 1) and (SCRATCH_ROWS, 1).
+    """
+
+    start: NDArray
+    way: NDArray
+    tried: NDArray
+    end: NDArray
+    point: NDArray
+    rows: NDArray
+    scratch: NDArray
+
+
 @kernel
-def _distance(x, collider, shapes, k, lane, spent, point, rows, scratch):
+def probe_of(x):
+    """A ``Probe`` in the dtype of an array."""
+    real = x.dtype
+    return Probe(
+        np.empty(3, real), np.empty(3, real), np.empty(3, real), np.empty(3, real), np.empty((3, 1, 1), real),
+        np.empty((COLLIDER_ROWS, 1), real), np.empty((SCRATCH_ROWS, 1), real),
+    )  # fmt: skip
+
+
+@kernel
+def _distance(x, collider, shapes, k, lane, spent, probe):
     """Distance of a point from the solid of one lane, without its thickness [m]; the normal is left in S_CONTACT + 1 and on.
 
-    x: the point [m], (3,).  spent: time for which the solid has moved [s].  point, rows, scratch: scratch, (3, 1, 1),
-    (COLLIDER_ROWS, 1) and (SCRATCH_ROWS, 1).
+    x: the point [m], (3,).  spent: time for which the solid has moved [s].
     """
+    point, rows, scratch = probe.point, probe.rows, probe.scratch
     # the solid's rows, and the point relative to where it has moved
     for r in range(COLLIDER_ROWS):
         rows[r, 0] = collider[r, lane]
@@ -38,14 +67,14 @@ def _distance(x, collider, shapes, k, lane, spent, point, rows, scratch):
 
 
 @apart
-def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, scratch):
+def stop_at_solids(x, way, colliders, shapes, lane, time_step, probe):
     """Move a point by a displacement, and stop it at solids.  Returns whether they changed its way.
 
     x: where the point is [m], (3,); becomes where it ends.  way: its displacement in this control step [m], (3,); becomes the
     actual one.
-    colliders: rows of a block, (colliders, COLLIDER_ROWS, lanes).  time_step: [s].  point, rows, scratch: scratch, see
-    ``_distance``.
+    colliders: rows of a block, (colliders, COLLIDER_ROWS, lanes).  time_step: [s].  probe: scratch, a ``Probe``.
     """
+    rows, scratch = probe.rows, probe.scratch
     zero, one = x.dtype.type(0), x.dtype.type(1)
     touching, shortest = x.dtype.type(AT_SURFACE), x.dtype.type(SHORTEST)
     start_x, start_y, start_z = x[0], x[1], x[2]
@@ -55,7 +84,7 @@ def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, scra
         step = one - done
         vx, vy, vz = way[0], way[1], way[2]
         for k in range(colliders.shape[0]):
-            distance = _distance(x, colliders[k], shapes, k, lane, done * time_step, point, rows, scratch)
+            distance = _distance(x, colliders[k], shapes, k, lane, done * time_step, probe)
             nx, ny, nz = scratch[S_CONTACT + 1, 0], scratch[S_CONTACT + 2, 0], scratch[S_CONTACT + 3, 0]
             # a point that starts inside may stay as deep; later, one that has become deeper is pushed back
             if n == 0:
@@ -95,20 +124,20 @@ def stop_at_solids(x, way, colliders, shapes, lane, time_step, point, rows, scra
 
 
 @apart
-def keep_out(start, way, colliders, shapes, lane, time_step, point, rows, scratch):
+def keep_out(start, way, colliders, shapes, lane, time_step, probe):
     """Change a displacement so that a point which starts at ``start``, (3,) [m], ends no deeper in any solid than it began.
 
     Returns whether it was changed; the other arguments are those of ``stop_at_solids``.
     """
     zero = start.dtype.type(0)
-    end = np.empty(3, start.dtype)
+    end, scratch = probe.end, probe.scratch
     changed = False
     for k in range(colliders.shape[0]):
         # depth before and after
-        before = min(_distance(start, colliders[k], shapes, k, lane, zero, point, rows, scratch), zero)
+        before = min(_distance(start, colliders[k], shapes, k, lane, zero, probe), zero)
         for c in range(3):
             end[c] = start[c] + way[c]
-        lacking = before - _distance(end, colliders[k], shapes, k, lane, time_step, point, rows, scratch)
+        lacking = before - _distance(end, colliders[k], shapes, k, lane, time_step, probe)
         # push the end out by the difference
         if lacking > start.dtype.type(AT_SURFACE):
             changed = True

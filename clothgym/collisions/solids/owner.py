@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +28,13 @@ from clothgym.layout import Layout
 from clothgym.state import State
 
 
+class Solid(NamedTuple):
+    """Solids as kernels see them: what all environments share, and a block's rows, (blocks, colliders, COLLIDER_ROWS, lanes)."""
+
+    shapes: Shapes
+    rows: NDArray
+
+
 class Solids:
     """The colliders of a batch, each with its own pose in every environment.
 
@@ -41,6 +49,11 @@ class Solids:
         self.shapes = _shapes(self.colliders, dtype)
         self.rows: NDArray
         self.homes: NDArray
+
+    @property
+    def solid(self) -> Solid:
+        """What kernels take."""
+        return Solid(self.shapes, self.rows)
 
     def described(self) -> NDArray[np.float64]:
         """Rows of the colliders as given, (colliders, COLLIDER_ROWS)."""
