@@ -71,7 +71,8 @@ class ClothCanonicalizeEnv(ClothEnv):
     fixed sequence of motions can fold it.  After 640 steps the grippers open, and the shirt settles for 40 steps, in which actions
     are ignored; then it is evaluated.  In the canonical pose the shirt lies flat, centered on the origin, its neck toward +y and
     its left sleeve toward -x.  With ``action_mode="throw"`` an episode has four throws, and the environment also turns a
-    lifted edge to its direction in the canonical pose.
+    lifted edge to its direction in the canonical pose.  The places of a throw lie along the direction opposite to ``out``: a throw
+    ends with the held edge ahead of the other one, and the front comes to lie up.
 
     $physics
 

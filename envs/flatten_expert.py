@@ -220,6 +220,9 @@ def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, 
     out = np.array([-along[1], along[0], 0.0]) * np.sign(turn)
     middle = tips.mean(axis=0)
     aim = _aim(task, e, corner, edge, along)
+    # a throw ends with the held edge ahead of the far one: it goes the other way, so that the front comes to lie up
+    if aim is not None and throwing is not None:
+        out = -out
     ahead = along if aim is None else _turned(along, np.clip(aim.angle, -TURNING, TURNING))
     apart = np.stack([-ahead, ahead]) * taut / 2
     low = x[ends, 2].min()

@@ -288,6 +288,24 @@ def test_a_throw_takes_the_hands_along_out_through_its_places():
     assert np.nanmax(middles[..., 1], axis=0).min() > 1.17 and np.isnan(middles[passed[-1] + 6, range(3)]).all()
 
 
+def test_throws_of_a_shirt_with_a_front_go_against_out():
+    env = gym.make_vec("clothgym:ClothCanonicalize-v0", num_envs=1, action_mode="throw", autoreset_mode="Disabled").unwrapped
+    env.reset(seed=5)
+    task = env.task
+    along, above = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5]), np.array([1.2, 1.1, 1.0, 0.9, 0.9, 0.9])
+    noted, inner = [], task._control_step
+
+    def step(actions):
+        out = task.seen["out"][0].copy()
+        inner(actions)
+        if np.all(task.simulation.grippers.held > 0) and np.linalg.norm(out) > 0.5:
+            noted.append(task.simulation.grippers.positions[0, :, :2].astype(float).mean(axis=0) @ out / task.physics.side)
+
+    task._control_step = step
+    task.step(np.concatenate([np.zeros(5), along / 0.7, (above - 0.635) / 0.615])[None])
+    assert not task.simulation.grippers.held.any() and noted[-1] == pytest.approx(-0.5, abs=0.02)
+
+
 def test_one_throw_in_an_action_and_a_way_that_it_cuts_short_leaves_the_edge_held():
     env = gym.make_vec(ID, num_envs=1, action_mode="throw", autoreset_mode="Disabled").unwrapped
     env.reset(seed=1_000_005)
