@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from clothgym._jit import apart, callees_of, kernel, run_spans, specialize
 from clothgym.bending import Bending, add_bend_forces
 from clothgym.checks import finite, indices, positive, spread, vector
-from clothgym.collisions import Solids, keep_out, probe_of, stop_at_solids
+from clothgym.collisions import AT_SURFACE, Solids, keep_out, probe_of, stop_at_solids
 from clothgym.elements import Elastic, Topology, scratch_for_forces
 from clothgym.forces import add_air_forces, add_spring_forces
 from clothgym.grid_forces import kernels_of
@@ -404,19 +404,23 @@ def steer(x, v, tips, targets, holder, limits, anchors, time_step):
 @kernel
 def keep_held_out(k, x, lag, holder, way, l, time_step, solid, b, probe):
     """Change the way of attachment k in lane l of block b so that no particle which it holds ends deeper in a solid than it began,
-    nor does where it goes that lags.  Returns whether it was changed; way: [m], (3,); the rest as in ``bar_blocks``."""
-    start, changed = probe.start, False
+    and that neither does the place to which a lagging one will catch up.
+
+    Returns whether it was changed.  way: [m], (3,).  probe: a ``Probe``, whose ``start`` is overwritten.  The rest as in
+    ``bar_blocks``.
+    """
+    start, tolerance, changed = probe.start, x.dtype.type(AT_SURFACE), False
     for p in range(x.shape[2]):
         if holder[b, p, l] != k:
             continue
         for c in range(3):
             start[c] = x[b, c, p, l]
-        changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, probe)
+        changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, tolerance, probe)
         # contact may have held it back: it catches up
         if lag.shape[0] > 0 and (lag[b, 0, p, l] != 0 or lag[b, 1, p, l] != 0 or lag[b, 2, p, l] != 0):
             for c in range(3):
                 start[c] += lag[b, c, p, l]
-            changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, probe)
+            changed |= keep_out(start, way, solid.rows[b], solid.shapes, l, time_step, tolerance, probe)
     return changed
 
 
@@ -454,7 +458,7 @@ def bar_blocks(first, last, x, lag, tips, targets, holder, limits, anchors, time
                     for c in range(3):
                         start[c] = x[b, c, anchors[k], l] if held else tips[b, k, c, l]
                         tried[c] = way[c]
-                    caught = keep_out(start, tried, solid.rows[b], solid.shapes, l, time_step, probe)
+                    caught = keep_out(start, tried, solid.rows[b], solid.shapes, l, time_step, x.dtype.type(AT_SURFACE), probe)
                     if caught or keep_held_out(k, x, lag, holder, tried, l, time_step, solid, b, probe):
                         way[:] = 0
                 # where it leads

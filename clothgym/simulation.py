@@ -217,7 +217,7 @@ class Simulation:
         chosen = None if envs is None else self.layout.alone(envs, self.integrator.name)
         self._prepare()
         schedule, solids = self._schedule, self._solids.solid
-        sheet, lag = self._contact.at(solids), self._contact.lag
+        sheet, lag = self._contact.sheet_with(solids), self._contact.lag
         motion, outcome = Motion(self._x, self._v, self._w, self._remainders), Outcome(self._limited, self._diverged)
 
         def work(first: int, last: int) -> None:

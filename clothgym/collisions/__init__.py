@@ -19,13 +19,14 @@ thickness is not promised, nor that a start with intersections is untangled.
 """
 
 from clothgym.collisions.self.owner import SelfCollision, SelfContacts
-from clothgym.collisions.solids.attachment_contact import keep_out, probe_of, stop_at_solids
+from clothgym.collisions.solids.attachment_contact import AT_SURFACE, keep_out, probe_of, stop_at_solids
 from clothgym.collisions.solids.mesh_collider import MeshCollider
 from clothgym.collisions.solids.owner import Solid, Solids
 from clothgym.collisions.solids.penetration import Contacts
 from clothgym.collisions.solids.shapes import Box, Capsule, Collider, Plane, Sphere
 
 __all__ = [
+    "AT_SURFACE",
     "Box",
     "Capsule",
     "Collider",

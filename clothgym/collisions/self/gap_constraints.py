@@ -19,6 +19,8 @@ HALVINGS = 4  # times that the moves of a gap constraint's vertices are halved b
 GROWTHS = 8  # a zone that has taken in this many times what it would violate a gap constraint with stays in place
 LEAST_MOVED = 3e-5  # least gap in a zone, at the last certified positions, with which it moves: more than rounding can take [m]
 ALIKE = 1e-6  # largest difference of the displacements of attached vertices in a zone that moves as they do [m]
+ROUNDED = 1e-6  # by how much deeper in a solid rounding may place a vertex that was kept out [m]
+ROOM = 1.001  # squares of displacements over their limits that still are within them, see ``displacement_bounds.INSIDE``
 INACTIVE_COST = 8  # inactive gap constraints that cost as much to skip as one active one to evaluate
 
 
@@ -211,8 +213,11 @@ def _move_zones(x, v, w, sheet, block, l, outside, scratch, h, bounded):
 
 @uncounted
 def _move_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
-    """Move one zone.  It takes in what it would violate a gap constraint with.  All of it is left where it was if that does not
-    end, if its attached vertices do not move alike, or if a gap in it is so small that rounding counts."""
+    """Move one zone.  It takes in what it would violate a gap constraint with.
+
+    All of it is left where it was if that does not end, if its attached vertices do not move alike, if solids leave it no way, or
+    if a gap in it is so small that rounding counts.
+    """
     memory = sheet.memory
     lag, zone, before, zone_before = memory.lag[block], scratch.zone, scratch.before_zone, scratch.zone_before
     # what to return to
@@ -244,8 +249,8 @@ def _move_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
 @uncounted
 def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
     """Place a zone: x <- old + d, v <- u, with the means of ``_move_zones``, or with the displacement of an attached vertex, if it
-    has one, and u = d / h.  Returns whether it may move: its attached vertices move alike and press none of the others into a
-    solid, and all numbers are finite."""
+    has one, and u = d / h; the latter is deflected where it would press cloth into a solid.  Returns whether the zone may move: its
+    attached vertices move alike, solids leave it a way, and all numbers are finite."""
     old, zone, wish, mean = sheet.memory.old[block], scratch.zone, scratch.wish, scratch.mean
     held, alike, total, limit = -1, True, 0.0, np.inf
     mean[:] = 0.0
@@ -272,8 +277,9 @@ def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
             mean[k] *= share
     if not (alike and square < np.inf):
         return False
-    # what is between an attachment and a solid stops it
-    if held >= 0 and not _keep_zone_out(root, mean, old, w, l, zone, sheet.solid, block, scratch.probe, h):
+    # cloth between an attachment and a solid is not pressed into it
+    limit = limit if bounded else np.inf
+    if held >= 0 and not _keep_zone_out(root, mean, old, w, l, zone, sheet.solid, block, scratch.probe, h, limit):
         return False
     for p in range(zone.shape[0]):
         if zone[p] == root:
@@ -286,27 +292,37 @@ def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
 
 
 @uncounted
-def _keep_zone_out(root, mean, old, w, l, zone, solid, block, probe, h):
-    """Deflect a zone's displacement, and so its velocity, where it would carry a free vertex deeper into a solid.  Returns whether
-    it may go there: not between solids that push back in turn."""
-    start, way, changed, again = probe.start, probe.way, False, True
+def _keep_zone_out(root, mean, old, w, l, zone, solid, block, probe, h, limit):
+    """Deflect a zone's displacement, and so its velocity, where it would carry a free vertex deeper into a solid.
+
+    Returns whether it may move: the deflected displacement is within the limit, a square [m^2], and carries none of the vertices,
+    attached ones included, deeper into a solid.  Solids do not push a zone out: they have moved on already, and act on it next.
+    """
+    real, way = old.dtype.type, probe.way
     for k in range(3):
         way[k] = mean[k]
-    # the second time nothing may change it
-    for _ in range(2):
-        again = False
-        for p in range(zone.shape[0]):
-            if zone[p] == root and w[p, l] > 0:
-                for k in range(3):
-                    start[k] = old[k, p, l]
-                again |= keep_out(start, way, solid.rows[block], solid.shapes, l, h - h, probe)
-        changed |= again
-        if not again:
-            break
-    if changed:
-        for k in range(3):
-            mean[k], mean[3 + k] = way[k], way[k] / h
-    return not again
+    # one vertex after the other; then all again, if that has changed anything
+    if not _keep_vertices_out(root, old, w, l, zone, solid, block, probe, real(0), True):
+        return True
+    if _keep_vertices_out(root, old, w, l, zone, solid, block, probe, real(ROUNDED), False):
+        return False
+    square = 0.0
+    for k in range(3):
+        mean[k], mean[3 + k] = way[k], way[k] / h
+        square += mean[k] * mean[k]
+    return square <= ROOM * limit
+
+
+@uncounted
+def _keep_vertices_out(root, old, w, l, zone, solid, block, probe, tolerance, free_only):
+    """``keep_out`` of a zone's vertices, or of its free ones, with the displacement ``probe.way``; whether one has changed it."""
+    start, zero, changed = probe.start, old.dtype.type(0), False
+    for p in range(zone.shape[0]):
+        if zone[p] == root and (w[p, l] > 0 or not free_only):
+            for k in range(3):
+                start[k] = old[k, p, l]
+            changed |= keep_out(start, probe.way, solid.rows[block], solid.shapes, l, zero, tolerance, probe)
+    return changed
 
 
 @uncounted

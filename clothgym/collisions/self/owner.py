@@ -114,7 +114,7 @@ class SelfCollision:
     Attributes:
         options: what was asked for; None for none.
         thickness: distance that the cloth keeps to itself [m].
-        sheet: what the main loop gives to the kernels.
+        sheet: what the main loop gives to the kernels, but for the solids, see ``sheet_with``.
     """
 
     def __init__(self, layout: Layout, mesh: ClothMesh, value: Any, dtype: np.dtype) -> None:
@@ -149,7 +149,7 @@ class SelfCollision:
         """Whether sheets are kept from passing through themselves."""
         return self.options is not None and self.options.mode == "strict"
 
-    def at(self, solid: Solid) -> Any:
+    def sheet_with(self, solid: Solid) -> Any:
         """``sheet`` with the solids as they are now."""
         return () if self.options is None else self.sheet._replace(solid=solid)
 

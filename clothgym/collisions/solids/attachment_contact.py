@@ -19,13 +19,15 @@ from clothgym.collisions.solids.signed_distance import S_CONTACT, S_SPOT, SCRATC
 STEPS = 20  # largest number of steps along a displacement
 SHORTEST = 1 / 16  # least share of the displacement in a step: a thinner wall may be missed
 AT_SURFACE = 1e-5  # distance below which a point is at the surface [m]
+FAR = 4.0  # square of the ways to a solid beyond which it is not looked at again: distances between cells may rise faster than ways
 
 
 class Probe(NamedTuple):
     """Scratch for one point in one lane.
 
-    start, way: the point and its displacement [m]; tried: another displacement; end: where it leads, all (3,).  point, rows,
-    scratch: of the distance to a solid, (3, 1, 1), (COLLIDER_ROWS, 1) and (SCRATCH_ROWS, 1).
+    Of the caller: start, way, a point and its displacement; tried, another displacement [m], all (3,).  Of ``keep_out`` and
+    ``stop_at_solids``: end, where the point ends [m], (3,); point, rows, scratch, for the distance to a solid, (3, 1, 1),
+    (COLLIDER_ROWS, 1) and (SCRATCH_ROWS, 1).
     """
 
     start: NDArray
@@ -124,22 +126,31 @@ def stop_at_solids(x, way, colliders, shapes, lane, time_step, probe):
 
 
 @apart
-def keep_out(start, way, colliders, shapes, lane, time_step, probe):
+def keep_out(start, way, colliders, shapes, lane, time_step, tolerance, probe):
     """Change a displacement so that a point which starts at ``start``, (3,) [m], ends no deeper in any solid than it began.
 
-    Returns whether it was changed; the other arguments are those of ``stop_at_solids``.
+    Returns whether it was changed.  tolerance: how much deeper it may end [m]; up to AT_SURFACE it always may be.  The other
+    arguments are those of ``stop_at_solids``.
     """
-    zero = start.dtype.type(0)
-    end, scratch = probe.end, probe.scratch
+    zero, at_surface = start.dtype.type(0), start.dtype.type(AT_SURFACE)
+    end, rows, scratch = probe.end, probe.rows, probe.scratch
     changed = False
     for k in range(colliders.shape[0]):
-        # depth before and after
-        before = min(_distance(start, colliders[k], shapes, k, lane, zero, probe), zero)
+        # depth before; a solid that is farther away than twice the way to it cannot be met
+        before = _distance(start, colliders[k], shapes, k, lane, zero, probe)
+        length2 = zero
+        for c in range(3):
+            relative = way[c] - time_step * rows[R_VELOCITY + c, 0]
+            length2 += relative * relative
+        if before > zero and before * before > FAR * length2:
+            continue
+        # and after
         for c in range(3):
             end[c] = start[c] + way[c]
-        lacking = before - _distance(end, colliders[k], shapes, k, lane, time_step, probe)
+        after = _distance(end, colliders[k], shapes, k, lane, time_step, probe)
+        lacking = min(before, zero) - after
         # push the end out by the difference
-        if lacking > start.dtype.type(AT_SURFACE):
+        if lacking > tolerance and after < -at_surface:
             changed = True
             for c in range(3):
                 way[c] += lacking * scratch[S_CONTACT + 1 + c, 0]

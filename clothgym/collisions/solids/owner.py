@@ -29,7 +29,10 @@ from clothgym.state import State
 
 
 class Solid(NamedTuple):
-    """Solids as kernels see them: what all environments share, and a block's rows, (blocks, colliders, COLLIDER_ROWS, lanes)."""
+    """Solids as kernels see them.
+
+    shapes: what all environments share.  rows: (blocks, colliders, COLLIDER_ROWS, lanes).
+    """
 
     shapes: Shapes
     rows: NDArray
