@@ -117,16 +117,18 @@ def _from_scratch(env_id: str) -> list[tuple[str, str]]:
     """How the task is learned without an expert by SAC, and the median success of the committed runs; nothing if there are none."""
     runs = [row for row in results.learned() if row["env"] == env_id and row["learner"] == "sac_scratch"]
     # with the arguments of the printed command
-    runs = [row for row in runs if "obs_mode" not in row["env_kwargs"]]
+    runs = [row for row in runs if not ({"obs_mode"} | results.VARIANTS) & row["env_kwargs"].keys()]
     if not runs:
         return []
     config = results.read_config(results.RUNS / runs[0]["run"], begun=False)
     said = {**config["env_kwargs"], **config["curriculum"].get("env_kwargs", {})}
     said |= {"starts_from": config["started_from"]["env"]} if "started_from" in config else {}
     recipe = ", ".join(f"`{name}={value!r}`" for name, value in said.items())
-    success = statistics.median(row["success_rate"] for row in runs)
+    success = f"success {statistics.median(row['success_rate'] for row in runs):.3f}"
+    if "cost" in runs[0]:
+        success += f", {statistics.median(row['safe_success_rate'] for row in runs):.3f} at no cost,"
     command, steps = f"`python training/sac_single_file.py --env {env_id}`", f"{config['timesteps'] / 1e6:.2f} M control steps"
-    return [("learned from scratch", f"{command}: trained with {recipe}, {steps}; success {success:.3f} in true physics")]
+    return [("learned from scratch", f"{command}: trained with {recipe}, {steps}; {success} in true physics")]
 
 
 def _scores(env_id: str, scores: Suite) -> str:

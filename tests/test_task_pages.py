@@ -1,8 +1,10 @@
 """docs/tasks/: a page for each id, which is what ``python docs/task_pages.py`` makes of the docstrings and the committed scores."""
 
+import json
 import re
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from training_runs import ROOT
 
@@ -51,6 +53,18 @@ def test_a_page_has_all_sections(env_id):
         table = text[text.index("## Observation Space") :]
         places = re.findall(r"^\| (\d+)(?:-(\d+))? \| ``", table, re.MULTILINE)
         assert int(places[-1][1] or places[-1][0]) + 1 == space.shape[0]
+
+
+def test_what_was_learned_is_what_the_printed_command_gives(task_pages):
+    """The median over the recipe's seeds, without runs on another fold or on pictures; of safe episodes where there is a cost."""
+    for env_id, name in (("ClothFold-v0", "success_rate"), ("ClothStrain-v0", "safe_success_rate")):
+        runs = [
+            json.loads(path.read_text())
+            for path in ROOT.glob(f"benchmarks/results/training/{env_id}_sac_scratch_*/evaluation.json")
+        ]
+        assert len(runs) == len({run["seed"] for run in runs})
+        [(_, text)] = task_pages._from_scratch(env_id)
+        assert f"{np.median([run[name] for run in runs]):.3f}" in text and "fold=" not in text
 
 
 def test_scores_are_those_of_the_file(task_pages, tmp_path, monkeypatch):
