@@ -48,7 +48,7 @@ ENVIRONMENTS = {
     ),
     "ClothFold-v0": (
         "ClothFold",
-        "Fold a sheet on the floor in half, along its diagonal, or twice.",
+        "Fold a sheet on the floor in half; with fold=, along its diagonal or twice.",
     ),
     "ClothFold-Hard-v0": (
         "ClothFoldHard",

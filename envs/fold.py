@@ -375,7 +375,7 @@ class FoldHardTask(FoldTask):
 
 
 class ClothFoldEnv(ClothEnv):
-    """Fold a sheet on the floor in half, along its diagonal, or twice.
+    """Fold a sheet on the floor in half; with fold=, along its diagonal or twice.
 
     ## Description
     A sheet of 0.6 m lies flat on the floor, turned and off center.  Two grippers hover above the corners of one edge.  ``fold``

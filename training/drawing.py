@@ -134,6 +134,38 @@ def draw_curves(env_id: str, results: list[dict[str, Any]]) -> None:
     files.write(CURVES / f"{env_id}.png", picture.getvalue())
 
 
+def draw_controls(results: list[dict[str, Any]]) -> None:
+    """Success of each seed of the controls of SAC, by the mean action and with noise; a panel for each environment."""
+    from results import by_setting  # imported here: runs need no committed results
+
+    found = by_setting(results)
+    names = sorted({setting.env for setting in found})
+    of = {name: {setting: rows for setting, rows in found.items() if setting.env == name} for name in names}
+    heights = [len(settings) for settings in of.values()]
+    figure, panels = plt.subplots(
+        len(of), 1, figsize=(7, 1.2 + 0.27 * sum(heights)), layout="constrained", sharex=True, squeeze=False, height_ratios=heights
+    )
+    for panel, (name, settings) in zip(panels[:, 0], of.items()):
+        # controls differ from the setting of the most seeds, with few critics
+        usual = max(settings, key=lambda setting: (len(settings[setting]), -setting.critics))
+        for height, rows in enumerate(settings.values()):
+            scores = [row["success_rate"] for row in rows], [row["with_noise"]["success_rate"] for row in rows]
+            for up, values, color in zip((0.14, -0.14), scores, (COLORS[1], COLORS[0])):
+                panel.plot(values, [height + up] * len(rows), ls="", marker="o", ms=4, alpha=0.7, color=color, clip_on=False)
+                panel.plot([np.median(values)] * 2, [height + up - 0.13, height + up + 0.13], color=color, lw=2, clip_on=False)
+        panel.set(title=name, xlim=(0, 1), ylim=(len(settings) - 0.5, -0.5))
+        panel.set_yticks(range(len(settings)), [setting.said(usual) for setting in settings])
+        panel.spines[["top", "right"]].set_visible(False)
+    panels[-1, 0].set(xlabel="success: a dot for each seed, their median as a bar")
+    words = [plt.Line2D([], [], ls="", marker="o", color=color, label=label) for color, label in
+             ((COLORS[1], "mean action"), (COLORS[0], "with noise"))]  # fmt: skip
+    figure.legend(handles=words, frameon=False, loc="outside upper right", ncols=2)
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=110, metadata={"Software": None})
+    plt.close(figure)
+    files.write(CURVES / "controls.png", picture.getvalue())
+
+
 def _draw_seeds(panel: Any, seeds: list[list[tuple[float, float]]], color: str, label: str) -> None:
     """What the seeds of one learner came to on the way; they are evaluated at the same steps."""
     common = min(map(len, seeds))

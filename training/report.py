@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 import suite
 import tyro
-from drawing import CURVES, SHOWN, draw_curves, scores_figure
+from drawing import CURVES, SHOWN, draw_controls, draw_curves, scores_figure
 from endings import refused
 from results import (
     FROM_SCRATCH,
@@ -34,6 +34,7 @@ from results import (
     Result,
     add,
     add_controls,
+    by_setting,
     controls,
     groups,
     is_present,
@@ -256,24 +257,18 @@ def cheats_table(rows: list[Result], digests: dict[str, str]) -> str:
 
 def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
     """Scores of SAC with one thing changed, over seeds."""
-    found: dict[tuple[Any, ...], list[Result]] = {}
-    for row in rows:
-        options, kwargs = row["hyperparameters"], row["env_kwargs"]
-        changed = kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"]
-        changed += options["normalize"], kwargs.get("frame", "world"), options.get("critics", 2)
-        found.setdefault((row["env"], row["timesteps"], *changed, kwargs.get("gamma", 1)), []).append(row)
     return markdown([
         {
-            "environment": f"`{env_id}`{_old(all(is_present(row, digests) for row in group))}",
-            "control steps": f"{steps / 1e6:.2f} M", "`action_repeat`": str(repeat), "batch": str(batch), "updates": str(updates),
-            "discount": f"{gamma:.3g}",
-            "normalized": "yes" if normalize else "no", "`frame`": frame, "critics": str(critics), "seeds": str(len(group)),
-            "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
+            "environment": f"`{setting.env}`{_old(all(is_present(row, digests) for row in group))}",
+            "control steps": f"{setting.timesteps / 1e6:.2f} M", "`action_repeat`": str(setting.action_repeat),
+            "batch": str(setting.batch), "updates": str(setting.updates), "discount": f"{setting.discount:.3g}",
+            "normalized": "yes" if setting.normalized else "no", "`frame`": setting.frame, "critics": str(setting.critics),
+            "seeds": str(len(group)), "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
             "with noise": f"{interquartile_mean(row['with_noise']['success_rate'] for row in group):.3f}",
             "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",
             "training": f"{_minutes(group):.1f} min{_collecting(group)}",
         }
-        for (env_id, steps, repeat, batch, updates, gamma, normalize, frame, critics, _), group in sorted(found.items())
+        for setting, group in by_setting(rows).items()
     ])  # fmt: skip
 
 
@@ -332,7 +327,9 @@ def main(args: Args) -> None:
     with refused():
         for env_id in add(args.add):
             draw_curves(env_id, learned())
-        add_controls(args.controls)
+        if args.controls:
+            add_controls(args.controls)
+            draw_controls(controls())
         if args.digests:
             note_digests()
         if args.policies:

@@ -10,7 +10,7 @@ import json
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scoring import HELD_OUT
@@ -119,6 +119,42 @@ def controls() -> list[Result]:
         | {"hyperparameters": read_config(folder, begun=False)["hyperparameters"]}
         for folder in folders
     ]
+
+
+class Setting(NamedTuple):
+    """By what runs of SAC differ, whose scores a control compares."""
+
+    env: str
+    timesteps: int
+    action_repeat: int
+    batch: int
+    updates: int
+    discount: float
+    normalized: bool
+    frame: str
+    critics: int
+
+    def said(self, usual: Setting) -> str:
+        """What differs from the usual setting; updates and discount follow the action repeat and the batch."""
+        if self == usual:
+            return "usual"
+        follow = {"env", "timesteps"} | ({"updates", "discount"} if self[2:4] != usual[2:4] else set())
+        changes = {name: value for name, value in self._asdict().items() if name not in follow and value != getattr(usual, name)}
+        words = {"normalized": "normalized" if self.normalized else "not normalized"}
+        return ", ".join(words.get(name, f"{name.replace('_', ' ')} {value}") for name, value in changes.items())
+
+
+def by_setting(rows: Iterable[Result]) -> dict[Setting, list[Result]]:
+    """Results of controls that differ only in their seed."""
+    found: dict[Setting, list[Result]] = {}
+    for row in rows:
+        options, kwargs = row["hyperparameters"], row["env_kwargs"]
+        setting = Setting(
+            row["env"], row["timesteps"], kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"],
+            options["normalize"], kwargs.get("frame", "world"), options.get("critics", 2),
+        )  # fmt: skip
+        found.setdefault(setting, []).append(row)
+    return dict(sorted(found.items()))
 
 
 def add_controls(folders: Iterable[Path]) -> None:
