@@ -2,6 +2,7 @@
 
 python docs/garments.py                                  # garments.webp, and garment_shirts.webp
 python docs/garments.py --kinds tshirt towel --seed 1    # garments.webp with some kinds and other sizes
+python docs/garments.py --many                           # garments_many.webp: ten of each kind, with particles farther apart
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pictures import labeled, picture, side_by_side, write
 from PIL import Image
+from tqdm import tqdm
 
 from clothgym import Plane, Simulation, Sphere
 from clothgym.garments import RANGES, Garment, random_garment, tshirt
@@ -27,6 +29,7 @@ RESTING, HANGING, FALLING = 60, 240, 150  # control steps
 AIR_DRAG = 1.5  # with which what hangs comes to rest
 UNEVEN = 5e-4  # of what hangs [m]
 SMALLER = 0.7  # of the pictures of all kinds
+MANY, SPACING, TILE = 10, 0.03, 96  # garments of each kind, distance of their particles [m], and pixels of a small picture
 EYES = {"flat": (0.0, -0.25, 1.6), "hanging": (0.5, -2.0, 0.9), "crumpled": (0.7, -0.8, 0.6)}
 
 
@@ -66,6 +69,23 @@ def states(garment: Garment) -> dict[str, NDArray[np.float32]]:
     return {"flat": after(flat, RESTING), "hanging": hanging, "crumpled": after(cloth, FALLING)}
 
 
+def _seen(garment: Garment, state: str, x: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """A picture of a garment in a state, about the middle."""
+    return picture(garment.mesh, x - x.mean(axis=0) * [1, 1, 0], Camera(EYES[state], (0, 0, 0.02)), [])
+
+
+def draw_many(kinds: Sequence[str]) -> None:
+    """Three rows for each kind, one a state, and a column for each random garment."""
+    rows = []
+    for kind in kinds:
+        garments = [random_garment(kind, seed, SPACING) for seed in range(MANY)]
+        of = [states(garment) for garment in tqdm(garments, desc=kind, disable=None)]
+        for state in EYES:
+            tiles = [Image.fromarray(_seen(garment, state, x[state])).resize((TILE, TILE)) for garment, x in zip(garments, of)]
+            rows.append(side_by_side([np.asarray(tile) for tile in tiles]))
+    write(HERE / "garments_many.webp", side_by_side(rows, axis=0))
+
+
 def draw_kinds(kinds: Sequence[str], seed: int) -> None:
     """A row for each two kinds, with a random garment in each state."""
     strips = []
@@ -73,8 +93,7 @@ def draw_kinds(kinds: Sequence[str], seed: int) -> None:
         garment = random_garment(kind, seed)
         images = []
         for state, x in states(garment).items():
-            about = x - x.mean(axis=0) * [1, 1, 0]
-            images.append(labeled(picture(garment.mesh, about, Camera(EYES[state], (0, 0, 0.02)), []), f"{kind}, {state}"))
+            images.append(labeled(_seen(garment, state, x), f"{kind}, {state}"))
         strips.append(side_by_side(images))
     rows = [side_by_side(strips[k : k + 2]) for k in range(0, len(strips), 2)]
     whole = Image.fromarray(side_by_side(rows, axis=0))
@@ -102,9 +121,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kinds", nargs="*", default=list(RANGES), choices=list(RANGES), help="of the rows")
     parser.add_argument("--seed", type=int, default=0, help="of their sizes")
+    parser.add_argument("--many", action="store_true", help="only garments_many.webp")
     args = parser.parse_args()
-    draw_kinds(args.kinds, args.seed)
-    draw_shirts()
+    if args.many:
+        draw_many(args.kinds)
+    else:
+        draw_kinds(args.kinds, args.seed)
+        draw_shirts()
 
 
 if __name__ == "__main__":
