@@ -201,6 +201,12 @@ def _turned(x: NDArray, angle: float) -> NDArray:
     return np.array([c * x[0] - s * x[1], s * x[0] + c * x[1], x[2]])
 
 
+def _outward(ends: NDArray, others: NDArray, along: NDArray) -> NDArray:
+    """From a held edge to where the far edge lies if the front is up, (3,); ends, others: of both at rest [m], (2, 3)."""
+    turn = np.cross(ends[1] - ends[0], others.mean(axis=0) - ends.mean(axis=0))[2]
+    return np.array([-along[1], along[0], 0.0]) * np.sign(turn)
+
+
 def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, throwing: Hands | None) -> Any:
     """Lift the edge, stretch it, lay the sheet down behind its far edge, or follow the way of a throw, and let go."""
     corners, size, side, own = task.corners, task.sizes()[e], task.physics.side, task.episode[e]
@@ -212,17 +218,14 @@ def _spread(task: Any, e: int, tips: Any, held: Any, corner: Any, speed: float, 
     if edge < 0:  # a diagonal
         return np.zeros((2, 3)), np.array([-1.0, 1.0])
     deep = size * task.across()[edge]
-    # along the edge, and to the far edge, its front up
+    # along the edge, and across it
     along = (tips[1] - tips[0]) * (1, 1, 0)
     along /= max(np.linalg.norm(along), 1e-9)
-    far_rest = rest[corners[OPPOSITE[edge]]].mean(axis=0) - rest[ends].mean(axis=0)
-    turn = np.cross(rest[ends[1]] - rest[ends[0]], far_rest)[2]
-    out = np.array([-along[1], along[0], 0.0]) * np.sign(turn)
+    out = _outward(rest[ends], rest[corners[OPPOSITE[edge]]], along)
     middle = tips.mean(axis=0)
     aim = _aim(task, e, corner, edge, along)
     # a throw ends with the held edge ahead of the far one: it goes the other way, so that the front comes to lie up
-    if aim is not None and throwing is not None:
-        out = -out
+    out = out if aim is None or throwing is None else -out
     ahead = along if aim is None else _turned(along, np.clip(aim.angle, -TURNING, TURNING))
     apart = np.stack([-ahead, ahead]) * taut / 2
     low = x[ends, 2].min()
