@@ -249,8 +249,8 @@ def _move_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
 @uncounted
 def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
     """Place a zone: x <- old + d, v <- u, with the means of ``_move_zones``, or with the displacement of an attached vertex, if it
-    has one, and u = d / h; the latter is deflected where it would press cloth into a solid.  Returns whether the zone may move: its
-    attached vertices move alike, solids leave it a way, and all numbers are finite."""
+    has one, and u = d / h; where this would press cloth into a solid, d is deflected, and u = d / h.  Returns whether the zone may
+    move: its attached vertices move alike, solids leave it a way, and all numbers are finite."""
     old, zone, wish, mean = sheet.memory.old[block], scratch.zone, scratch.wish, scratch.mean
     held, alike, total, limit = -1, True, 0.0, np.inf
     mean[:] = 0.0
@@ -277,9 +277,9 @@ def _place_zone(root, x, v, w, sheet, block, l, outside, scratch, h, bounded):
             mean[k] *= share
     if not (alike and square < np.inf):
         return False
-    # cloth between an attachment and a solid is not pressed into it
+    # neither an attachment nor the cloth that a vertex is jammed with presses it into a solid
     limit = limit if bounded else np.inf
-    if held >= 0 and not _keep_zone_out(root, mean, old, w, l, zone, sheet.solid, block, scratch.probe, h, limit):
+    if not _keep_zone_out(root, mean, old, w, l, zone, sheet.solid, block, scratch.probe, h, limit):
         return False
     for p in range(zone.shape[0]):
         if zone[p] == root:
