@@ -1,4 +1,5 @@
-"""The picture of docs/observations.md: one moment in all modes of observation, from above and by the task's own camera.
+"""The picture of docs/observations.md, one moment in all modes of observation, from above and by the task's own camera; and its
+table of how many pixels show the sheet.
 
 python docs/observations.py
 """
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from clothgym.registration import ENVIRONMENTS
 from clothgym.render import write_picture
 
 OUT = Path(__file__).with_suffix(".png")
@@ -20,6 +22,7 @@ MODES = ("rgb", "depth", "rgbd", "heightmap", "pointcloud")
 SIZE, SCALE, GAP, LINE = 64, 3, 6, 22  # pixels of a picture, and of each of its own; between pictures; of a line of labels
 LABELS = {"rgbd": "rgbd: color | depth"}
 STEPS = 62  # of the expert's episode
+STARTS = 8  # episodes at whose start pixels are counted
 
 
 def gray(values: NDArray) -> NDArray:
@@ -49,7 +52,20 @@ def shown(mode: str, seen: NDArray) -> NDArray:
     return picture
 
 
+def cloth_pixels(env_id: str, camera: str | None) -> int:
+    """The mean number of pixels that show the sheet at the start of an episode: a cloud with room for all of them has each once."""
+    env = gym.make_vec(
+        f"clothgym:{env_id}", num_envs=STARTS, obs_mode="pointcloud", image_size=SIZE, num_points=SIZE * SIZE, camera=camera
+    )
+    clouds, _ = env.reset(seed=0)
+    return round(np.mean([len(np.unique(cloud, axis=0)) for cloud in clouds]))
+
+
 def main() -> None:
+    for env_id in ENVIRONMENTS:
+        # goals are of key points alone
+        if "-Hard" not in env_id and "Goal" not in env_id:
+            print(f"| `{env_id}` | {cloth_pixels(env_id, None)} | {cloth_pixels(env_id, 'task')} |", flush=True)
     rows = []
     for camera in (None, "task"):
         row = []

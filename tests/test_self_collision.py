@@ -499,6 +499,17 @@ def test_what_a_jam_holds_keeps_its_momentum(height):
     assert not lag.any()
 
 
+def test_a_jam_of_free_vertices_is_not_pressed_into_the_floor():
+    """A vertex of 1 kg comes down on one of 1 kg, which lies on the floor: both slide by half of its way along the floor."""
+    x, moves = [(0, 0, 0.501), (0, 0, 0.5), (0, 0, 0.6)], [(4e-4, 0, -8e-4), (0, 2e-4, 2e-4), (0, 0, 0)]
+    moved, v, _ = enforced(x, moves, [1, 1, 1], solids=[clothgym.Plane((0, 0, 0.5))])
+    np.testing.assert_allclose(moved[:2], [(2e-4, 1e-4, 0)] * 2, atol=1e-7)
+    np.testing.assert_allclose(v[:2] * H, [(2e-4, 1e-4, 0)] * 2, atol=1e-7)
+    # with a wall ahead they stay
+    corner = [clothgym.Plane((0, 0, 0.5)), clothgym.Plane((0, 0, 0.5), (-2, -1, 0))]
+    np.testing.assert_allclose(enforced(x, moves, [1, 1, 1], solids=corner)[0][:2], 0, atol=1e-7)
+
+
 def test_what_cannot_be_certified_stays_to_the_bit():
     """A gap constraint that keeps more than there is, as of parts that almost touch: rounding could close their gap."""
     moved, v, _ = enforced([(0, 0, 0.500001), (0, 0, 0.5)], [(2e-4, 0, -8e-4), (0, 4e-4, 0)], [1, 1], pairs=[(0, 1, np.inf)])

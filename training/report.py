@@ -263,6 +263,7 @@ def controls_table(rows: list[Result], digests: dict[str, str]) -> str:
             "control steps": f"{setting.timesteps / 1e6:.2f} M", "`action_repeat`": str(setting.action_repeat),
             "batch": str(setting.batch), "updates": str(setting.updates), "discount": f"{setting.discount:.3g}",
             "normalized": "yes" if setting.normalized else "no", "`frame`": setting.frame, "critics": str(setting.critics),
+            "shaping": "sum" if setting.shaping == 1 else "discounted",
             "seeds": str(len(group)), "success": f"{interquartile_mean(row['success_rate'] for row in group):.3f}",
             "with noise": f"{interquartile_mean(row['with_noise']['success_rate'] for row in group):.3f}",
             "performance": f"{interquartile_mean(row['normalized_performance'] for row in group):.3f}",

@@ -122,7 +122,7 @@ def controls() -> list[Result]:
 
 
 class Setting(NamedTuple):
-    """By what runs of SAC differ, whose scores a control compares."""
+    """By what runs of SAC differ, whose scores a control compares; shaping: the environment's ``gamma``."""
 
     env: str
     timesteps: int
@@ -133,6 +133,7 @@ class Setting(NamedTuple):
     normalized: bool
     frame: str
     critics: int
+    shaping: float
 
     def said(self, usual: Setting) -> str:
         """What differs from the usual setting; updates and discount follow the action repeat and the batch."""
@@ -140,7 +141,7 @@ class Setting(NamedTuple):
             return "usual"
         follow = {"env", "timesteps"} | ({"updates", "discount"} if self[2:4] != usual[2:4] else set())
         changes = {name: value for name, value in self._asdict().items() if name not in follow and value != getattr(usual, name)}
-        words = {"normalized": "normalized" if self.normalized else "not normalized"}
+        words = {"normalized": "normalized" if self.normalized else "not normalized", "shaping": "discounted shaping"}
         return ", ".join(words.get(name, f"{name.replace('_', ' ')} {value}") for name, value in changes.items())
 
 
@@ -151,7 +152,7 @@ def by_setting(rows: Iterable[Result]) -> dict[Setting, list[Result]]:
         options, kwargs = row["hyperparameters"], row["env_kwargs"]
         setting = Setting(
             row["env"], row["timesteps"], kwargs.get("action_repeat", 1), options["n_envs"], options["updates"], options["gamma"],
-            options["normalize"], kwargs.get("frame", "world"), options.get("critics", 2),
+            options["normalize"], kwargs.get("frame", "world"), options.get("critics", 2), kwargs.get("gamma", 1.0),
         )  # fmt: skip
         found.setdefault(setting, []).append(row)
     return dict(sorted(found.items()))
