@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import statistics
 import sys
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ for folder in (HERE, ROOT / "training"):
 
 import gallery  # noqa: E402 - scripts in this folder
 import pictures  # noqa: E402
+import report  # noqa: E402
 import results  # noqa: E402 - scripts of training/
 import suite  # noqa: E402
 
@@ -114,21 +114,28 @@ def _facts(env_id: str) -> str:
 
 
 def _from_scratch(env_id: str) -> list[tuple[str, str]]:
-    """How the task is learned without an expert by SAC, and the median success of the committed runs; nothing if there are none."""
-    runs = [row for row in results.learned() if row["env"] == env_id and row["learner"] == "sac_scratch"]
-    # with the arguments of the printed command
-    runs = [row for row in runs if not ({"obs_mode"} | results.VARIANTS) & row["env_kwargs"].keys()]
-    if not runs:
+    """How the task is learned best without an expert, and the success of the committed runs as the README has it; nothing if there
+    are none."""
+    best = report.best_rows(env_id, results.learned(), results.read_digests(), results.FROM_SCRATCH)
+    if best is None:
         return []
-    config = results.read_config(results.RUNS / runs[0]["run"], begun=False)
-    said = {**config["env_kwargs"], **config["curriculum"].get("env_kwargs", {})}
+    # with the arguments of the printed command
+    _, runs = best
+    algo, config = runs[0]["learner"], results.read_config(results.RUNS / runs[0]["run"], begun=False)
+    script = "sac_single_file.py --env" if algo == "sac_scratch" else f"train.py --algo {algo} --env"
+    first, begun = config["curriculum"].get("n_timesteps", 0), config["curriculum"].get("env_kwargs", {})
+    partly = 0 < first < config["timesteps"]
+    said = {**config["env_kwargs"], **({} if partly else begun)}
     said |= {"starts_from": config["started_from"]["env"]} if "started_from" in config else {}
-    recipe = ", ".join(f"`{name}={value!r}`" for name, value in said.items())
-    success = f"success {statistics.median(row['success_rate'] for row in runs):.3f}"
+    parts = ["trained with " + ", ".join(f"`{name}={value!r}`" for name, value in said.items())] if said else []
+    parts.append(f"{config['timesteps'] / 1e6:.2f} M control steps")
+    if partly:
+        parts.append(f"the first {first / 1e6:.2f} M with {', '.join(f'`{name}={value!r}`' for name, value in begun.items())}")
+    success = f"success {report.interquartile_mean(row['success_rate'] for row in runs):.3f}"
     if "cost" in runs[0]:
-        success += f", {statistics.median(row['safe_success_rate'] for row in runs):.3f} at no cost,"
-    command, steps = f"`python training/sac_single_file.py --env {env_id}`", f"{config['timesteps'] / 1e6:.2f} M control steps"
-    return [("learned from scratch", f"{command}: trained with {recipe}, {steps}; {success} in true physics")]
+        success += f", {report.interquartile_mean(row['safe_success_rate'] for row in runs):.3f} at no cost,"
+    command, seeds = f"`python training/{script} {env_id}`", f" ({len(runs)} seeds)" if len(runs) > 1 else ""
+    return [("learned from scratch", f"{command}: {', '.join(parts)}; {success} in true physics{seeds}")]
 
 
 def _scores(env_id: str, scores: Suite) -> str:

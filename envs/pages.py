@@ -360,8 +360,8 @@ def actions_of(task_class: type[Task], whom: str = "") -> list[str]:
 def _gripper(physics: Physics) -> str:
     return (
         "A gripper is a kinematic body with two fingers.  When the fingers have closed it holds the particles within "
-        f"{100 * physics.grippers[0].reach:g} cm of its tip, of all layers; when they begin to open it releases them.  It may "
-        "grasp any number of times.  The fingers do not push the cloth.  The floor stops held cloth, and a gripper does not sink "
+        f"{100 * physics.grippers[0].reach:g} cm of its tip, of all layers; when they begin to open it releases them.  The "
+        "fingers do not push the cloth.  The floor stops held cloth, and a gripper does not sink "
         "while its fingers move."
     )
 
