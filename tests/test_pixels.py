@@ -42,7 +42,10 @@ def test_the_actor_sees_the_picture_alone_and_the_critic_the_state_alone(model, 
     assert np.array_equal(value, other_value) and np.abs(action - other_action).max() > 1e-4
 
 
-def test_its_places_are_where_a_feature_is_and_its_weights_know_no_resolution():
+@pytest.mark.parametrize(
+    ("scale", "height"), [(0, 1.0), (1, 0.002)], ids=["a box", "a sheet on the floor, on the saturating scale"]
+)
+def test_its_places_are_where_a_feature_is_and_its_weights_know_no_resolution(scale, height):
     spaces = [gym.spaces.Dict(observation=gym.spaces.Box(0.0, 4.0, (1, n, n)), state=gym.spaces.Box(-1, 1, (3,))) for n in (32, 64)]
     assert len({sum(p.numel() for p in DepthEncoder(space).parameters()) for space in spaces}) == 1
     encoder = DepthEncoder(spaces[1])
@@ -52,10 +55,10 @@ def test_its_places_are_where_a_feature_is_and_its_weights_know_no_resolution():
         for layer in (first, second, encoder.linear[0]):
             layer.weight.zero_()
             layer.bias.zero_()
-        first.weight[0, 0], second.weight[0, 0, 1, 1] = 1.0, 100.0
+        first.weight[0, scale], second.weight[0, 0, 1, 1] = 1.0, 100.0
         encoder.linear[0].weight[0, 0] = encoder.linear[0].weight[1, 1] = 1.0
         depth = torch.full((1, 1, 64, 64), 2.0)
-        depth[0, 0, 8:16, 40:48] = 1.0
+        depth[0, 0, 8:16, 40:48] -= height
         features = encoder({"observation": depth})[0]
     # the block's middle is at column 43.5 and row 11.5 of 0 to 63; the grid of features has 16 steps from -1 to 1
     assert np.arctanh(features[:2].numpy()) == pytest.approx([43.5 / 31.5 - 1, 11.5 / 31.5 - 1], abs=0.06)

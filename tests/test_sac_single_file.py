@@ -133,6 +133,33 @@ def test_nets_see_the_named_observations_and_zero_for_the_others(single):
         single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2, sees=["wind"]))}, None)
 
 
+def test_a_policy_of_pictures_receives_the_numbers_that_it_feels_and_no_others(single):
+    kwargs = {"physics": "fast", "obs_mode": "depth", "privileged": True, "image_size": 16}
+    config = {"env": "ClothFold-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}, "env_kwargs": kwargs}
+    config["hyperparameters"] = single.asdict(options(single, n_envs=2, feels=["grippers", "acting_left"]))
+    run = single.Run(config, None)
+    slices, (image,) = run.env.task.observation_slices, run.env.reset(seed=0)[0]["observation"][:1]
+    states = np.eye(73, dtype=np.float32)
+    acts = run.acts(None, {"state": np.vstack([np.zeros_like(states[:1]), states]), "observation": np.array([image] * 74)})
+    felt = np.flatnonzero(np.abs(acts[1:] - acts[0]).max(axis=1))
+    names = np.arange(73)
+    assert np.array_equal(felt, [*names[slices["grippers"]], *names[slices["acting_left"]]])
+    # a policy of states has no picture beside which it could feel anything
+    with pytest.raises(ValueError, match="feels: is for policies of pictures"):
+        single.Run(config | {"env_kwargs": {}}, None)
+
+
+def test_a_sheet_on_the_floor_stands_out_from_it_in_half_precision(single):
+    # 2 mm thick, seen from 2.25 m, where depths in half precision are multiples of 2 mm
+    kwargs = {"physics": "fast", "obs_mode": "depth", "privileged": True}
+    config = {"env": "ClothFold-v0", "seed": 0, "threads": 1, "timesteps": 1000, "curriculum": {}, "env_kwargs": kwargs}
+    run = single.Run(config | {"hyperparameters": single.asdict(options(single, n_envs=2))}, None)
+    pictures = run.now["picture"].astype(float)
+    sheet = (pictures > 0.0005) & (pictures < 0.01)
+    assert (np.abs(pictures[pictures < 0.0005]) < 1e-6).all() and sheet.sum() > 1000
+    assert pictures[sheet] == pytest.approx(0.0021, abs=0.0002)
+
+
 def started(single, env="ClothFlattenShirt-v0", env_kwargs="{}", **chosen):
     """A run that begins with the committed policy of ClothFlatten-v0."""
     options = {"n_envs": 2, "sees": ["coverage"], "critics": 5, "starts_from": "ClothFlatten-v0", **chosen}
@@ -336,7 +363,8 @@ def test_of_pictures_the_policy_sees_nothing_else_and_critics_see_the_state(sing
     run = single.Run(config | {"env_kwargs": kwargs, "hyperparameters": single.asdict(options(single, n_envs=3))}, None)
     made = gym.make_vec("clothgym:ClothReach-v0", num_envs=3, autoreset_mode="Disabled", **kwargs)
     first = made.reset(seed=int(np.random.SeedSequence([0, 0]).generate_state(2)[0] % (single.HELD_OUT - 3)))[0]
-    seen = torch.as_tensor(first["observation"][..., 0][:, None]).half()
+    middle = made.single_observation_space["observation"].high.max() / 2
+    seen = torch.as_tensor(middle - first["observation"][..., 0][:, None]).half(), torch.zeros(3, 58)
     torch.manual_seed(0)
     want = run.agent.act(seen)[0].detach().numpy()
     torch.manual_seed(0)
@@ -345,10 +373,11 @@ def test_of_pictures_the_policy_sees_nothing_else_and_critics_see_the_state(sing
     run.keep(action, *run.step(action))
     rows, second = run.replay.rows, made.step(action)[0]
     for name, observation in (("", first), ("following_", second)):
-        assert np.array_equal(rows[f"{name}picture"][:3], np.moveaxis(observation["observation"], -1, 1).astype(np.float16))
+        heights = middle - np.moveaxis(observation["observation"], -1, 1)
+        assert np.array_equal(rows[f"{name}picture"][:3], heights.astype(np.float16))
         assert np.array_equal(rows["following" if name else "observation"][:3], observation["state"])
     # an update moves the encoder, too
-    encoder = run.agent.policy[0]
+    encoder = run.agent.policy.encoder
     before = encoder.linear[0].weight.clone()
     (batch,) = run.replay.minibatches(1, 8, run.rng, run.normalizer)
     run.agent.update(batch, with_policy=True)
@@ -529,6 +558,7 @@ WRONG = {
     '--options {"cost_limit":true}': "--options: cost_limit True: must be a number",
     '--options {"net_arch":[64,true]}': "--options: net_arch [64, True]: must be a list of counts",
     '--options {"net_arch":64}': "--options: net_arch 64: must be a list of counts",
+    '--options {"feels":[3]}': "--options: feels [3]: must be a list of names",
     '--options {"sees":"way"}': "--options: sees 'way': must be a list of names",
     '--options {"keeps":"first"}': "--options: keeps 'first': must be last or best",
     '--options {"critics":1}': "--options: critics 1: must be from 2 to 100",

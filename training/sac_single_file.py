@@ -10,7 +10,8 @@ With more than two ``critics`` targets take the least of two that are drawn at r
 Chen et al., "Randomized Ensembled Double Q-Learning: Learning Fast Without a Model", 2021).
 Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
 Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
-alone, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for Image-Based Robot Learning", 2018).
+alone, or with what it ``feels``, as its grippers, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for
+Image-Based Robot Learning", 2018).
 
 The environments step in a thread of their own while the nets are updated from the transitions before.
 A run may begin with another task's policy, as far as both see the same (``starts_from``).  Rates depend on counts of steps, not on
@@ -94,6 +95,7 @@ class Options:
     keeps: str = "last"  # of the policies that were evaluated on the way; "best" where scores differ much between evaluations
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
+    feels: tuple[str, ...] = ()  # names of the observations that a policy of pictures receives beside them, as of its grippers
     starts_from: str = ""  # id of a task with whose committed policy of this script the run begins, or a policy file
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -150,7 +152,7 @@ class Args:
                 raise ValueError("--options: starts_from needs normalized observations, and sees: the names of what carries over")
             policy, digest = first_policy(chosen["starts_from"])
             started = {"started_from": {"env": policy.about["env"], "seed": policy.about.get("seed"), "sha256": digest}}
-        free = {"normalize", "sees", "keeps", "starts_from"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
+        free = {"normalize", "sees", "feels", "keeps", "starts_from"} | ({"cost_limit"} if chosen["cost_limit"] is None else set())
         _within_limits("--options: ", {name: value for name, value in chosen.items() if name not in free})
         self.folder = (self.run or Path("runs") / f"{self.env}_{ALGO}_{self.seed}").expanduser()
         if policies.has_checkpoint(self.folder) or (self.folder / policies.CONFIG).exists():
@@ -165,9 +167,9 @@ class Args:
 def _of_their_types(chosen: dict[str, Any]) -> None:
     """Refuse options of another type than that of their defaults."""
     for name, value in chosen.items():
-        if name == "sees":
+        if name in ("sees", "feels"):
             if type(value) not in (list, tuple) or not all(isinstance(one, str) for one in value):
-                raise ValueError(f"--options: sees {value!r}: must be a list of names")
+                raise ValueError(f"--options: {name} {value!r}: must be a list of names")
             continue
         if name == "starts_from":
             if not isinstance(value, str):
@@ -203,8 +205,13 @@ class Agent:
     critics: of the reward; where costs are limited, two of the cost follow.  multiplier: price of a cost, in scaled rewards.
     """
 
-    def __init__(self, observations: int, actions: int, options: Options, pictures: Any = None) -> None:
-        """pictures: the space of an observation with a picture; None where the policy sees what critics see."""
+    def __init__(
+        self, observations: int, actions: int, options: Options, pictures: Any = None, felt: NDArray | None = None
+    ) -> None:
+        """pictures: the space of an observation with a picture; None where the policy sees what critics see.
+
+        felt: places in the observation of the numbers that a policy of pictures receives, too.
+        """
         import torch  # imported in functions: it takes seconds, after all checks of arguments
         from torch import nn
 
@@ -217,13 +224,14 @@ class Agent:
         self.options, self.target_entropy, self.multiplier = options, options.target_entropy * actions, 0.0
         # the policy's outputs: means, then logarithms of standard deviations
         if pictures is None:
-            self.policy = net(observations, 2 * actions, normalized=False)
+            head = self.policy = net(observations, 2 * actions, normalized=False)
         else:
-            from clothgym.adapters.pixels import DepthEncoder
+            from clothgym.adapters.pixels import DepthActor, DepthEncoder
 
-            encoder = DepthEncoder(pictures)
-            self.policy = nn.Sequential(encoder, *net(encoder.features_dim, 2 * actions, normalized=False))
-        nn.init.constant_(self.policy[-1].bias[actions:], options.first_log_std)
+            encoder, numbers = DepthEncoder(pictures), [] if felt is None else felt.tolist()
+            head = net(encoder.features_dim + len(numbers), 2 * actions, normalized=False)
+            self.policy = DepthActor(encoder, head, numbers)
+        nn.init.constant_(head[-1].bias[actions:], options.first_log_std)
         count = options.critics + (0 if options.cost_limit is None else 2)
         self.critics, self.targets = (
             nn.ModuleList(net(observations + actions, 1, normalized=True) for _ in range(count)) for _ in range(2)
@@ -267,7 +275,7 @@ class Agent:
         the reward the least of two, which are drawn where there are more; to the reward the worth of entropy is added."""
         import torch
 
-        following, density = self.act(batch.get(FOLLOWING["picture"], batch["following"]))
+        following, density = self.act(_policy_sees(batch, FOLLOWING["picture"], "following"))
         count, targets = self.options.critics, list(self.targets)
         drawn = [0, 1] if count == 2 else torch.randperm(count)[:2].tolist()
         said = self.said([targets[i] for i in drawn] + targets[count:], batch["following"], following)
@@ -284,7 +292,7 @@ class Agent:
 
         alpha = self.log_alpha.detach().exp()
         if with_policy:
-            action, log_density = self.act(batch.get("picture", batch["observation"]))
+            action, log_density = self.act(_policy_sees(batch, "picture", "observation"))
             # the temperature falls while the entropy is above its target, and rises below it
             loss = -(self.log_alpha * (log_density.detach() + self.target_entropy)).mean()
             self._step("alpha", loss, [self.log_alpha])
@@ -324,6 +332,11 @@ class Agent:
         weight, bias = linear[-1]
         linear[-1] = weight[:, : weight.shape[1] // 2], bias[: len(bias) // 2]
         return Policy(linear, "relu", squashed=True, keys=keys, about=about, normalization=normalizer.numbers())
+
+
+def _policy_sees(batch: dict[str, Any], picture: str, state: str) -> Any:
+    """The state, or pictures and states where the batch has pictures."""
+    return (batch[picture], batch[state]) if picture in batch else batch[state]
 
 
 # --- experience ---------------------------------------------------------------------------------------------------------------
@@ -451,8 +464,12 @@ class Run:
         self.enter()
         numbers, actions = self.now["observation"].shape[1], self.env.single_action_space.shape[0]
         space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
-        self.agent = Agent(numbers, actions, self.options, space)
-        self.normalizer = Normalizer(numbers, self.options.normalize, self.seen_numbers(numbers), bool(self.options.starts_from))
+        felt = self.named_numbers("feels", numbers)
+        if felt is not None and not self.pictured:
+            raise ValueError("feels: is for policies of pictures; a policy of states sees what sees names")
+        self.agent = Agent(numbers, actions, self.options, space, None if felt is None else np.flatnonzero(felt))
+        seen = self.named_numbers("sees", numbers)
+        self.normalizer = Normalizer(numbers, self.options.normalize, seen, bool(self.options.starts_from))
         self.replay = Replay(self.options.buffer_size, numbers, actions, picture)
         if (size := sum(rows.nbytes for rows in self.replay.rows.values())) > files.LARGEST:
             much = f"{size / 2**30:.1f} GiB, and a checkpoint holds {files.LARGEST / 2**30:.0f}"
@@ -470,22 +487,22 @@ class Run:
                 raise ValueError(f"starts_from: {self.options.starts_from} has changed since the run began; begin another run")
             self.begin_as(policy)
 
-    def seen_numbers(self, count: int) -> NDArray | None:
-        """Which numbers of an observation the nets see, as ``Normalizer`` takes it.
+    def named_numbers(self, option: str, count: int) -> NDArray | None:
+        """1 for the numbers of an observation that the option names, 0 for the others; None where it names none.
 
         Raises:
             ValueError: there is no observation of that name, observations are not normalized, or they have goals.
         """
-        if not (names := self.options.sees):
+        if not (names := getattr(self.options, option)):
             return None
-        slices, seen = self.env.task.observation_slices, np.zeros(count)
+        slices, named = self.env.task.observation_slices, np.zeros(count)
         if unknown := set(names) - set(slices):
-            raise ValueError(f"sees: no observation {', '.join(sorted(unknown))} (there are: {', '.join(slices)})")
+            raise ValueError(f"{option}: no observation {', '.join(sorted(unknown))} (there are: {', '.join(slices)})")
         if (self.keys and not self.pictured) or not self.options.normalize:
-            raise ValueError("sees: is for normalized observations without goals")
+            raise ValueError(f"{option}: is for normalized observations without goals")
         for name in names:
-            seen[slices[name]] = 1
-        return seen
+            named[slices[name]] = 1
+        return named
 
     def begin_as(self, policy: Any) -> None:
         """Act as another task's policy does where what the nets see is there too, by name, and the rest as on average there.
@@ -542,6 +559,7 @@ class Run:
         space = self.env.single_observation_space
         self.keys = tuple(space.keys()) if isinstance(space, gym.spaces.Dict) else ()
         self.pictured = "state" in self.keys
+        self.middle = space["observation"].high.max() / 2 if self.pictured else None  # depth of the camera's target [m]
         mode = self.env.task.obs_mode
         if mode in PICTURES and not (self.pictured and mode == "depth"):
             raise ValueError(f"obs_mode={mode!r}: of pictures the script takes obs_mode='depth', with privileged=True")
@@ -554,17 +572,21 @@ class Run:
         self.episodes: deque[tuple[float, float, float]] = deque(maxlen=EPISODES)
 
     def parts(self, observation: Any) -> dict[str, NDArray]:
-        """An observation as one array, of goals as well; where there is a picture, the state, and the picture in half precision."""
+        """An observation as one array, of goals as well; with a picture, the state, and heights above the camera's target.
+
+        They are in half precision, where a depth of 2 m would be as coarse as a layer of cloth.
+        """
         if self.pictured:
-            picture = np.moveaxis(observation["observation"], -1, -3)
-            return {"observation": observation["state"], "picture": picture.astype(np.float16)}
+            heights = self.middle - np.moveaxis(observation["observation"], -1, -3)
+            return {"observation": observation["state"], "picture": heights.astype(np.float16)}
         return {"observation": np.concatenate([observation[key] for key in self.keys], axis=-1) if self.keys else observation}
 
     def seen(self, parts: dict[str, NDArray]) -> Any:
         """What the policy sees of an observation, as a tensor."""
         import torch
 
-        return torch.as_tensor(parts["picture"]) if self.pictured else self.normalizer(parts["observation"])
+        state = self.normalizer(parts["observation"])
+        return (torch.as_tensor(parts["picture"]), state) if self.pictured else state
 
     def steps(self) -> Iterator[int]:
         """A step of the batch and its updates, again and again, until the control steps are done; yields how many were done."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -11,13 +12,15 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 CHANNELS, FEATURES = 32, 64
+LAYER = 0.004  # height [m] whose saturating value is a half: two layers of a thin sheet
 
 
 class DepthEncoder(BaseFeaturesExtractor):
     """Pictures of depth, (batch, 1, size, size) [m], to features, (batch, 64).
 
-    Two convolutions; then where each of their channels is strongest, as a spatial soft-argmax (Finn et al. 2016, "Deep spatial
-    autoencoders for visuomotor learning"), and the mean over the picture.  The number of weights does not depend on ``image_size``.
+    Heights h above the camera's target, also as h / (abs(h) + LAYER), where a sheet on the floor stands out; two convolutions; then
+    where each of their channels is strongest, as a spatial soft-argmax (Finn et al. 2016, "Deep spatial autoencoders for visuomotor
+    learning"), and the mean over the picture.  The number of weights does not depend on ``image_size``.
     """
 
     def __init__(self, observation_space: gym.spaces.Dict) -> None:
@@ -26,17 +29,40 @@ class DepthEncoder(BaseFeaturesExtractor):
         # the sky's depth is twice that of the camera's target
         self.middle = float(picture.high.max()) / 2
         self.convolutions = nn.Sequential(
-            nn.Conv2d(3, 16, 8, stride=4, padding=2), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=1), nn.ReLU()
+            nn.Conv2d(4, 16, 8, stride=4, padding=2), nn.ReLU(), nn.Conv2d(16, CHANNELS, 3, padding=1), nn.ReLU()
         )
         self.linear = nn.Sequential(nn.Linear(3 * CHANNELS, FEATURES), nn.Tanh())
 
     def forward(self, observations: dict[str, torch.Tensor] | torch.Tensor) -> torch.Tensor:
         pictures = observations["observation"] if isinstance(observations, dict) else observations
-        # heights above the target, of the size of 1
-        height = 4 - 4 * pictures.float() / self.middle
-        seen = self.convolutions(torch.cat([height, _coordinates(height).expand(len(height), -1, -1, -1)], dim=1))
+        return self.encode(self.middle - pictures.float())
+
+    def encode(self, heights: torch.Tensor) -> torch.Tensor:
+        """heights: above the camera's target, along its axis, (batch, 1, size, size) [m]."""
+        heights = heights.float()
+        scales = 4 * heights / self.middle, heights / (heights.abs() + LAYER)
+        seen = self.convolutions(torch.cat([*scales, _coordinates(heights).expand(len(heights), -1, -1, -1)], dim=1))
         places = torch.softmax(seen.flatten(2), dim=2) @ _coordinates(seen).flatten(2)[0].T
         return self.linear(torch.cat([places.flatten(1), seen.mean(dim=(2, 3))], dim=1))
+
+
+class DepthActor(nn.Module):
+    """A policy net of a picture and, where ``felt`` is not empty, of numbers of the state beside it, as those of a robot's joints.
+
+    encoder: of the picture.  head: from its features, followed by those numbers.  felt: where the numbers are in the state.
+    """
+
+    felt: torch.Tensor
+
+    def __init__(self, encoder: DepthEncoder, head: nn.Module, felt: Sequence[int]) -> None:
+        super().__init__()
+        self.encoder, self.head = encoder, head
+        self.register_buffer("felt", torch.tensor(felt, dtype=torch.long), persistent=False)
+
+    def forward(self, seen: tuple[torch.Tensor, torch.Tensor]) -> torch.Tensor:
+        """seen: heights as ``DepthEncoder.encode`` takes them, and states, (batch, numbers)."""
+        heights, states = seen
+        return self.head(torch.cat([self.encoder.encode(heights), states[:, self.felt]], dim=1))
 
 
 def _coordinates(pictures: torch.Tensor) -> torch.Tensor:
