@@ -1,4 +1,4 @@
-"""ClothFoldShirt-v0 and ClothFoldShirt-Hard-v0: fold a T-shirt, shorts or trousers on the floor in half, left over right."""
+"""ClothFoldShirt-v0 and ClothFoldShirt-Hard-v0: fold a T-shirt, shorts, trousers or a towel in half, left over right."""
 
 from __future__ import annotations
 
@@ -23,8 +23,11 @@ from clothgym.mesh import ClothMesh
 
 SPACING = 0.04  # of the particles [m]
 # of each garment: sizes that are not the middles of their ranges, and the key points that grippers take, without their sides
-SIZES: dict[str, dict[str, float]] = {"tshirt": {"chest_width": 0.42, "length": 0.64}, "shorts": {}, "trousers": {}}
-TAKEN = {"tshirt": ("sleeve_top", "waist"), "shorts": ("waist", "pipe_outer"), "trousers": ("waist", "pipe_outer")}
+SIZES: dict[str, dict[str, float]] = {"tshirt": {"chest_width": 0.42, "length": 0.64}, "shorts": {}, "trousers": {}, "towel": {}}
+TAKEN = {
+    "tshirt": ("sleeve_top", "waist"), "shorts": ("waist", "pipe_outer"), "trousers": ("waist", "pipe_outer"),
+    "towel": ("top", "bottom"),
+}  # fmt: skip
 
 
 def garment_named(name: str, sizes: Mapping[str, float] | None = None) -> Garment:
@@ -57,13 +60,19 @@ HARD = {"size": [0.85, 1.15], "density": [0.1, 0.2], "bend_rigidity": [3e-7, 3e-
 # --- the ideal folds, and the measures of others ------------------------------------------------------------------------------
 
 
+def layers(garment: Garment) -> int:
+    """Of cloth: two panels, or one of a towel."""
+    return 1 if np.ptp(garment.mesh.rest_positions[:, 2]) == 0 else 2
+
+
 def folded(garment: Garment) -> NDArray[np.float64]:
-    """Positions of a garment folded in half, left over right and right over left, in four thin layers [m], (2, particles, 3)."""
+    """Positions of a garment folded in half, left over right and right over left, in thin layers [m], (2, particles, 3)."""
     u, v, z = garment.mesh.rest_positions.T
-    thickness = USUAL_THICKNESS * SPACING
-    layer = thickness * (z - z.min()) / (z.max() - z.min())
+    thickness, count = USUAL_THICKNESS * SPACING, layers(garment)
+    layer = thickness * (count - 1) * (z - z.min()) / max(np.ptp(z), 1e-30)
+    top = (2 * count - 1) * thickness
     ways = [(np.maximum(u, -u), u < 0), (np.minimum(u, -u), u > 0)]
-    return np.array([np.stack([across, v, np.where(over, 3 * thickness - layer, layer)], axis=1) for across, over in ways])
+    return np.array([np.stack([across, v, np.where(over, top - layer, layer)], axis=1) for across, over in ways])
 
 
 @apart
@@ -140,7 +149,7 @@ class FoldShirtTask(FoldingTask):
     evaluation: ClassVar[Fields] = (*FoldingTask.evaluation, ("vertex_distance", float), ("peer_foldnet", float))
     arguments: ClassVar = {
         **FoldingTask.arguments,
-        "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``',
+        "garment": '``"tshirt"``, ``"shorts"``, ``"trousers"`` or ``"towel"``',
         "sizes": 'of the garment, by name, as ``clothgym.garments`` takes them: ``{"length": 0.7}``',
     }
 
@@ -161,8 +170,7 @@ class FoldShirtTask(FoldingTask):
         return folded(self.garment)[..., :2]
 
     def constants(self) -> dict[str, Any]:
-        # one layer covers half of the cloth
-        root_area = np.sqrt(self.physics.mesh.area.sum() / 2)
+        root_area = np.sqrt(self.physics.mesh.area.sum() / layers(self.garment))
         return {**super().constants(), "goals": folded(self.garment), "root_area": root_area}
 
 
@@ -191,8 +199,8 @@ class ClothFoldShirtEnv(ClothEnv):
     ## Description
     A T-shirt of two layers lies flat on the floor, front up, turned and off center.  Two grippers hover above its left sleeve and
     the left end of its hem.  The task is to lay its left half over its right half.  When the time is up the fingers open, and the
-    shirt settles, in steps whose actions are ignored; then it is evaluated.  ``garment`` selects shorts or trousers instead, which
-    the grippers take by the left ends of waist and leg.
+    shirt settles, in steps whose actions are ignored; then it is evaluated.  ``garment`` selects shorts or trousers, which the
+    grippers take by the left ends of waist and leg, or a towel of one layer, 0.63 m wide and 0.75 m long, by its left corners.
 
     The shirt is ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn along shoulders, sleeves and
     sides, and open at neck, hem and cuffs.  ``sizes`` gives it other measures.  All environments of a batch have the same
@@ -213,10 +221,11 @@ class ClothFoldShirtEnv(ClothEnv):
     ``fold_error_max`` at most 0.1.  The ideal is the garment folded along its middle, left over right or right over left, whichever
     is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m by default.
 
-    At the end there are also measures of three-dimensional distance from the ideal, whose four layers are one cloth thickness
-    apart: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and translation along
-    the floor, divided by the square root of the area, as in ``clothgym.envs.garment_scores``.  ``info["peer/foldnet"]`` is the
-    measure of FoldNet: the mean squared error of a coordinate after the best rotation about z and translation, in m^2; FoldNet
+    At the end there are also measures of three-dimensional distance from the ideal, whose layers, four of a shirt, are one cloth
+    thickness apart: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and
+    translation along the floor, divided by the square root of the area, as in ``clothgym.envs.garment_scores``.
+    ``info["peer/foldnet"]`` is the measure of FoldNet: the mean squared error of a coordinate after the best rotation about z and
+    translation, in m^2; FoldNet
     counts at most 0.001 as a success.
 
     ## Starting State
