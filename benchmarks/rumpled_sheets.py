@@ -1,8 +1,8 @@
-"""The sheets with which episodes may begin: rumpled ones of ClothDrapeGripper-v0, crumpled ones of ClothFlatten-v0, T-shirts too.
+"""The sheets with which episodes may begin: rumpled ones of ClothDrapeGripper-v0, crumpled ones of ClothFlatten-v0, garments too.
 
-    python benchmarks/rumpled_sheets.py [rumpled crumpled crumpled_large crumpled_shirts]    # writes envs/NAME.npz, in some minutes
+    python benchmarks/rumpled_sheets.py [rumpled crumpled crumpled_large crumpled_shirts ...]    # writes envs/NAME.npz, in minutes
 
-Sheets that lie flat are lifted at a random particle, carried some way and dropped, twice or thrice, T-shirts once, and come to
+Sheets that lie flat are lifted at a random particle, carried some way and dropped, twice or thrice, garments once, and come to
 rest, in strict self-collision (``starts.make``): rumpled ones were lifted a little, crumpled ones high.  Of the rumpled ones
 the most rumpled are kept, by mean height, of those whose two corners at the target can be taken: they lie half a side apart,
 and no cloth from elsewhere is within a gripper's reach of them.  Of the crumpled ones those that cover least.  Layers of a kept
@@ -52,7 +52,7 @@ def made(bank: Bank, mesh: ClothMesh, physics: Physics) -> NDArray:
     for seed in tqdm(range(0, bank.made, AT_ONCE), unit="batch"):
         try:
             x = starts.make(
-                mesh, physics.material, bank.kind, AT_ONCE, seed=seed, thickness=3 * ON_FLOOR, picks=bank.picks, **options
+                mesh, physics.material, bank.kind, AT_ONCE, seed=seed, thickness=bank.thickness, picks=bank.picks, **options
             )
         except RuntimeError as error:
             print(f"seeds {seed} to {seed + AT_ONCE - 1} are left out: {error}")

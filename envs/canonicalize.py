@@ -11,7 +11,7 @@ from clothgym._jit import inlined
 from clothgym.envs.coverage import CELL, FINE_CELL, shared_area
 from clothgym.envs.episode import Fields
 from clothgym.envs.flatten import improvement, is_measured, measure_raised, note_coverage
-from clothgym.envs.flatten_shirt import SHIRT, FlattenShirtTask, evaluate_shirt
+from clothgym.envs.flatten_shirt import FlattenShirtTask, evaluate_shirt
 from clothgym.envs.fold_shirt import ShirtsDrawn
 from clothgym.envs.single import ClothEnv
 
@@ -53,10 +53,10 @@ class CanonicalizeTask(FlattenShirtTask):
 
     def constants(self) -> dict[str, Any]:
         # of the type of ``sheet.unit``, as ``shared_area`` takes both
-        return super().constants() | {"flat": np.ascontiguousarray(SHIRT.mesh.rest_positions.T, np.float32)}
+        return super().constants() | {"flat": np.ascontiguousarray(self.garment.mesh.rest_positions.T, np.float32)}
 
     def pose(self) -> NDArray:
-        return SHIRT.mesh.rest_positions[self.corners, :2]
+        return self.garment.mesh.rest_positions[self.corners, :2]
 
 
 class CanonicalizeHardTask(ShirtsDrawn, CanonicalizeTask):

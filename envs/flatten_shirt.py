@@ -1,28 +1,29 @@
-"""ClothFlattenShirt-v0 and ClothFlattenShirt-Hard-v0: spread a crumpled T-shirt on the floor."""
+"""ClothFlattenShirt-v0 and ClothFlattenShirt-Hard-v0: spread a crumpled T-shirt, shorts, trousers or a towel on the floor."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from clothgym._jit import apart, inlined
+from clothgym.checks import one_of
 from clothgym.envs import garment_scores
 from clothgym.envs.coverage import softgym_area
 from clothgym.envs.episode import Fields
 from clothgym.envs.flatten import FlattenTask, evaluate_spread
-from clothgym.envs.fold_shirt import SPACING, FoldShirtTask, ShirtsDrawn, garment_named
+from clothgym.envs.fold_shirt import SPACING, TAKEN, FoldShirtTask, ShirtsDrawn, garment_named, layers
 from clothgym.envs.garment_scores import funnels
 from clothgym.envs.gripper_task import GripperTask
-from clothgym.envs.rumpled import CRUMPLED_SHIRTS, stored
+from clothgym.envs.rumpled import GARMENTS, stored
 from clothgym.envs.single import ClothEnv
 from clothgym.envs.taking import EDGES, OPPOSITE
+from clothgym.garments import Garment
 from clothgym.mesh import ClothMesh
 
-SHIRT = garment_named(CRUMPLED_SHIRTS.garment)
-CORNERS = ("waist_left", "waist_right", "sleeve_top_left", "sleeve_top_right")  # that grippers take
-BY_THE_SIDE = 8.0  # extra cost of lifting a shirt by its side, from which a sleeve hangs down, in other particles
+BY_THE_SIDE = 8.0  # extra cost of lifting two panels by a side, from which a sleeve or a leg hangs down, in other particles
 
 
 @apart
@@ -46,50 +47,63 @@ def evaluate_shirt(own, rules, sheet, info):
 
 
 class FlattenShirtTask(FlattenTask):
-    """The task of ``ClothFlattenShirt-v0``, see ``ClothFlattenShirtEnv``."""
+    """The task of ``ClothFlattenShirt-v0``, see ``ClothFlattenShirtEnv``.
 
+    Args:
+        garment: one of ``rumpled.GARMENTS``.
+    """
+
+    garment: Garment = FoldShirtTask.garment
     physics = FoldShirtTask.physics
     kernels = FlattenTask.kernels._replace(evaluate=evaluate_shirt)
     acting_steps = 640
     throws = 4
     enough = 0.9
     entangles = True
-    bank = CRUMPLED_SHIRTS
     key_points = FoldShirtTask.key_points
     evaluation: ClassVar[Fields] = (
         *FlattenTask.evaluation, ("face_up", float), ("peer_funnels", float), ("peer_funnels_shape", float),
     )  # fmt: skip
+    arguments: ClassVar = {**FlattenTask.arguments, "garment": FoldShirtTask.arguments["garment"]}
+
+    def __init__(self, num_envs: int, garment: str = "tshirt", **kwargs: Any) -> None:
+        one_of("garment", garment, *GARMENTS)
+        self.garment, self.bank = garment_named(garment), GARMENTS[garment]  # type: ignore[misc]
+        self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
+        super().__init__(num_envs, **kwargs)
 
     def observed_particles(self, mesh: ClothMesh) -> NDArray:
         """The garment's key points."""
-        return np.array(list(SHIRT.key_points.values()))
+        return np.array(list(self.garment.key_points.values()))
 
     @property
     def corners(self) -> NDArray:
-        return np.array([SHIRT.key_points[name] for name in CORNERS])
+        top, bottom = TAKEN[self.bank.garment]
+        return np.array([self.garment.key_points[f"{end}_{side}"] for end in (bottom, top) for side in ("left", "right")])
 
     @property
     def spacing(self) -> float:
         return SPACING
 
     def flat_areas(self) -> tuple[float, float]:
-        flat = np.ascontiguousarray(SHIRT.mesh.rest_positions.T)
-        return garment_scores.flat_area(SHIRT), float(softgym_area(flat, SPACING))
+        flat = np.ascontiguousarray(self.garment.mesh.rest_positions.T)
+        return garment_scores.flat_area(self.garment), float(softgym_area(flat, SPACING))
 
     def edge_costs(self) -> NDArray[np.float64]:
         costs = super().edge_costs()
-        for one, other in EDGES[1::2]:
+        for one, other in EDGES[1::2] if layers(self.garment) == 2 else ():
             costs[one, other] = costs[other, one] = BY_THE_SIDE
         return costs
 
     def across(self) -> NDArray:
-        at = SHIRT.mesh.rest_positions[self.corners]
+        at = self.garment.mesh.rest_positions[self.corners]
         return np.linalg.norm(at[EDGES].mean(axis=1) - at[OPPOSITE].mean(axis=1), axis=1)
 
     def constants(self) -> dict[str, Any]:
-        a, b, c = (SHIRT.mesh.rest_positions[SHIRT.mesh.triangles[:, k]] for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * SHIRT.front
-        canonical = np.ascontiguousarray(SHIRT.mesh.rest_positions[:, :2].T)
+        mesh = self.garment.mesh
+        a, b, c = (mesh.rest_positions[mesh.triangles[:, k]] for k in range(3))
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) * self.garment.front
+        canonical = np.ascontiguousarray(mesh.rest_positions[:, :2].T)
         return super().constants() | {"canonical": canonical, "front": area / area.sum()}
 
     def sheets(self) -> NDArray:
@@ -97,7 +111,7 @@ class FlattenShirtTask(FlattenTask):
 
     def mirrored(self, x: NDArray) -> NDArray:
         # left particles take the places of right ones: the mirror image itself would be a shirt that is inside out
-        return super().mirrored(x)[SHIRT.mirror]
+        return super().mirrored(x)[self.garment.mirror]
 
     def expert_picks(self) -> NDArray:
         return GripperTask.expert_picks(self)  # that of ``ClothFlatten-v0`` is for squares
@@ -116,16 +130,19 @@ class ClothFlattenShirtEnv(ClothEnv):
 
     The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
     along shoulders, sleeves and sides, and open at neck, hem and cuffs.  L is its width from cuff to cuff, 0.76 m.  All
-    environments of a batch have the same proportions; ``randomize`` draws fabrics, and a factor on all lengths.
+    environments of a batch have the same proportions; ``randomize`` draws fabrics, and a factor on all lengths.  ``garment``
+    selects shorts, trousers or a towel of the default sizes instead, with 32, 24 and 32 crumpled starts of their own; L is the
+    larger side.
 
     $physics
 
     ## Observation Space
     $observations
 
-    The corners are the left and right end of the hem, and of the sleeves' upper side.  The edges between them are the hem, the
-    sides, and the line from sleeve to sleeve.  ``next`` is chosen as in ``ClothFlatten-v0``, except that a side is never the first
-    edge, and counts as eight more particles where a gripper that holds a corner chooses its neighbor.  It is 0 for a released shirt
+    The corners are the left and right end of the hem, and of the sleeves' upper side; of shorts and trousers, those of the legs
+    and of the waist.  The edges between them are the hem, the sides, and the line from sleeve to sleeve.  ``next`` is chosen as in
+    ``ClothFlatten-v0``, except that a side of a garment with two panels is never the first edge, and counts as eight more particles
+    where a gripper that holds a corner chooses its neighbor.  It is 0 for a released shirt
     from a coverage of 0.905.
 
     ## Rewards

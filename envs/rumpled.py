@@ -22,8 +22,8 @@ TRIALS = 20  # uneven starts of each sheet that must be free of intersections
 class Bank(NamedTuple):
     """A file of sheets: its name, the kind of ``starts.make``, how often each was dropped, rows, side [m], and how many.
 
-    made: those of which the file keeps some.  garment: its name in ``fold_shirt.SIZES``, of a sheet that is no grid, without rows
-    and a side.
+    made: those of which the file keeps some.  garment: its name in ``fold_shirt.SIZES``, of a sheet without rows and a side.
+    thickness: of its contact as it comes to rest [m].
     """
 
     file: str
@@ -34,13 +34,16 @@ class Bank(NamedTuple):
     made: int
     kept: int
     garment: str = ""
+    thickness: float = 3 * ON_FLOOR
 
 
 RUMPLED = Bank("rumpled.npz", "rumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 256, 64)
 CRUMPLED = Bank("crumpled.npz", "crumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSICS.side, 192, 128)
 CRUMPLED_LARGE = Bank("crumpled_large.npz", "crumpled", 3, 21, 0.8, 144, 96)
-CRUMPLED_SHIRTS = Bank("crumpled_shirts.npz", "crumpled", 1, 0, 0.0, 48, 32, "tshirt")
-BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE, CRUMPLED_SHIRTS)}
+FILES = {"tshirt": "shirts", "shorts": "shorts", "trousers": "trousers", "towel": "towels"}  # of crumpled garments
+GARMENTS = {name: Bank(f"crumpled_{file}.npz", "crumpled", 1, 0, 0.0, 48, 32, name) for name, file in FILES.items()}
+GARMENTS["trousers"] = GARMENTS["trousers"]._replace(kept=24, thickness=0.004)  # the legs leave no room for more
+BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE, *GARMENTS.values())}
 
 
 @cache

@@ -3,10 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_flatten_shirt import REST, TRIANGLES, evaluated, turned
+from test_flatten_shirt import REST, SHIRT, TRIANGLES, evaluated, turned
 
 from clothgym.envs.flatten_expert import _aim, _turned
-from clothgym.envs.flatten_shirt import SHIRT
 
 ID = "clothgym:ClothCanonicalize-v0"
 CELL = 0.004
