@@ -93,6 +93,8 @@ def test_learners_with_other_arguments_are_other_rows(report, results):
     assert [label for _, label in results.groups(other)] == ["PPO", "PPO, `physics='fast'`", results.LABELS["sac"]]
     begun = [result(0.2), result(0.9, started_from={"env": "ClothFlatten-v0", "seed": 0, "sha256": "0"})]
     assert [label for _, label in results.groups(begun)] == ["PPO", "PPO, `starts_from='ClothFlatten-v0'`"]
+    felt = [result(0.9, env_kwargs={"obs_mode": "depth"}, feels=["grippers", "acting_left"])]
+    assert [label for _, label in results.groups(felt)] == ["PPO, `obs_mode='depth'`, `feels='grippers, acting_left'`"]
     now = {"ClothReach-v0": "now"}
     assert report.best_of("ClothReach-v0", other, now, from_scratch=True) == "PPO: 0.85 (worst of 2 seeds: 0.80) in 2 min"
     expert = report.best_of("ClothReach-v0", other, now, from_scratch=False)

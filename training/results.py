@@ -60,6 +60,8 @@ def groups(results: Iterable[Result]) -> dict[tuple[str, str], list[Result]]:
         more = {name: value for name, value in one["env_kwargs"].items() if name not in WITHOUT_EFFECT}
         if "started_from" in one:
             more["starts_from"] = one["started_from"]["env"]
+        if "feels" in one:
+            more["feels"] = ", ".join(one["feels"])
         label = ", ".join([LABELS[one["learner"]], *(f"`{name}={value!r}`" for name, value in more.items())])
         found.setdefault((one["env"], label), []).append(one)
     return found
@@ -110,15 +112,16 @@ def note_policies() -> None:
 
 
 def controls() -> list[Result]:
-    """The results of controls, and of the runs that they are compared with, with their hyperparameters."""
+    """The results of controls, and of the runs of SAC from states that they are compared with, with their hyperparameters."""
     folders = [path.parent for path in sorted(CONTROLS.glob("*/evaluation.json"))]
     envs = {read_config(folder, begun=False)["env"] for folder in folders}
     folders += [folder for env_id in sorted(envs) for folder in sorted(RUNS.glob(f"{env_id}_sac_scratch_*"))]
-    return [
+    rows = [
         json.loads((folder / "evaluation.json").read_text())
         | {"hyperparameters": read_config(folder, begun=False)["hyperparameters"]}
         for folder in folders
     ]
+    return [row for row in rows if not (VARIANTS | {"obs_mode"}) & row["env_kwargs"].keys()]
 
 
 class Setting(NamedTuple):

@@ -791,6 +791,7 @@ def train(args: Args) -> None:
     said = {name: noisy[name] for name in ("episodes", "success_rate", "success_rate_ci95", "normalized_performance")}
     print(f"with noise: success {said['success_rate']:.3f}, performance {said['normalized_performance']:.3f}")
     more = {"with_noise": said} | {name: config[name] for name in ("started_from",) if name in config}
+    more |= {"feels": list(run.options.feels)} if run.options.feels else {}
     about = learning.conclude(record, acting(run, policy), args.final_episodes, more)
     if policy is not None:
         policy.about |= about
