@@ -112,16 +112,15 @@ def note_policies() -> None:
 
 
 def controls() -> list[Result]:
-    """The results of controls, and of the runs of SAC from states that they are compared with, with their hyperparameters."""
+    """The results of controls, and of the runs that they are compared with, with their hyperparameters."""
     folders = [path.parent for path in sorted(CONTROLS.glob("*/evaluation.json"))]
     envs = {read_config(folder, begun=False)["env"] for folder in folders}
     folders += [folder for env_id in sorted(envs) for folder in sorted(RUNS.glob(f"{env_id}_sac_scratch_*"))]
-    rows = [
+    return [
         json.loads((folder / "evaluation.json").read_text())
         | {"hyperparameters": read_config(folder, begun=False)["hyperparameters"]}
         for folder in folders
     ]
-    return [row for row in rows if not (VARIANTS | {"obs_mode"}) & row["env_kwargs"].keys()]
 
 
 class Setting(NamedTuple):
