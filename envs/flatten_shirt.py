@@ -23,8 +23,8 @@ from clothgym.envs.taking import EDGES, OPPOSITE
 from clothgym.garments import Garment
 from clothgym.mesh import ClothMesh
 
-# extra costs of an edge by which two panels are lifted, in other particles: of a side, from which a sleeve or a leg hangs down, and of
-# both legs, which swing apart
+# extra costs of an edge by which two panels are lifted, in other particles: of a side, from which a sleeve or a leg hangs down, and
+# of both legs, which swing apart
 BY_THE_SIDE, BY_THE_LEGS = 8.0, 30.0
 
 
