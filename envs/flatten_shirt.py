@@ -24,7 +24,7 @@ from clothgym.garments import Garment
 from clothgym.mesh import ClothMesh
 
 # extra costs of an edge by which two panels are lifted, in other particles: of a side, from which a sleeve or a leg hangs down, and
-# of both legs, which swing apart
+# of the ends of trousers' legs, which are long and swing apart
 BY_THE_SIDE, BY_THE_LEGS = 8.0, 30.0
 
 
@@ -92,7 +92,7 @@ class FlattenShirtTask(FlattenTask):
         return garment_scores.flat_area(self.garment), float(softgym_area(flat, SPACING))
 
     def edge_costs(self) -> NDArray[np.float64]:
-        costs, legs = super().edge_costs(), BY_THE_LEGS if "crotch" in self.garment.key_points else 0.0
+        costs, legs = super().edge_costs(), BY_THE_LEGS if self.garment.kind == "trousers" else 0.0
         if layers(self.garment) == 2:
             for (one, other), cost in zip(EDGES, (legs, BY_THE_SIDE, 0.0, BY_THE_SIDE)):
                 costs[one, other] = costs[other, one] = cost
@@ -145,7 +145,7 @@ class ClothFlattenShirtEnv(ClothEnv):
     The corners are the left and right end of the hem, and of the sleeves' upper side; of shorts and trousers, those of the legs
     and of the waist.  The edges between them are the hem, the sides, and the line from sleeve to sleeve.  ``next`` is chosen as in
     ``ClothFlatten-v0``, except that a side of a garment with two panels is never the first edge, and counts as eight more particles
-    where a gripper that holds a corner chooses its neighbor; both legs count as 30.  It is 0 for a released shirt
+    where a gripper that holds a corner chooses its neighbor; both legs of trousers count as 30.  It is 0 for a released shirt
     from a coverage of 0.905.
 
     ## Rewards
