@@ -36,8 +36,10 @@ def _evaluate(own, rules, sheet, info):
     evaluate_shirt(own, rules, sheet, info)
     both, either = shared_area(sheet.unit, rules.flat, sheet.mesh.triangles, FINE_CELL)
     info.coverage, info.overlap = min(both / rules.flat_area, 1.0), both / either
-    # what covers so much of the outline covers at least as much of the floor
-    info.is_success = info.is_success and info.coverage >= rules.enough and info.face_up >= ENOUGH_UP
+    # what covers so much of the outline covers at least as much of the floor; turned by half a circle it may, too
+    left, right, top_left, top_right = rules.corners
+    upright = sheet.unit[1, top_left] + sheet.unit[1, top_right] > sheet.unit[1, left] + sheet.unit[1, right]
+    info.is_success = info.is_success and info.coverage >= rules.enough and info.face_up >= ENOUGH_UP and upright
     return improvement(info.coverage, own.coverage_start)
 
 
@@ -49,7 +51,9 @@ class CanonicalizeTask(FlattenShirtTask):
 
     kernels = FlattenShirtTask.kernels._replace(measure=_measure, evaluate=_evaluate)
     enough = 0.8
+    takes = tuple(name for name in FlattenShirtTask.takes if name != "towel")  # which has no front, and no end that differs
     evaluation: ClassVar[Fields] = (*FlattenShirtTask.evaluation, ("overlap", float))
+    arguments: ClassVar = {**FlattenShirtTask.arguments, "garment": '``"tshirt"``, ``"shorts"`` or ``"trousers"``'}
 
     def constants(self) -> dict[str, Any]:
         # of the type of ``sheet.unit``, as ``shared_area`` takes both
@@ -72,7 +76,8 @@ class ClothCanonicalizeEnv(ClothEnv):
     are ignored; then it is evaluated.  In the canonical pose the shirt lies flat, centered on the origin, its neck toward +y and
     its left sleeve toward -x.  With ``action_mode="throw"`` an episode has four throws, and the environment also turns a
     lifted edge to its direction in the canonical pose.  The places of a throw lie along the direction opposite to ``out``: a throw
-    ends with the held edge ahead of the other one, and the front comes to lie up.
+    ends with the held edge ahead of the other one, and the front comes to lie up.  With ``garment="shorts"`` or ``"trousers"`` the
+    waist takes the place of the neck, and the legs that of the hem.
 
     $physics
 
@@ -88,8 +93,9 @@ class ClothCanonicalizeEnv(ClothEnv):
     ## Evaluation
     The coverage c is the area that the shirt covers inside the outline of the canonical pose, seen from above, over the area of
     that outline, 0.31 m^2.  It is measured as in ``ClothFlatten-v0``, and the normalized performance is the normalized improvement
-    of c.  In a success, c is 0.8 or more, at least nine tenths of the front panel face up, and the shirt is released and at rest
-    (less than 0.02 m/s rms).  Rewards, performance, ``first_success`` and ``success_held`` do not depend on the side that is up.
+    of c.  In a success, c is 0.8 or more, at least nine tenths of the front panel face up, the sleeves are farther along +y than
+    the hem, and the shirt is released and at rest (less than 0.02 m/s rms).  Rewards, performance, ``first_success`` and
+    ``success_held`` depend neither on the side that is up nor on this direction.
 
     ``info`` is that of ``ClothFlattenShirt-v0``, with this coverage.  At the evaluation it also has ``overlap``, the intersection
     over union of the covered area and the outline.  ``peer/funnels`` is Cloth Funnels' distance from this pose.
@@ -122,7 +128,7 @@ class ClothCanonicalizeHardEnv(ClothEnv):
     As in ``ClothCanonicalize-v0``, with the same ``info``.  Areas and distances are those of the shirt over its size.
 
     ## Starting State
-    As in ``ClothCanonicalize-v0``: the same 32 crumpled shirts, of the usual fabric, scaled to the size that was drawn.
+    As in ``ClothCanonicalize-v0``: the same crumpled garments, of the usual fabric, scaled to the size that was drawn.
     """
 
     task_class = CanonicalizeHardTask

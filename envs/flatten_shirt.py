@@ -14,7 +14,7 @@ from clothgym.envs import garment_scores
 from clothgym.envs.coverage import softgym_area
 from clothgym.envs.episode import Fields
 from clothgym.envs.flatten import FlattenTask, evaluate_spread
-from clothgym.envs.fold_shirt import SPACING, TAKEN, FoldShirtTask, ShirtsDrawn, garment_named, layers
+from clothgym.envs.fold_shirt import SPACING, TAKEN, FoldShirtTask, ShirtsDrawn, garment_named, layers, refuse_sheet
 from clothgym.envs.garment_scores import funnels
 from clothgym.envs.gripper_task import GripperTask
 from clothgym.envs.rumpled import GARMENTS, stored
@@ -52,8 +52,16 @@ class FlattenShirtTask(FlattenTask):
     """The task of ``ClothFlattenShirt-v0``, see ``ClothFlattenShirtEnv``.
 
     Args:
-        garment: one of ``rumpled.GARMENTS``.
+        garment: one of ``takes``.
+
+    Raises:
+        ValueError: another garment.
+
+    Attributes:
+        takes: the garments, of ``rumpled.GARMENTS``.
     """
+
+    takes: ClassVar[tuple[str, ...]] = tuple(GARMENTS)
 
     garment: Garment = FoldShirtTask.garment
     physics = FoldShirtTask.physics
@@ -69,8 +77,9 @@ class FlattenShirtTask(FlattenTask):
     arguments: ClassVar = {**FlattenTask.arguments, "garment": FoldShirtTask.arguments["garment"]}
 
     def __init__(self, num_envs: int, garment: str = "tshirt", **kwargs: Any) -> None:
-        one_of("garment", garment, *GARMENTS)
+        one_of("garment", garment, *self.takes)
         self.garment, self.bank = garment_named(garment), GARMENTS[garment]  # type: ignore[misc]
+        refuse_sheet(self.garment, kwargs)
         self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
         super().__init__(num_envs, **kwargs)
 
@@ -134,8 +143,7 @@ class ClothFlattenShirtEnv(ClothEnv):
     The shirt is that of ``ClothFoldShirt-v0``, ``clothgym.garments.tshirt(0.04, chest_width=0.42, length=0.64)``: two panels, sewn
     along shoulders, sleeves and sides, and open at neck, hem and cuffs.  L is its width from cuff to cuff, 0.76 m.  All
     environments of a batch have the same proportions; ``randomize`` draws fabrics, and a factor on all lengths.  ``garment``
-    selects shorts, trousers or a towel of the default sizes instead, with 32, 24 and 32 crumpled starts of their own; L is the
-    larger side.
+    selects shorts, trousers or a towel of the default sizes instead, for which L is 0.64, 0.93 and 0.75 m.
 
     $physics
 
@@ -143,26 +151,29 @@ class ClothFlattenShirtEnv(ClothEnv):
     $observations
 
     The corners are the left and right end of the hem, and of the sleeves' upper side; of shorts and trousers, those of the legs
-    and of the waist.  The edges between them are the hem, the sides, and the line from sleeve to sleeve.  ``next`` is chosen as in
-    ``ClothFlatten-v0``, except that a side of a garment with two panels is never the first edge, and counts as eight more particles
-    where a gripper that holds a corner chooses its neighbor; both legs of trousers count as 30.  It is 0 for a released shirt
-    from a coverage of 0.905.
+    and of the waist; and those of a towel.  The edges between them are the hem, the sides, and the line from sleeve to sleeve.
+    ``next`` is chosen as in ``ClothFlatten-v0``, with two exceptions.  A side of a garment with two panels is never the first edge,
+    and counts as eight more particles where a gripper that holds a corner chooses its neighbor.  The edge between the ends of the
+    trousers' legs is never the first one either, and counts as 30 more particles.  ``next`` is 0 for a released garment from a
+    coverage of 0.905.
 
     ## Rewards
     As in ``ClothFlatten-v0``.
 
     ## Evaluation
-    The coverage and the normalized performance are those of ``ClothFlatten-v0``, relative to the area that the flat shirt covers,
-    0.31 m^2.  In a success, the coverage is 0.9 or more, and the shirt is released and at rest (less than 0.02 m/s rms).
+    The coverage and the normalized performance are those of ``ClothFlatten-v0``, relative to the area that the flat garment covers:
+    0.31 m^2 of the T-shirt, 0.19 m^2 of shorts, 0.45 m^2 of trousers, and 0.47 m^2 of a towel.  In a success, the coverage is 0.9
+    or more, and the garment is released and at rest (less than 0.02 m/s rms).
 
-    ``info`` is that of ``ClothFlatten-v0``; ``softgym_coverage`` is relative to the same measure of the flat shirt.  At the
+    ``info`` is that of ``ClothFlatten-v0``; ``softgym_coverage`` is relative to the same measure of the flat garment.  At the
     evaluation it also has ``face_up``, the share of the front panel that looks up, and Cloth Funnels' distance from the canonical
-    pose: the flat shirt about the origin, its neck toward +y.  ``peer/funnels`` is 0.65 times the distance in shape plus 0.35 times
-    that in pose, and ``peer/funnels_shape`` is the distance in shape, see ``clothgym.envs.garment_scores``.
+    pose: the flat garment about the origin, its neck, waist or top toward +y.  ``peer/funnels`` is 0.65 times the distance in shape
+    plus 0.35 times that in pose, and ``peer/funnels_shape`` is the distance in shape, see ``clothgym.envs.garment_scores``.
 
     ## Starting State
     One of 32 crumpled shirts that cover 0.24 to 0.47 of the flat shirt's area (``benchmarks/rumpled_sheets.py``): lifted high at a
-    random particle and dropped.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
+    random particle and dropped.  Of the 32 shorts it is 0.26 to 0.47, of the 24 trousers 0.30 to 0.62, and of the 32 towels 0.22 to
+    0.47.  It is turned by any angle, in half of the episodes mirrored, and moved by up to 0.2 L along x and
     y.  Held-out seeds draw from the same shirts, in new combinations.  The grippers are open, 0.3 to 0.5 L to the left and right of
     the origin, 0.4 to 0.6 L above the floor.
     """
@@ -194,7 +205,7 @@ class ClothFlattenShirtHardEnv(ClothEnv):
     As in ``ClothFlattenShirt-v0``, with the same ``info``.  Areas and distances are those of the shirt over its size.
 
     ## Starting State
-    As in ``ClothFlattenShirt-v0``: the same 32 crumpled shirts, of the usual fabric, scaled to the size that was drawn.
+    As in ``ClothFlattenShirt-v0``: the same crumpled garments, of the usual fabric, scaled to the size that was drawn.
     """
 
     task_class = FlattenShirtHardTask

@@ -53,6 +53,13 @@ def _garment(name: str, sizes: tuple[tuple[str, float], ...]) -> Garment:
     return make(name, SPACING, sizes=SIZES[name] | dict(sizes))
 
 
+def refuse_sheet(garment: Garment, kwargs: Mapping[str, Any]) -> None:
+    """Refuse ``rows`` and ``side``, by which another grid would replace a towel's mesh; other garments' meshes refuse them."""
+    given = [f"{name}={shown(kwargs[name])}" for name in ("rows", "side") if kwargs.get(name) is not None]
+    if given and garment.mesh.shape is not None:
+        raise ValueError(f"{', '.join(given)}: a garment has one mesh; leave them out")
+
+
 # what episodes of the harder task draw
 HARD = {"size": [0.85, 1.15], "density": [0.1, 0.2], "bend_rigidity": [3e-7, 3e-6], "friction": [0.3, 0.7]}
 
@@ -156,6 +163,7 @@ class FoldShirtTask(FoldingTask):
     def __init__(self, num_envs: int, garment: str = "tshirt", sizes: Mapping[str, float] | None = None, **kwargs: Any) -> None:
         one_of("garment", garment, *SIZES)
         self.garment = garment_named(garment, sizes)
+        refuse_sheet(self.garment, kwargs)
         self.physics = replace(self.physics, mesh=self.garment.mesh)  # type: ignore[misc]
         points = self.garment.key_points
         self.stages = [[(points[f"{name}_left"], points[f"{name}_right"]) for name in TAKEN[garment]]]
@@ -175,7 +183,7 @@ class FoldShirtTask(FoldingTask):
 
 
 class ShirtsDrawn(Task):
-    """What harder tasks with T-shirts share: episodes draw the shirt and the floor.
+    """What harder tasks with garments share: episodes draw the size and fabric of the garment, and the floor's friction.
 
     Args:
         randomize: as all tasks take it; ``HARD`` by default.
@@ -219,14 +227,14 @@ class ClothFoldShirtEnv(ClothEnv):
     ## Evaluation
     Fold error, height, overlap, success, and the normalized performance are defined as for the half fold of ``ClothFold-v0``, with
     ``fold_error_max`` at most 0.1.  The ideal is the garment folded along its middle, left over right or right over left, whichever
-    is nearer.  L is the width of the shirt from cuff to cuff, 0.76 m by default.
+    is nearer.  L is the garment's longer side: 0.76 m from cuff to cuff of the T-shirt, 0.64 m of shorts, 0.93 m of trousers, and
+    0.75 m of a towel.
 
     At the end there are also measures of three-dimensional distance from the ideal, whose layers, four of a shirt, are one cloth
     thickness apart: ``info["vertex_distance"]`` is the mean distance of the particles after the best rotation about z and
     translation along the floor, divided by the square root of the area, as in ``clothgym.envs.garment_scores``.
     ``info["peer/foldnet"]`` is the measure of FoldNet: the mean squared error of a coordinate after the best rotation about z and
-    translation, in m^2; FoldNet
-    counts at most 0.001 as a success.
+    translation, in m^2; FoldNet counts at most 0.001 as a success.
 
     ## Starting State
     The shirt's center is up to 0.15 L from the origin along x and y, and it is turned by up to 45 degrees.  The grippers are open,

@@ -42,7 +42,7 @@ CRUMPLED = Bank("crumpled.npz", "crumpled", 2, PHYSICS.mesh.grid_shape[0], PHYSI
 CRUMPLED_LARGE = Bank("crumpled_large.npz", "crumpled", 3, 21, 0.8, 144, 96)
 FILES = {"tshirt": "shirts", "shorts": "shorts", "trousers": "trousers", "towel": "towels"}  # of crumpled garments
 GARMENTS = {name: Bank(f"crumpled_{file}.npz", "crumpled", 1, 0, 0.0, 48, 32, name) for name, file in FILES.items()}
-GARMENTS["trousers"] = GARMENTS["trousers"]._replace(kept=24, thickness=0.004)  # the legs leave no room for more
+GARMENTS["trousers"] = GARMENTS["trousers"]._replace(kept=24, thickness=0.004)  # legs too close for 6 mm
 BANKS = {bank.file.removesuffix(".npz"): bank for bank in (RUMPLED, CRUMPLED, CRUMPLED_LARGE, *GARMENTS.values())}
 
 

@@ -6,6 +6,7 @@ import pytest
 from test_flatten_shirt import REST, SHIRT, TRIANGLES, evaluated, turned
 
 from clothgym.envs.flatten_expert import _aim, _turned
+from clothgym.envs.fold_shirt import garment_named
 
 ID = "clothgym:ClothCanonicalize-v0"
 CELL = 0.004
@@ -27,6 +28,19 @@ def test_a_shirt_in_the_canonical_pose_is_a_success():
     assert info["is_success"] and info["normalized_performance"] == 1 and info["face_up"] == pytest.approx(1, abs=0.02)
     assert info["coverage"] == pytest.approx(1, abs=0.01) and info["overlap"] == pytest.approx(1, abs=0.02)
     assert info["peer/funnels"] < 0.01
+
+
+@pytest.mark.parametrize("name", ["tshirt", "shorts", "trousers"])
+def test_a_garment_is_in_the_canonical_pose_one_way_up_and_not_turned_by_half_a_circle(name):
+    rest = garment_named(name).mesh.rest_positions
+    for yaw, success in ((0.0, True), (np.pi, False)):
+        info = evaluated(turned(rest, yaw), env_id=ID, garment=name)
+        assert info["coverage"] > 0.8 and info["face_up"] > 0.9 and info["is_success"] == success
+
+
+def test_a_towel_has_no_canonical_pose():
+    with pytest.raises(ValueError, match="garment='towel': must be 'tshirt' or 'shorts' or 'trousers'"):
+        gym.make(ID, garment="towel")
 
 
 @pytest.mark.parametrize(("yaw", "shift", "over"), [(0.0, (0.03, 0.0), False), (0.5, (0.0, 0.1), False), (0.0, (0.0, 0.0), True)])

@@ -92,7 +92,7 @@ def episodes(count, still=False, **kwargs):
 def test_the_expert_folds_without_an_intersection(name):
     env, info = episodes(4, garment=name)
     simulation = env.task.simulation
-    assert info["is_success"].all() and info["fold_error_mm"].max() < 35 and not info["failure"].any()
+    assert info["is_success"].all() and info["fold_error_mm"].max() < (35 if name == "towel" else 30) and not info["failure"].any()
     assert info["peer/foldnet"].max() < ENOUGH_FOR_FOLDNET
     # by the count that shares nothing with contact
     assert not len(find_intersections(env.task.physics.mesh.triangles, simulation.positions.astype(np.float64)))
@@ -120,6 +120,13 @@ def test_key_points_of_the_garment_are_observed():
 def test_a_garment_without_a_fold_is_refused():
     with pytest.raises(ValueError, match="garment='skirt': must be 'tshirt' or 'shorts' or 'trousers' or 'towel'"):
         gym.make(ID, garment="skirt")
+
+
+@pytest.mark.parametrize("env_id", [ID, "clothgym:ClothFlattenShirt-v0"])
+@pytest.mark.parametrize("sheet", [{"rows": 15}, {"side": 0.6}])
+def test_a_towel_has_one_mesh(env_id, sheet):
+    with pytest.raises(ValueError, match="(rows=15|side=0.6): a garment has one mesh; leave them out"):
+        gym.make(env_id, garment="towel", **sheet)
 
 
 @pytest.mark.slow

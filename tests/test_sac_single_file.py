@@ -144,9 +144,20 @@ def test_a_policy_of_pictures_receives_the_numbers_that_it_feels_and_no_others(s
     felt = np.flatnonzero(np.abs(acts[1:] - acts[0]).max(axis=1))
     names = np.arange(73)
     assert np.array_equal(felt, [*names[slices["grippers"]], *names[slices["acting_left"]]])
-    # a policy of states has no picture beside which it could feel anything
-    with pytest.raises(ValueError, match="feels: is for policies of pictures"):
-        single.Run(config | {"env_kwargs": {}}, None)
+    # its weights, and what it feels, are those of a resumed run
+    state = run.state({"training_seconds": 1.0, "core_seconds": 1.0, "collecting_seconds": 1.0})
+    seen = {"state": states, "observation": np.array([image] * 73)}
+    assert np.array_equal(single.Run(config, state).acts(None, seen), acts[1:])
+    # what sees leaves out no net receives, and a policy of states has no picture beside which it could feel anything
+    for chosen, own, message in (
+        ({"feels": ["grippers"], "sees": ["ways"]}, kwargs, "feels: grippers: not in sees"),
+        ({"feels": ["wind"]}, kwargs, "feels: no observation wind"),
+        ({"feels": ["grippers"]}, {}, "feels: is for policies of pictures"),
+        ({"feels": ["grippers"], "normalize": False}, {}, "feels: is for policies of pictures"),
+    ):
+        hyperparameters = single.asdict(options(single, n_envs=2, **chosen))
+        with pytest.raises(ValueError, match=message):
+            single.Run(config | {"env_kwargs": own, "hyperparameters": hyperparameters}, None)
 
 
 def test_a_sheet_on_the_floor_stands_out_from_it_in_half_precision(single):

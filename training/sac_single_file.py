@@ -10,8 +10,8 @@ With more than two ``critics`` targets take the least of two that are drawn at r
 Chen et al., "Randomized Ensembled Double Q-Learning: Learning Fast Without a Model", 2021).
 Where costs are limited, two more critics learn the cost to come, and a Lagrange multiplier is its price (Ha et al., "Learning to
 Walk in the Real World with Minimal Human Effort", 2020).  With ``obs_mode="depth", privileged=True`` the policy sees pictures
-alone, or with what it ``feels``, as its grippers, and critics the state alone (Pinto et al., "Asymmetric Actor Critic for
-Image-Based Robot Learning", 2018).
+and what it ``feels`` beside them, for instance its own grippers, and critics the state alone (Pinto et al., "Asymmetric Actor
+Critic for Image-Based Robot Learning", 2018).
 
 The environments step in a thread of their own while the nets are updated from the transitions before.
 A run may begin with another task's policy, as far as both see the same (``starts_from``).  Rates depend on counts of steps, not on
@@ -95,7 +95,7 @@ class Options:
     keeps: str = "last"  # of the policies that were evaluated on the way; "best" where scores differ much between evaluations
     normalize: bool = True  # whether observations are normalized
     sees: tuple[str, ...] = ()  # names of the observations that the nets see, of a state; of all by default
-    feels: tuple[str, ...] = ()  # names of the observations that a policy of pictures receives beside them, as of its grippers
+    feels: tuple[str, ...] = ()  # names of the observations that a policy of pictures receives beside them
     starts_from: str = ""  # id of a task with whose committed policy of this script the run begins, or a policy file
     net_arch: tuple[int, ...] = (128, 128)  # sizes of the hidden layers, of the policy net and of the critics
 
@@ -286,7 +286,7 @@ class Agent:
     def update(self, batch: dict[str, Any], with_policy: bool) -> None:
         """Learn from a minibatch: observation, action, reward, cost, following observation, and 0 after an episode's end.
 
-        It may have the pictures of both observations, which the policy sees instead.
+        With the pictures of both observations, the policy sees these, and of the states what it feels.
         """
         import torch
 
@@ -464,9 +464,11 @@ class Run:
         self.enter()
         numbers, actions = self.now["observation"].shape[1], self.env.single_action_space.shape[0]
         space, picture = (self.env.single_observation_space, self.now["picture"].shape[1:]) if self.pictured else (None, None)
-        felt = self.named_numbers("feels", numbers)
-        if felt is not None and not self.pictured:
+        if self.options.feels and not self.pictured:
             raise ValueError("feels: is for policies of pictures; a policy of states sees what sees names")
+        felt = self.named_numbers("feels", numbers)
+        if unseen := set(self.options.feels) - set(self.options.sees or self.options.feels):
+            raise ValueError(f"feels: {', '.join(sorted(unseen))}: not in sees, which names all that the nets receive")
         self.agent = Agent(numbers, actions, self.options, space, None if felt is None else np.flatnonzero(felt))
         seen = self.named_numbers("sees", numbers)
         self.normalizer = Normalizer(numbers, self.options.normalize, seen, bool(self.options.starts_from))

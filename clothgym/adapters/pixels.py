@@ -18,7 +18,8 @@ LAYER = 0.004  # height [m] whose saturating value is a half: two layers of a th
 class DepthEncoder(BaseFeaturesExtractor):
     """Pictures of depth, (batch, 1, size, size) [m], to features, (batch, 64).
 
-    Heights h above the camera's target, also as h / (abs(h) + LAYER), where a sheet on the floor stands out; two convolutions; then
+    Heights h above the camera's target, also as h / (abs(h) + LAYER), where a sheet on the floor stands out, if the camera looks
+    straight down at the floor, as it does by default; two convolutions; then
     where each of their channels is strongest, as a spatial soft-argmax (Finn et al. 2016, "Deep spatial autoencoders for visuomotor
     learning"), and the mean over the picture.  The number of weights does not depend on ``image_size``.
     """
