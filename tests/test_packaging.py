@@ -46,7 +46,7 @@ def test_wheel_ships_clothgym_only(wheel):
     assert {f"{package.as_posix()}/__init__.py" for package in packages} <= set(names)
     metadata = wheel.read(f"clothgym-{clothgym.__version__}.dist-info/METADATA").decode()
     assert f"\nVersion: {clothgym.__version__}\n" in metadata
-    assert sum(member.compress_size for member in wheel.infolist()) < 3e6
+    assert sum(member.compress_size for member in wheel.infolist()) < 3.2e6
 
 
 @pytest.mark.slow

@@ -180,10 +180,13 @@ def test_every_task_at_its_standard_tier_has_one():
     assert max(path.stat().st_size for path in policies.FOLDER.glob("*.npz")) < 100_000
 
 
-# the first of them in the fast tier
+# that of the fastest task in the fast tier
 @pytest.mark.parametrize(
     ("env_id", "learner"),
-    [pytest.param(*one, id=" ".join(one), marks=[pytest.mark.slow] if k else []) for k, one in enumerate(COMMITTED)],
+    [
+        pytest.param(*one, id=" ".join(one), marks=[] if one == ("ClothReach-v0", "sac_scratch") else [pytest.mark.slow])
+        for one in COMMITTED
+    ],
 )
 def test_a_committed_policy_scores_what_it_says(env_id, learner, scripts):
     """On the first hundred of the held-out episodes, to the episode; of one of older code, what is noted of it on this code."""
