@@ -18,10 +18,10 @@ LAYER = 0.004  # height [m] whose saturating value is a half: two layers of a th
 class DepthEncoder(BaseFeaturesExtractor):
     """Pictures of depth, (batch, 1, size, size) [m], to features, (batch, 64).
 
-    Heights h above the camera's target, also as h / (abs(h) + LAYER), where a sheet on the floor stands out, if the camera looks
-    straight down at the floor, as it does by default; two convolutions; then
-    where each of their channels is strongest, as a spatial soft-argmax (Finn et al. 2016, "Deep spatial autoencoders for visuomotor
-    learning"), and the mean over the picture.  The number of weights does not depend on ``image_size``.
+    Heights h above the camera's target, also as h / (abs(h) + LAYER), where a sheet on the floor stands out if the camera looks
+    straight down at the floor, as it does by default.  Two convolutions follow; then where each of their channels is strongest, as
+    a spatial soft-argmax (Finn et al. 2016, "Deep spatial autoencoders for visuomotor learning"), and the mean over the picture.
+    The number of weights does not depend on ``image_size``.
     """
 
     def __init__(self, observation_space: gym.spaces.Dict) -> None:
@@ -48,7 +48,7 @@ class DepthEncoder(BaseFeaturesExtractor):
 
 
 class DepthActor(nn.Module):
-    """A policy net of a picture and, where ``felt`` is not empty, of numbers of the state beside it, as those of a robot's joints.
+    """A policy net of a picture and, where ``felt`` is not empty, of numbers of the state beside it, such as those of a robot's joints.
 
     encoder: of the picture.  head: from its features, followed by those numbers.  felt: where the numbers are in the state.
     """
