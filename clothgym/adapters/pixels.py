@@ -48,7 +48,7 @@ class DepthEncoder(BaseFeaturesExtractor):
 
 
 class DepthActor(nn.Module):
-    """A policy net of a picture and, where ``felt`` is not empty, of numbers of the state beside it, such as those of a robot's joints.
+    """A policy net of a picture and of numbers of the state beside it, such as those of a robot's joints; there may be none.
 
     encoder: of the picture.  head: from its features, followed by those numbers.  felt: where the numbers are in the state.
     """
